@@ -1,0 +1,319 @@
+"""Checkpoints of a run: crash-safe saving, finding the latest, restoring; and a graceful end on a signal.
+
+A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the format of `torchrl.checkpoint`. It is
+written beside its final place and renamed into it, so that a folder of that name is always complete; what a killed
+process leaves behind has a name with a leading dot, is never read, and is removed by the next run.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+import torch
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointRotation,
+    GlobalRNGState,
+    StateDictCheckpointAdapter,
+)
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINTS = "checkpoints"
+_PREFIX = "checkpoint"
+
+
+class RandomState(GlobalRNGState):
+    """State of the Python, NumPy and torch generators; that of devices absent here is skipped with a warning."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        state = dict(state_dict)
+        saved, present = len(state.get("torch_cuda", ())), torch.cuda.device_count()
+        if saved and saved != present:
+            logger.warning(
+                "The checkpoint holds the random state of %d CUDA devices and this machine has %d: it is not restored, "
+                "so the run continues with other random numbers.",
+                saved,
+                present,
+            )
+            del state["torch_cuda"]
+        super().load_state_dict(state)
+
+
+class RunCheckpoints:
+    """Saves and restores the named parts of a run.
+
+    A part has ``dump(path)``/``load(path)`` (a replay), or ``state_dict()``/``load_state_dict(state)`` of tensors and
+    plain Python values (learner, optimiser, curriculum), or is a dictionary of JSON values, restored in place
+    (counters). The random state of Python, NumPy and torch is always saved with them, as the part ``random_state``.
+
+    One process at a time may write below a run directory.
+
+    Args:
+        run_dir: folder of the run; checkpoints go to its subfolder ``checkpoints``.
+        components: the parts by name.
+        keep_last: checkpoints kept.
+
+    Example:
+        >>> counters = {"env_steps": 0}
+        >>> checkpoints = RunCheckpoints("runs/example", {"counters": counters})  # doctest: +SKIP
+        >>> checkpoints.save(env_steps=1000)  # doctest: +SKIP
+        >>> checkpoints.load()  # doctest: +SKIP
+    """
+
+    def __init__(self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2) -> None:
+        self.directory = Path(run_dir).absolute() / CHECKPOINTS
+        self._checkpoint = _bind({**components, "random_state": RandomState()})
+        self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, prefix=_PREFIX)
+        self._last_saved: Path | None = None
+        ensure_writable(self.directory)
+        _remove_partial(self.directory)
+
+    def save(self, env_steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
+        """Saves all parts and removes the oldest checkpoints beyond ``keep_last``.
+
+        Checkpoints of more ``env_steps`` are removed too: they belong to a run that this one, resumed from before
+        them, replaces. A second save at the same ``env_steps`` does nothing.
+
+        Args:
+            env_steps: control steps summed over environments, which names the checkpoint.
+            metadata: JSON values, kept in the manifest.
+
+        Returns:
+            The checkpoint's folder.
+
+        Raises:
+            CheckpointError: if it cannot be written; the previous checkpoints are untouched.
+        """
+        final = self.directory / f"{_PREFIX}-{env_steps:012d}"
+        if final == self._last_saved:
+            return final
+        partial = self.directory / f".{final.name}.partial"
+        try:
+            self._checkpoint.save(partial, metadata={**(metadata or {}), "env_steps": env_steps})
+            _check_loadable(partial)
+            _sync_tree(partial)
+            _publish(partial, final)
+        except Exception as error:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise CheckpointError(
+                f"The checkpoint {final} could not be written ({error}). Earlier checkpoints are untouched; check the "
+                "free space and the permissions of that folder, then resume."
+            ) from error
+        self._last_saved = final
+        self._remove_later(final)
+        self._rotation.prune()
+        return final
+
+    def load(self, path: str | Path | None = None, map_location: torch.device | str = "cpu") -> dict[str, Any]:
+        """Restores all parts.
+
+        Args:
+            path: run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
+            map_location: device that tensors are read to before the parts copy them to their own.
+
+        Returns:
+            The metadata of the checkpoint, with ``env_steps``.
+
+        Raises:
+            FileNotFoundError: if there is no complete checkpoint.
+            CheckpointError: if a part is missing or does not fit.
+        """
+        source = latest_checkpoint(self.directory if path is None else path)
+        self._last_saved = None
+        return _restore(self._checkpoint, source, map_location)
+
+    def _remove_later(self, newest: Path) -> None:
+        for path in self._rotation.checkpoints():
+            if path.name > newest.name:
+                logger.warning("Removing %s: the run was resumed from before it.", path)
+                tombstone = path.with_name(f".{path.name}.removed")
+                shutil.rmtree(tombstone, ignore_errors=True)
+                os.replace(path, tombstone)
+                shutil.rmtree(tombstone)
+
+
+def load_components(
+    path: str | Path, components: Mapping[str, Any], map_location: torch.device | str = "cpu"
+) -> dict[str, Any]:
+    """Restores some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
+
+    Args:
+        path: run directory, folder of checkpoints, or one checkpoint.
+        components: the parts by the names they were saved under.
+        map_location: as in `RunCheckpoints.load`.
+
+    Returns:
+        The metadata of the checkpoint, with ``env_steps``.
+
+    Raises:
+        FileNotFoundError: if there is no complete checkpoint.
+        CheckpointError: if a part is missing or does not fit.
+    """
+    return _restore(_bind(components), latest_checkpoint(path), map_location)
+
+
+def latest_checkpoint(path: str | Path) -> Path:
+    """Finds the newest complete checkpoint. Folders that a killed process left incomplete are passed over.
+
+    Args:
+        path: run directory, folder of checkpoints, or one checkpoint.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    path = Path(path).absolute()
+    if _is_complete(path):
+        return path
+    for directory in (path / CHECKPOINTS, path):
+        for candidate in sorted(directory.glob(f"{_PREFIX}-*"), reverse=True):
+            if _is_complete(candidate):
+                return candidate
+            logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
+    found = "exists, but holds none" if path.exists() else "does not exist"
+    raise FileNotFoundError(
+        f"No complete checkpoint at {path}: the path {found}. Give a run directory (with a subfolder "
+        f"'{CHECKPOINTS}'), a folder of '{_PREFIX}-<env_steps>' folders, or one of these."
+    )
+
+
+def ensure_writable(directory: str | Path) -> Path:
+    """Creates a folder if needed and writes a file to it, to fail before a run and not at its first checkpoint.
+
+    Returns:
+        The absolute path of the folder.
+
+    Raises:
+        PermissionError: if nothing can be written there.
+    """
+    directory = Path(directory).expanduser().absolute()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory) as file:
+            file.write(b"writable")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise PermissionError(
+            f"Cannot write to the folder {directory} ({error.strerror or error}). The run keeps its checkpoints and "
+            "metrics there: choose another with run_dir=PATH, or give this user write permission and free space."
+        ) from error
+    return directory
+
+
+class GracefulExit:
+    """Turns SIGINT and SIGTERM into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
+
+    The handlers from before are put back at exit. Outside the main thread, where Python allows no handlers, the flag
+    is never set.
+
+    Example:
+        >>> with GracefulExit() as stop:
+        ...     while not stop.requested:
+        ...         break
+    """
+
+    def __init__(self) -> None:
+        self.signal_name: str | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal has arrived."""
+        return self.signal_name is not None
+
+    def __enter__(self) -> GracefulExit:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        # No logging here: the signal may have interrupted a write to the same stream.
+        name = signal.Signals(number).name
+        if self.requested:
+            raise KeyboardInterrupt(f"{name} after {self.signal_name}")
+        self.signal_name = name
+
+
+def _bind(components: Mapping[str, Any]) -> Checkpoint:
+    checkpoint = Checkpoint()
+    for name, component in components.items():
+        has_state = hasattr(component, "state_dict") and not hasattr(component, "dump")
+        # One ordinary file a part: TorchRL's default is a memory map per tensor, thousands of files for an optimiser,
+        # and a write to a memory map on a full disk ends the process with a bus error.
+        adapter = StateDictCheckpointAdapter(payload_format="torch") if has_state else None
+        checkpoint.register(name, component, adapter=adapter)
+    return checkpoint
+
+
+def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | str) -> dict[str, Any]:
+    try:
+        return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
+    except CheckpointError as error:
+        raise CheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
+
+
+def _is_complete(path: Path) -> bool:
+    """Whether the manifest, which is written last, is there with every file it lists (a copy may have lost some)."""
+    if not path.is_dir() or not Checkpoint.is_checkpoint(path):
+        return False
+    parts = Checkpoint.manifest(path)["components"].values()
+    return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])
+
+
+def _check_loadable(path: Path) -> None:
+    """Reads the state dicts back (mapped, not copied), to refuse values that only a resume would find unreadable."""
+    for file in path.rglob(StateDictCheckpointAdapter.state_torch):
+        torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+
+
+def _sync_tree(path: Path) -> None:
+    for entry in (*path.rglob("*"), path):
+        descriptor = os.open(entry, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _publish(partial: Path, final: Path) -> None:
+    """Renames into place. A folder cannot be renamed onto another, so an earlier one of that name steps aside."""
+    aside = final.with_name(f".{final.name}.replaced")
+    if final.exists():
+        os.replace(final, aside)
+    os.replace(partial, final)
+    shutil.rmtree(aside, ignore_errors=True)
+    descriptor = os.open(final.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove_partial(directory: Path) -> None:
+    """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
+    for path in directory.glob(f".*{_PREFIX}-*"):
+        final = path.with_name(path.name.removeprefix(".").removesuffix(".replaced"))
+        if path.name.endswith(".replaced") and not final.exists() and _is_complete(path):
+            os.replace(path, final)
+        else:
+            logger.info("Removing the unfinished %s.", path)
+            shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""The race: tracks, quadrotor physics, batched simulation, and the environments built on them."""

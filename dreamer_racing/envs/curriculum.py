@@ -1,0 +1,115 @@
+"""Curriculum of the body-rate penalty: the schedule of b₂ and today's b₂ on the rewards of old steps.
+
+Reference: the paper's Eq. 1 and its appendix (b₁ = 1, b₂ → 0.01). When b₂ grows is this project's choice, see
+`BodyRateCurriculum`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+
+
+class BodyRateCurriculum:
+    """Raises b₂, the weight of the body-rate penalty, once the policy races well.
+
+    b₂ starts at 0. Whenever the mean return of the last ``window`` training episodes exceeds ``threshold``, it grows by
+    ``increment``, but at most once in ``cooldown`` episodes and never beyond ``maximum``. It never decreases.
+
+    Args:
+        threshold: mean return above which b₂ grows.
+        increment: what b₂ grows by, 1/(rad/s).
+        maximum: cap of b₂, 1/(rad/s).
+        window: episodes that the mean is over; no growth before there are as many.
+        cooldown: least number of episodes between two growths.
+
+    Example:
+        >>> curriculum = BodyRateCurriculum(window=2, cooldown=2)
+        >>> curriculum.update([60.0, 60.0, 60.0, 60.0])
+        0.002
+    """
+
+    def __init__(
+        self,
+        threshold: float = 50.0,
+        increment: float = 0.001,
+        maximum: float = 0.01,
+        window: int = 100,
+        cooldown: int = 100,
+    ) -> None:
+        if window < 1 or cooldown < 1 or increment < 0 or maximum < 0:
+            raise ValueError(
+                "The body-rate curriculum needs window >= 1, cooldown >= 1, increment >= 0 and maximum >= 0, got "
+                f"window={window}, cooldown={cooldown}, increment={increment}, maximum={maximum}."
+            )
+        self.threshold = threshold
+        self.increment = increment
+        self.maximum = maximum
+        self.cooldown = cooldown
+        self._returns: deque[float] = deque(maxlen=window)
+        self._growths = 0
+        self._since_growth = cooldown
+
+    @property
+    def body_rate_weight(self) -> float:
+        """Today's b₂, 1/(rad/s)."""
+        # A product, not a sum of increments: ten times 0.001 shall be 0.01.
+        return min(self._growths * self.increment, self.maximum)
+
+    def update(self, episode_returns: Tensor | Sequence[float]) -> float:
+        """Accounts for finished training episodes, one by one in the given order.
+
+        Args:
+            episode_returns: undiscounted returns, ``(E,)``.
+
+        Returns:
+            b₂ after the last of them.
+        """
+        values = episode_returns.flatten().tolist() if isinstance(episode_returns, Tensor) else episode_returns
+        for value in values:
+            self._returns.append(float(value))
+            self._since_growth += 1
+            if self._may_grow() and sum(self._returns) / len(self._returns) > self.threshold:
+                self._growths += 1
+                self._since_growth = 0
+        return self.body_rate_weight
+
+    def _may_grow(self) -> bool:
+        window_is_full = len(self._returns) == self._returns.maxlen
+        return window_is_full and self._since_growth >= self.cooldown and self.body_rate_weight < self.maximum
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"returns": list(self._returns), "growths": self._growths, "since_growth": self._since_growth}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._returns.clear()
+        self._returns.extend(state_dict["returns"])
+        self._growths = state_dict["growths"]
+        self._since_growth = state_dict["since_growth"]
+
+
+class RelabelReward(Transform):
+    """Replay transform that gives every sampled step today's reward: ``reward_base − b₂ · body_rate_norm``.
+
+    Without it, a replay returns the rewards with the b₂ of the day they were collected.
+
+    Args:
+        curriculum: whose b₂ is applied, read at each sample.
+
+    Example:
+        >>> transform = RelabelReward(BodyRateCurriculum())
+        >>> # make_replay(..., transform=transform)
+    """
+
+    def __init__(self, curriculum: BodyRateCurriculum) -> None:
+        super().__init__()
+        self.curriculum = curriculum
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        penalty = self.curriculum.body_rate_weight * tensordict["body_rate_norm"]
+        return tensordict.set("reward", tensordict["reward_base"] - penalty)

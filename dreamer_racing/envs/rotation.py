@@ -1,0 +1,37 @@
+"""Unit quaternions (wxyz, body → world) on batched tensors.
+
+Shapes: every function broadcasts over leading dimensions; quaternions end in 4, vectors in 3.
+"""
+
+import torch
+from torch import Tensor
+
+
+def rotate(attitude: Tensor, vector: Tensor) -> Tensor:
+    """Rotate body-frame vectors (..., 3) into the world by attitudes (..., 4), wxyz."""
+    w, xyz = attitude[..., :1], attitude[..., 1:]
+    cross = 2.0 * torch.linalg.cross(xyz, vector)
+    return vector + w * cross + torch.linalg.cross(xyz, cross)
+
+
+def rotate_inverse(attitude: Tensor, vector: Tensor) -> Tensor:
+    """Rotate world-frame vectors (..., 3) into the body by attitudes (..., 4), wxyz."""
+    w, xyz = attitude[..., :1], attitude[..., 1:]
+    cross = 2.0 * torch.linalg.cross(xyz, vector)
+    return vector - w * cross + torch.linalg.cross(xyz, cross)
+
+
+def from_roll_pitch_yaw(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
+    """Attitude (..., 4), wxyz, of intrinsic z-y'-x'' (yaw, pitch, roll) angles in radians, each (...)."""
+    cr, sr = torch.cos(roll / 2), torch.sin(roll / 2)
+    cp, sp = torch.cos(pitch / 2), torch.sin(pitch / 2)
+    cy, sy = torch.cos(yaw / 2), torch.sin(yaw / 2)
+    return torch.stack(
+        (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ),
+        dim=-1,
+    )

@@ -1,0 +1,275 @@
+"""Nose-camera images of M drones on CPU: K single-threaded executors, each with a worker and a slice of the frames.
+
+Only the camera moves: hall and gates stand still and the drone is hidden from its own camera. So a worker prepares the
+scene once, and per frame only places the camera and draws.
+
+Workers, in the order in which `renderer="auto"` tries them:
+
+| name | needs | how |
+|---|---|---|
+| `egl` | an EGL library (Mesa in software will do) | MuJoCo's OpenGL renderer |
+| `osmesa` | OSMesa | the same, slower |
+| `warp` | nothing | `mujoco_warp`'s ray caster, compiled for the CPU |
+
+Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
+"""
+
+import atexit
+import ctypes
+import importlib
+import logging
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.rotation import rotate
+from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera
+
+logger = logging.getLogger(__name__)
+
+MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
+GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
+RENDERERS = ("egl", "osmesa", "warp")
+
+
+class RendererUnavailableError(RuntimeError):
+    """No image can be drawn this way on this machine; the message says why and what would help."""
+
+
+class Worker(Protocol):
+    """Draws frames in one thread."""
+
+    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
+        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        ...
+
+    def close(self) -> None:
+        """Free what the worker holds; called in its own thread."""
+        ...
+
+
+class Renderer:
+    """Spreads frames over workers, each of which lives in a thread of its own.
+
+    Args:
+        name: `egl`, `osmesa` or `warp`.
+        make_worker: makes one worker; called once in each thread.
+        camera: the nose camera.
+        num_workers: K.
+    """
+
+    def __init__(self, name: str, make_worker: Callable[[], Worker], camera: Camera, num_workers: int) -> None:
+        self.name = name
+        self.camera = camera
+        self._executors = [ThreadPoolExecutor(1, f"render_{index}") for index in range(num_workers)]
+        try:
+            # one after the other: the first GL context of a process initialises the display
+            self._workers = [executor.submit(make_worker).result() for executor in self._executors]
+        except BaseException:
+            self._shutdown()
+            raise
+        tilt = math.radians(camera.tilt)
+        cosine, sine = math.cos(tilt), math.sin(tilt)
+        self._mount = torch.tensor(camera.position, dtype=torch.float64)
+        self._axes = torch.tensor(  # (3, 3) rows: right, up, backwards in the body frame
+            ((0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)), dtype=torch.float64
+        )
+
+    def render(self, position: Tensor, attitude: Tensor) -> Tensor:
+        """Images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
+        camera = self.camera
+        frames = len(position)
+        eye = (position + rotate(attitude, self._mount.expand_as(position))).numpy()
+        axes = rotate(attitude.unsqueeze(1).expand(-1, 3, -1), self._axes.expand(frames, -1, -1)).numpy()  # (M, 3, 3)
+        images = torch.empty((frames, camera.height, camera.width, 3), dtype=torch.uint8)
+        out = images.numpy()
+        size = -(-frames // len(self._executors))
+        slices = [slice(start, start + size) for start in range(0, frames, size)]
+        jobs = [
+            executor.submit(worker.draw, eye[part], axes[part], out[part])
+            for executor, worker, part in zip(self._executors, self._workers, slices, strict=False)
+        ]
+        for job in jobs:
+            job.result()
+        return images
+
+    def close(self) -> None:
+        """Free every worker in its own thread, then end the threads."""
+        for executor, worker in zip(self._executors, self._workers, strict=True):
+            executor.submit(worker.close).result()
+        self._workers = []
+        self._shutdown()
+
+    def _shutdown(self) -> None:
+        for executor in self._executors:
+            executor.shutdown()
+        self._executors = []
+
+
+class OpenGLWorker:
+    """MuJoCo's OpenGL renderer with a context of its own.
+
+    Args:
+        backend: `egl` or `osmesa`.
+        model: the compiled scene.
+        camera: the nose camera.
+    """
+
+    def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
+        gl = importlib.import_module(f"mujoco.{backend}")
+        self._gl: Any = gl.GLContext(camera.width, camera.height)
+        atexit.register(self._gl.free)  # runs before MuJoCo's own hook terminates the display
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._viewport = mujoco.MjrRect(0, 0, camera.width, camera.height)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 0
+        option.geomgroup[HALL_GROUP] = 1
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        view = mujoco.MjvCamera()
+        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = model.camera(CAMERA_NAME).id
+        mujoco.mjv_updateScene(
+            model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
+        self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
+
+    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
+        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        buffer, upright = self._buffer, self._buffer[::-1]  # OpenGL's first row is the lowest
+        for index in range(len(position)):
+            for eye in self._eyes:
+                eye.pos = position[index]
+                eye.up = axes[index, 1]
+                eye.forward = -axes[index, 2]
+            mujoco.mjr_render(self._viewport, self._scene, self._context)
+            mujoco.mjr_readPixels(buffer, None, self._viewport, self._context)
+            out[index] = upright
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._context.free()
+        self._gl.free()
+        atexit.unregister(self._gl.free)
+
+
+class RayCasterWorker:
+    """`mujoco_warp`'s batch renderer on warp's CPU device: needs no OpenGL library.
+
+    Args:
+        model: the compiled scene.
+        camera: the nose camera.
+        frames: the most frames drawn in one call.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int) -> None:
+        import mujoco_warp
+        import warp
+
+        warp.config.quiet = True
+        self._render, self._device = mujoco_warp.render, warp.get_device("cpu")
+        with warp.ScopedDevice(self._device):
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            self._model = mujoco_warp.put_model(model)
+            self._data = mujoco_warp.put_data(model, data, nworld=frames)
+            self._context = mujoco_warp.create_render_context(
+                model,
+                nworld=frames,
+                cam_res=(camera.width, camera.height),
+                render_rgb=True,
+                enabled_geom_groups=[HALL_GROUP],
+                enable_specular=False,
+                enable_emission=False,
+                enable_per_light_ambient=False,
+            )
+            mujoco_warp.refit_bvh(self._model, self._data, self._context)
+            mujoco_warp.render(self._model, self._data, self._context)  # compile now, not in the first step
+        # warp arrays on CPU share their memory with these NumPy views
+        self._position = self._data.cam_xpos.numpy()[:, 0]  # (frames, 3)
+        self._axes = self._data.cam_xmat.numpy()[:, 0]  # (frames, 3, 3) columns: right, up, backwards
+        packed = self._context.rgb_data.numpy()  # (frames, H * W) uint32 of bytes B, G, R, A
+        self._packed = packed.view(np.uint8).reshape(frames, camera.height, camera.width, 4)
+
+    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
+        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        count, capacity = len(position), len(self._position)
+        for start in range(0, count, capacity):
+            part = slice(start, min(start + capacity, count))
+            frames = part.stop - part.start
+            self._position[:frames] = position[part]
+            self._axes[:frames] = axes[part].transpose(0, 2, 1)
+            self._data.nworld = frames  # the renderer launches over this many worlds
+            self._render(self._model, self._data, self._context)
+            out[part] = self._packed[:frames, :, :, 2::-1]
+
+    def close(self) -> None:
+        """Nothing to free: warp's arrays go with the object."""
+
+
+def make_renderer(name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int) -> Renderer:
+    """Make the renderer of that name, or the first that works for `auto`; log which and why.
+
+    Raises:
+        ValueError: unknown name.
+        RendererUnavailableError: the renderer asked for does not work here.
+    """
+    if name not in ("auto", *RENDERERS):
+        raise ValueError(f"Unknown renderer {name!r}: use auto, {', '.join(RENDERERS)}, or None for no images.")
+    reasons = []
+    for candidate in RENDERERS if name == "auto" else (name,):
+        try:
+            renderer = Renderer(candidate, _worker_factory(candidate, model, camera, num_envs, num_workers), camera,
+                                num_workers)  # fmt: skip
+        except RendererUnavailableError as error:
+            reasons.append(str(error))
+            continue
+        why = f"; {' '.join(reasons)}" if reasons else ""
+        logger.info("renderer: %s, %d thread(s)%s", candidate, num_workers, why)
+        return renderer
+    raise RendererUnavailableError(" ".join(reasons))
+
+
+def _worker_factory(
+    name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int
+) -> Callable[[], Worker]:
+    if name == "warp":
+        return lambda: RayCasterWorker(model, camera, -(-num_envs // num_workers))
+    _require_library(name)
+    # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+
+    def make() -> Worker:
+        try:
+            return OpenGLWorker(name, model, camera)
+        except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
+            raise RendererUnavailableError(f"{name} did not start ({type(error).__name__}: {error}).") from error
+
+    return make
+
+
+def _require_library(name: str) -> None:
+    for library in GL_LIBRARIES[name]:
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return
+    raise RendererUnavailableError(
+        f"{name} needs {GL_LIBRARIES[name][0]}, which is not installed "
+        f"(Debian: apt-get install {'libegl1 libgl1-mesa-dri' if name == 'egl' else 'libosmesa6'})."
+    )

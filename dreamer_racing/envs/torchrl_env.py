@@ -1,0 +1,166 @@
+"""`DroneRacingEnv`: the race as a natively batched TorchRL environment.
+
+Keys, shapes and units: `docs/architecture.md`. Shapes: N environments.
+"""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.race import RaceStep
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
+
+
+class DroneRacingEnv(EnvBase):
+    """N drones racing at once, in one process, without ParallelEnv.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        num_envs: N; the batch size is [N].
+        device: where tensors live; the simulation itself runs on CPU.
+        from_pixels: whether there are `pixels`.
+        privileged: whether there are `("privileged", ...)` entries.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        seed: of start poses and physics randomisation.
+        worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
+            `num_threads`.
+
+    Attributes:
+        body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.
+
+    Example:
+        >>> env = DroneRacingEnv(track="circle", num_envs=4, from_pixels=False, seed=0)
+        >>> env.rollout(10, break_when_any_done=False)["next", "reward"].shape
+        torch.Size([4, 10, 1])
+    """
+
+    def __init__(
+        self,
+        track: str | Track = "kidney",
+        num_envs: int = 16,
+        device: torch.device | str = "cpu",
+        from_pixels: bool = True,
+        privileged: bool = True,
+        preset: str | QuadrotorParameters = "easy",
+        seed: int | None = None,
+        **worlds: Any,
+    ) -> None:
+        super().__init__(device=device, batch_size=[num_envs])
+        self.from_pixels = from_pixels
+        self.privileged = privileged
+        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, seed=seed, **worlds)
+        self.track = self.worlds.track
+        self.body_rate_weight = self.worlds.race.weights.body_rate
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        n = self.batch_size
+
+        def number(*shape: int, dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded((*n, *shape), dtype=dtype, device=self.device)
+
+        def flag() -> Bounded:
+            return Bounded(0, 1, (*n, 1), dtype=torch.bool, device=self.device)
+
+        self.action_spec = Bounded(-1.0, 1.0, (*n, ACTION_SIZE), dtype=torch.float32, device=self.device)
+        self.reward_spec = number(1)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=n, device=self.device)
+        race = Composite(
+            gates_passed=number(1, dtype=torch.int64),
+            gate_offset=number(1),
+            lap_time=number(1),
+            crash=number(1, dtype=torch.int64),
+            finished=flag(),
+            shape=n,
+            device=self.device,
+        )
+        observation = Composite(
+            reward_base=number(1), body_rate_norm=number(1), race=race, shape=n, device=self.device
+        )
+        self._before_the_race = observation.zero()
+        if self.from_pixels:
+            camera = self.worlds.camera
+            observation["pixels"] = Bounded(
+                0, 255, (*n, camera.height, camera.width, 3), dtype=torch.uint8, device=self.device
+            )
+        if self.privileged:
+            observation["privileged"] = Composite(
+                position=number(3),
+                attitude=number(4),
+                linear_velocity=number(3),
+                body_rates=number(3),
+                target_gate=number(1, dtype=torch.int64),
+                shape=n,
+                device=self.device,
+            )
+        self.observation_spec = observation
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        mask = tensordict.get("_reset", None) if tensordict is not None else None
+        mask = None if mask is None else mask.view(self.batch_size).cpu()
+        self.worlds.reset(mask)
+        return self._observe(None, mask)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        outcome = self.worlds.step(tensordict["action"].cpu())
+        data = self._observe(outcome, None)
+        reward = outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm
+        data.set("reward", self._column(reward))
+        data.set("terminated", self._column(outcome.terminated))
+        data.set("truncated", self._column(outcome.truncated))
+        data.set("done", data.get("terminated") | data.get("truncated"))
+        return data
+
+    def _column(self, values: Tensor) -> Tensor:
+        """(N,) → (N, 1) on this device, floats as float32."""
+        values = values.unsqueeze(-1)
+        return values.to(self.device, torch.float32 if values.is_floating_point() else values.dtype)
+
+    def _observe(self, outcome: RaceStep | None, mask: Tensor | None) -> TensorDict:
+        """Everything but reward and done; after a reset (no outcome) the race's entries are zero."""
+        if outcome is None:
+            data = self._before_the_race.clone()
+        else:
+            race = {
+                name: self._column(getattr(outcome, name))
+                for name in ("gates_passed", "gate_offset", "lap_time", "crash", "finished")
+            }
+            data = TensorDict(
+                {
+                    "reward_base": self._column(outcome.reward_base),
+                    "body_rate_norm": self._column(outcome.body_rate_norm),
+                    "race": TensorDict(race, self.batch_size, device=self.device),
+                },
+                self.batch_size,
+                device=self.device,
+            )
+        if self.privileged:
+            privileged = {name: value.to(self.device) for name, value in self.worlds.privileged().items()}
+            data.set("privileged", TensorDict(privileged, self.batch_size, device=self.device))
+        if self.from_pixels:
+            data.set("pixels", self._pixels(mask).to(self.device))
+        return data
+
+    def _pixels(self, mask: Tensor | None) -> Tensor:
+        """Images of all worlds (N, H, W, 3); after a partial reset only those rows are drawn, the rest is blank."""
+        images = self.worlds.render(mask)
+        if mask is None:
+            return images
+        everyone = torch.zeros((*self.batch_size, *images.shape[1:]), dtype=torch.uint8)
+        everyone[mask] = images
+        return everyone
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.worlds.seed(seed)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free rendering contexts and threads."""
+        if not self.is_closed:
+            self.worlds.close()
+        super().close(raise_if_closed=raise_if_closed)

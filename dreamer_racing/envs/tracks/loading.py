@@ -1,0 +1,233 @@
+"""Read a track from YAML, and refuse a bad file with the file, the field, its value and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Collection, Hashable
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track
+from dreamer_racing.envs.tracks.validation import validate_track
+
+BUILTIN_TRACKS: tuple[str, ...] = ("circle", "kidney", "figure8", "split_s", "figure8_decoys")
+"""Names that ``load_track`` knows without a path."""
+
+_FOLDER = Path(__file__).parent
+
+
+def load_track(name_or_path: str | Path | Track) -> Track:
+    """Return a checked track.
+
+    Args:
+        name_or_path: a name out of ``BUILTIN_TRACKS``, the path of a ``.yaml`` file, or a ``Track``, which is checked
+            and returned.
+
+    Raises:
+        TrackError: the track is unknown, cannot be read, or cannot be flown.
+
+    Example:
+        >>> load_track("kidney").num_gates
+        6
+    """
+    if isinstance(name_or_path, Track):
+        validate_track(name_or_path, source=f"Track({name_or_path.name!r})")
+        return name_or_path
+    path = _find(name_or_path)
+    track = _TrackReader(path).read()
+    validate_track(track, source=str(path))
+    return track
+
+
+def _find(name_or_path: str | Path) -> Path:
+    """Turn a built-in name or a path into the path of a file."""
+    if isinstance(name_or_path, str):
+        if name_or_path in BUILTIN_TRACKS:
+            return _FOLDER / f"{name_or_path}.yaml"
+        if not name_or_path.endswith((".yaml", ".yml")):
+            raise TrackError(
+                f"unknown track {name_or_path!r}{_suggestion(name_or_path, BUILTIN_TRACKS)}: the known tracks are "
+                f"{', '.join(BUILTIN_TRACKS)}, and the path of a .yaml file works too."
+            )
+    path = Path(name_or_path).expanduser()
+    if not path.is_file():
+        state = "is not a file" if path.exists() else "does not exist"
+        raise TrackError(
+            f"the track file {str(path)!r} {state} (working folder: {Path.cwd()}). Give the path of a .yaml file or "
+            f"one of the known tracks: {', '.join(BUILTIN_TRACKS)}."
+        )
+    return path
+
+
+def _suggestion(word: Any, known: Collection[str]) -> str:
+    """Return ``" (did you mean 'x'?)"`` for a likely slip of the pen, else nothing."""
+    close = difflib.get_close_matches(str(word), known, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML's safe loader, which also refuses a key given twice instead of keeping the last one silently."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {key.value!r} is given twice", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+
+class _TrackReader:
+    """Turns one YAML file into a ``Track``; every method names the field that it refuses."""
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    def read(self) -> Track:
+        """Read the file, check the form of every field and fill in the defaults."""
+        content = self._mapping(
+            self._parse(),
+            "the file",
+            required={"gates"},
+            optional={"name", "laps", "decoys", "shape", "start", "bounds"},
+        )
+        gates = self._gates(content["gates"], "gates", "race")
+        if len(gates) < 2:
+            raise self._error("gates", content["gates"], "a list of at least 2 race gates, so that there is a lap")
+        start_position, start_yaw_degrees = self._start(content.get("start", {}))
+        bounds_low, bounds_high = self._bounds(content["bounds"]) if "bounds" in content else (None, None)
+        return make_track(
+            self._text(content.get("name", self._path.stem), "name"),
+            gates,
+            decoys=self._gates(content.get("decoys", []), "decoys", "decoy"),
+            shape=self._shape(content.get("shape", {})),
+            start_position=start_position,
+            start_yaw_degrees=start_yaw_degrees,
+            bounds_low=bounds_low,
+            bounds_high=bounds_high,
+            laps=self._count(content.get("laps", 3), "laps"),
+        )
+
+    def _parse(self) -> Any:
+        """Return the file's content as Python objects."""
+        try:
+            text = self._path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise TrackError(f"{self._path}: the track file cannot be read: {error}.") from error
+        try:
+            return yaml.load(text, Loader=_UniqueKeyLoader)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark
+            where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "somewhere"
+            raise TrackError(f"{self._path}: not valid YAML at {where}: {error.problem}.") from error
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            raise TrackError(f"{self._path}: not valid YAML: {error}.") from error
+
+    def _gates(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> list[Gate]:
+        """Read a list of gates that are all of one kind."""
+        if not isinstance(value, list):
+            raise self._error(where, value, "a list of gates, each with a position and yaw_degrees")
+        return [self._gate(item, f"{where}[{index}]", kind) for index, item in enumerate(value)]
+
+    def _gate(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> Gate:
+        """Read one gate."""
+        fields = self._mapping(value, where, required={"position", "yaw_degrees"}, optional={"kind", "color"})
+        if fields.get("kind", kind) != kind:
+            raise self._error(
+                f"{where}.kind",
+                fields["kind"],
+                f"{kind!r} here or left out: kinds are 'race' (listed under gates, in the order of flight) and 'decoy' "
+                "(listed under decoys, drawn only)",
+            )
+        return Gate(
+            position=self._vector(fields["position"], f"{where}.position"),
+            yaw_degrees=self._number(fields["yaw_degrees"], f"{where}.yaw_degrees"),
+            kind=kind,
+            color=self._color(fields["color"], f"{where}.color") if "color" in fields else None,
+        )
+
+    def _start(self, value: Any) -> tuple[Vector | None, float | None]:
+        """Read the start pose; None stands for what is left out."""
+        fields = self._mapping(value, "start", required=set(), optional={"position", "yaw_degrees"})
+        position = self._vector(fields["position"], "start.position") if "position" in fields else None
+        yaw_degrees = self._number(fields["yaw_degrees"], "start.yaw_degrees") if "yaw_degrees" in fields else None
+        return position, yaw_degrees
+
+    def _bounds(self, value: Any) -> tuple[Vector, Vector]:
+        """Read the corners of the bounding box."""
+        fields = self._mapping(value, "bounds", required={"low", "high"})
+        return self._vector(fields["low"], "bounds.low"), self._vector(fields["high"], "bounds.high")
+
+    def _shape(self, value: Any) -> GateShape:
+        """Read the measures of the gates."""
+        fields = self._mapping(value, "shape", required=set(), optional={"opening", "outer", "depth", "margin"})
+        return GateShape(**{name: self._number(number, f"shape.{name}") for name, number in fields.items()})
+
+    def _mapping(
+        self, value: Any, where: str, *, required: Collection[str], optional: Collection[str] = ()
+    ) -> dict[str, Any]:
+        """Read a mapping that has every required key and no unknown one."""
+        allowed = sorted({*required, *optional})
+        if not isinstance(value, dict):
+            raise self._error(where, value, f"a mapping with the fields {', '.join(allowed)}")
+        prefix = "" if where == "the file" else f"{where}."
+        for key in value:
+            if key not in allowed:
+                raise TrackError(
+                    f"{self._path}: {prefix}{key} is an unknown field (its value is {value[key]!r})"
+                    f"{_suggestion(key, allowed)}; the allowed fields of {where} are {', '.join(allowed)}."
+                )
+        for key in sorted(required):
+            if key not in value:
+                raise TrackError(
+                    f"{self._path}: {prefix}{key} is missing; {where} has {', '.join(map(str, value)) or 'no field'} "
+                    f"and needs {', '.join(sorted(required))}."
+                )
+        return value
+
+    def _vector(self, value: Any, where: str) -> Vector:
+        """Read three numbers x, y, z in m."""
+        if not isinstance(value, list) or len(value) != 3:
+            raise self._error(where, value, "a list of three numbers [x, y, z] in m")
+        x, y, z = (self._number(number, f"{where}[{axis}]") for axis, number in enumerate(value))
+        return (x, y, z)
+
+    def _color(self, value: Any, where: str) -> Vector:
+        """Read red, green and blue."""
+        if not isinstance(value, list) or len(value) != 3:
+            raise self._error(where, value, "a list of three numbers [red, green, blue] from 0 to 1")
+        red, green, blue = (self._number(number, f"{where}[{axis}]") for axis, number in enumerate(value))
+        if not all(0 <= part <= 1 for part in (red, green, blue)):
+            raise self._error(where, value, "three numbers [red, green, blue] from 0 to 1")
+        return (red, green, blue)
+
+    def _number(self, value: Any, where: str) -> float:
+        """Read a finite number; true and false are none."""
+        try:
+            if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+                return float(value)
+        except OverflowError:
+            pass  # an integer too large for a float is refused like any other bad value
+        raise self._error(where, value, "a finite number")
+
+    def _count(self, value: Any, where: str) -> int:
+        """Read a whole number of at least 1."""
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise self._error(where, value, "a whole number of at least 1")
+        return value
+
+    def _text(self, value: Any, where: str) -> str:
+        """Read a text that is not empty."""
+        if not isinstance(value, str) or not value.strip():
+            raise self._error(where, value, "a text that is not empty")
+        return value
+
+    def _error(self, where: str, value: Any, allowed: str) -> TrackError:
+        """Return the refusal of one field."""
+        return TrackError(f"{self._path}: {where} is {value!r}, but must be {allowed}.")

@@ -1,0 +1,206 @@
+"""What a track is: gates, their shape, the start pose and the bounding box.
+
+Shape legend: G race gates. SI units, world z up. A gate's own axes are forward (direction of flight), left and up;
+gates stand upright, so one yaw angle turns the world's x axis into a gate's forward axis.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+
+Vector = tuple[float, float, float]
+
+GROUND_HEIGHT = 0.05
+"""Height (m) under which a drone has hit the ground [choice]: half of the drone's 0.1 m height."""
+
+START_DISTANCE = 2.5
+"""Distance (m) of the default start pose before the first gate [choice]."""
+
+BOUNDS_CLEARANCE = 3.0
+"""Distance (m) of the default bounding box from the race gates' frames [choice]."""
+
+DEFAULT_CEILING = 6.0
+"""Height (m) of the default bounding box [choice]."""
+
+
+class TrackError(ValueError):
+    """A track that cannot be flown, with one paragraph that says what is wrong, where, and what would be right."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gate:
+    """One square gate, standing upright.
+
+    Args:
+        position: centre of the opening in the world, m.
+        yaw_degrees: direction of flight through the gate, degrees from the world's x axis towards y.
+        kind: ``"race"`` gates are flown in order; ``"decoy"`` gates are drawn only (no reward, no crash, no order).
+        color: RGB in [0, 1], or None for the scene's own colour.
+    """
+
+    position: Vector
+    yaw_degrees: float
+    kind: Literal["race", "decoy"] = "race"
+    color: Vector | None = None
+
+    @property
+    def forward(self) -> Vector:
+        """Unit vector of the direction of flight in the world."""
+        yaw = math.radians(self.yaw_degrees)
+        return (math.cos(yaw), math.sin(yaw), 0.0)
+
+    @property
+    def left(self) -> Vector:
+        """Unit vector to the left of the direction of flight in the world."""
+        yaw = math.radians(self.yaw_degrees)
+        return (-math.sin(yaw), math.cos(yaw), 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class GateShape:
+    """The measures shared by all gates of a track, m.
+
+    Args:
+        opening: side of the square opening. Reference: uzh-rpg/agile_flight.
+        outer: side of the square frame's outside. Reference: uzh-rpg/agile_flight.
+        depth: thickness of the frame along the direction of flight. Reference: uzh-rpg/agile_flight.
+        margin: how much nearer than ``opening / 2`` to the centre a drone must pass on both axes [choice].
+    """
+
+    opening: float = 1.5
+    outer: float = 2.05
+    depth: float = 0.1
+    margin: float = 0.1
+
+    @property
+    def pass_half_width(self) -> float:
+        """Half of the side of the margin-reduced opening: what a drone's centre has to go through, m."""
+        return self.opening / 2 - self.margin
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """Everything about a race that is not the drone. Read one with ``load_track`` or build one with ``make_track``.
+
+    Args:
+        name: short name, for logs and plots.
+        gates: race gates in the order of flight.
+        decoys: gates that are drawn only.
+        shape: measures of every gate.
+        start_position: where an episode starts, m.
+        start_yaw_degrees: heading of the start pose.
+        bounds_low: lower corner of the box that a drone must not leave, m.
+        bounds_high: upper corner of the same box, m.
+        laps: number of laps of an evaluation episode.
+    """
+
+    name: str
+    gates: tuple[Gate, ...]
+    decoys: tuple[Gate, ...]
+    shape: GateShape
+    start_position: Vector
+    start_yaw_degrees: float
+    bounds_low: Vector
+    bounds_high: Vector
+    laps: int = 3
+
+    @property
+    def num_gates(self) -> int:
+        """Number of race gates, which is the number of passes in a lap."""
+        return len(self.gates)
+
+    def gate_positions(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        """Return the centres of the race gates, (G, 3), m."""
+        return torch.tensor([gate.position for gate in self.gates], device=device, dtype=dtype)
+
+    def gate_yaws(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        """Return the directions of flight through the race gates, (G,), rad."""
+        return torch.tensor([math.radians(gate.yaw_degrees) for gate in self.gates], device=device, dtype=dtype)
+
+    def gate_normals(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        """Return the unit directions of flight through the race gates, (G, 3)."""
+        return torch.tensor([gate.forward for gate in self.gates], device=device, dtype=dtype)
+
+    def gate_rotations(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        """Return the rotations gate → world, (G, 3, 3): their columns are forward, left and up."""
+        up = (0.0, 0.0, 1.0)
+        columns = [(gate.forward, gate.left, up) for gate in self.gates]
+        return torch.tensor(columns, device=device, dtype=dtype).mT.contiguous()
+
+
+def make_track(
+    name: str,
+    gates: Sequence[Gate],
+    *,
+    decoys: Sequence[Gate] = (),
+    shape: GateShape | None = None,
+    start_position: Vector | None = None,
+    start_yaw_degrees: float | None = None,
+    bounds_low: Vector | None = None,
+    bounds_high: Vector | None = None,
+    laps: int = 3,
+) -> Track:
+    """Build a track and fill in what is not given. ``load_track`` checks the result.
+
+    Args:
+        name: short name, for logs and plots.
+        gates: race gates in the order of flight, at least one.
+        decoys: gates that are drawn only.
+        shape: measures of every gate; None for the defaults of ``GateShape``.
+        start_position: m; None for 2.5 m before the first gate, at its height.
+        start_yaw_degrees: None to face the centre of the first gate.
+        bounds_low: m; None for 3 m outside the race gates' frames, from the floor.
+        bounds_high: m; None for 3 m outside the race gates' frames, 6 m high.
+        laps: number of laps of an evaluation episode.
+
+    Example:
+        >>> make_track("line", [Gate((0, 0, 1.35), 0), Gate((5, 0, 1.35), 0)]).start_position
+        (-2.5, 0.0, 1.35)
+    """
+    shape = shape or GateShape()
+    if start_position is None:
+        start_position = _point_before(gates[0], START_DISTANCE)
+    if start_yaw_degrees is None:
+        start_yaw_degrees = _bearing(start_position, gates[0].position)
+    default_low, default_high = _default_bounds(gates, shape)
+    return Track(
+        name=name,
+        gates=tuple(gates),
+        decoys=tuple(decoys),
+        shape=shape,
+        start_position=start_position,
+        start_yaw_degrees=start_yaw_degrees,
+        bounds_low=default_low if bounds_low is None else bounds_low,
+        bounds_high=default_high if bounds_high is None else bounds_high,
+        laps=laps,
+    )
+
+
+def _point_before(gate: Gate, distance: float) -> Vector:
+    """Return the point ``distance`` m before a gate's centre, at its height."""
+    x, y, z = gate.position
+    return (x - distance * gate.forward[0], y - distance * gate.forward[1], z)
+
+
+def _bearing(origin: Vector, target: Vector) -> float:
+    """Return the heading from one point to another, degrees."""
+    return math.degrees(math.atan2(target[1] - origin[1], target[0] - origin[0]))
+
+
+def _default_bounds(gates: Sequence[Gate], shape: GateShape) -> tuple[Vector, Vector]:
+    """Return the corners of the box that clears every race gate's frame by 3 m on each side, 0–6 m high.
+
+    Decoys do not count: the flyable space of a track is the same with and without them.
+    """
+    low, high = [math.inf, math.inf], [-math.inf, -math.inf]
+    for gate in gates:
+        for axis in range(2):
+            reach = (shape.outer * abs(gate.left[axis]) + shape.depth * abs(gate.forward[axis])) / 2
+            low[axis] = min(low[axis], gate.position[axis] - reach - BOUNDS_CLEARANCE)
+            high[axis] = max(high[axis], gate.position[axis] + reach + BOUNDS_CLEARANCE)
+    return (low[0], low[1], 0.0), (high[0], high[1], DEFAULT_CEILING)

@@ -1,0 +1,232 @@
+"""Whether a track can be flown: the rules about numbers and geometry, for files and for tracks built in Python.
+
+Overlap. A gate's frame must not reach into another gate's opening: two gates are refused when the box of one opening
+(opening × opening × depth) intersects the box of the other frame (outer × outer × depth). Bars that only touch or
+cross other bars are accepted, because both are obstacles anyway and every opening stays free: the two stacked gates
+of the published Split-S track share 7 cm of frame in just this way.
+
+Reach. The margin-reduced opening must lie inside the bounding box and above the ground, and so must the metre before
+it, where training episodes may begin. A frame may stand on the ground or touch a wall.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations
+
+from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
+
+START_CLEARANCE = 0.3
+"""Distance (m) that every start keeps from the bounding box and the ground [choice]."""
+
+GATE_CLEARANCE = 1.0
+"""Distance (m) of a start from a gate's plane: the noise of a training start moves it by at most 0.71 m [choice]."""
+
+
+def validate_track(track: Track, source: str) -> None:
+    """Check that a track can be flown.
+
+    Args:
+        track: the track to check.
+        source: what to call it in a message: its file, usually.
+
+    Raises:
+        TrackError: with source, field, value and what is allowed.
+    """
+    _check_numbers(track, source)
+    _check_kinds(track, source)
+    _check_shape(track.shape, source)
+    _check_bounds(track, source)
+    for name, gate in _named_gates(track):
+        if gate.kind == "race":
+            _check_reach(track, name, gate, source)
+        elif not _inside(gate.position, *flyable_box(track, clearance=0.0)):
+            raise _error(source, f"{name}.position", gate.position, f"inside the bounding box {_box(track)}")
+    _check_overlaps(track, source)
+    _check_start(track, source)
+
+
+def flyable_box(track: Track, clearance: float) -> tuple[Vector, Vector]:
+    """Return the corners of the bounding box above the ground, shrunk by ``clearance`` m on every side."""
+    low, high = track.bounds_low, track.bounds_high
+    floor = max(low[2], GROUND_HEIGHT)
+    return (
+        (low[0] + clearance, low[1] + clearance, floor + clearance),
+        (high[0] - clearance, high[1] - clearance, high[2] - clearance),
+    )
+
+
+def _named_gates(track: Track) -> list[tuple[str, Gate]]:
+    """Return every gate with the name of its field in a file."""
+    race = [(f"gates[{index}]", gate) for index, gate in enumerate(track.gates)]
+    return race + [(f"decoys[{index}]", gate) for index, gate in enumerate(track.decoys)]
+
+
+def _check_numbers(track: Track, source: str) -> None:
+    """Refuse vectors that are not three finite numbers, and numbers that are not finite."""
+    vectors = {
+        "start.position": track.start_position,
+        "bounds.low": track.bounds_low,
+        "bounds.high": track.bounds_high,
+        **{f"{name}.position": gate.position for name, gate in _named_gates(track)},
+    }
+    for field, vector in vectors.items():
+        if len(vector) != 3 or not all(math.isfinite(number) for number in vector):
+            raise _error(source, field, vector, "three finite numbers (x, y, z) in m")
+    numbers = {
+        "start.yaw_degrees": track.start_yaw_degrees,
+        **{f"{name}.yaw_degrees": gate.yaw_degrees for name, gate in _named_gates(track)},
+        **{f"shape.{name}": getattr(track.shape, name) for name in ("opening", "outer", "depth", "margin")},
+    }
+    for field, number in numbers.items():
+        if not math.isfinite(number):
+            raise _error(source, field, number, "a finite number")
+    if track.laps < 1:
+        raise _error(source, "laps", track.laps, "a whole number of at least 1")
+
+
+def _check_kinds(track: Track, source: str) -> None:
+    """Refuse too few race gates, and gates listed under the wrong name."""
+    if len(track.gates) < 2:
+        raise _error(source, "gates", track.gates, "at least 2 race gates, so that there is a lap")
+    for name, gate in _named_gates(track):
+        kind = "race" if name.startswith("gates") else "decoy"
+        if gate.kind != kind:
+            raise _error(source, f"{name}.kind", gate.kind, f"{kind!r}: race gates stand in gates, decoys in decoys")
+
+
+def _check_shape(shape: GateShape, source: str) -> None:
+    """Refuse gates without an opening, a frame or a thickness."""
+    if shape.opening <= 0:
+        raise _error(source, "shape.opening", shape.opening, "greater than 0 m")
+    if shape.outer <= shape.opening:
+        raise _error(source, "shape.outer", shape.outer, f"greater than shape.opening, which is {shape.opening} m")
+    if shape.depth <= 0:
+        raise _error(source, "shape.depth", shape.depth, "greater than 0 m")
+    if not 0 <= shape.margin < shape.opening / 2:
+        allowed = f"from 0 to less than half of shape.opening, which is {shape.opening / 2} m"
+        raise _error(source, "shape.margin", shape.margin, allowed)
+
+
+def _check_bounds(track: Track, source: str) -> None:
+    """Refuse a bounding box without an inside."""
+    for axis, letter in enumerate("xyz"):
+        if track.bounds_low[axis] >= track.bounds_high[axis]:
+            allowed = f"greater than bounds.low, which is {track.bounds_low[axis]} m on the {letter} axis"
+            raise _error(source, f"bounds.high[{axis}]", track.bounds_high[axis], allowed)
+
+
+def _check_reach(track: Track, name: str, gate: Gate, source: str) -> None:
+    """Refuse a race gate whose opening, or the metre before it, is not in the space that can be flown."""
+    low, high = flyable_box(track, clearance=0.0)
+    half = track.shape.pass_half_width
+    for left in (-half, half):
+        for up in (-half, half):
+            corner = _offset(gate, 0.0, left, up)
+            if not _inside(corner, low, high):
+                allowed = (
+                    f"such that the whole opening (less the margin: {half} m to each side) is inside the bounding box "
+                    f"{_box(track)} and above {GROUND_HEIGHT} m: its corner {_rounded(corner)} is not"
+                )
+                raise _error(source, f"{name}.position", gate.position, allowed)
+    approach = _offset(gate, -GATE_CLEARANCE, 0.0, 0.0)
+    if not _inside(approach, *flyable_box(track, START_CLEARANCE)):
+        allowed = (
+            f"such that the point {GATE_CLEARANCE} m before it, {_rounded(approach)}, is at least {START_CLEARANCE} m "
+            f"inside the bounding box {_box(track)}, so that a drone can get to it"
+        )
+        raise _error(source, f"{name}.position", gate.position, allowed)
+
+
+def _check_overlaps(track: Track, source: str) -> None:
+    """Refuse a gate whose opening is blocked by the frame of another gate."""
+    shape = track.shape
+    for (name, gate), (other_name, other) in permutations(_named_gates(track), 2):
+        if _boxes_intersect(gate, shape.opening, other, shape.outer, shape.depth):
+            allowed = (
+                f"farther from {other_name} at {other.position}: the frame of {other_name} ({shape.outer} m square, "
+                f"{shape.depth} m deep) reaches into the opening of {name} ({shape.opening} m square)"
+            )
+            raise _error(source, f"{name}.position", gate.position, allowed)
+
+
+def _check_start(track: Track, source: str) -> None:
+    """Refuse a start outside the box, behind the first gate's plane, or too near a gate."""
+    start = track.start_position
+    if not _inside(start, *flyable_box(track, START_CLEARANCE)):
+        allowed = f"at least {START_CLEARANCE} m inside the bounding box {_box(track)} and above {GROUND_HEIGHT} m"
+        raise _error(source, "start.position", start, allowed)
+    forward, _, _ = _coordinates(track.gates[0], start)
+    if forward > -GATE_CLEARANCE:
+        state = f"{-forward:.2f} m before" if forward <= 0 else f"{forward:.2f} m behind"
+        allowed = f"at least {GATE_CLEARANCE} m before the plane of gates[0]: it is {state}"
+        raise _error(source, "start.position", start, allowed)
+    reach = track.shape.outer / 2 + GATE_CLEARANCE
+    for index, gate in enumerate(track.gates):
+        forward, left, up = _coordinates(gate, start)
+        if abs(forward) < GATE_CLEARANCE and max(abs(left), abs(up)) < reach:
+            allowed = f"at least {GATE_CLEARANCE} m from the plane or the frame of gates[{index}] at {gate.position}"
+            raise _error(source, "start.position", start, allowed)
+
+
+def _boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:
+    """Tell whether two upright boxes (depth × side × side) share more than their surface.
+
+    The boxes stand upright, so they intersect if their heights do and if their ground plans do: two rectangles are
+    apart exactly if their projections are apart on the axis of one of their sides (separating axis theorem).
+    """
+    gap = [b - a for a, b in zip(gate.position, other.position, strict=True)]
+    if abs(gap[2]) >= (side + other_side) / 2:
+        return False
+    for axis in (gate.forward, gate.left, other.forward, other.left):
+        reach = _half_shadow(gate, side, depth, axis) + _half_shadow(other, other_side, depth, axis)
+        if abs(_dot(gap, axis)) >= reach:
+            return False
+    return True
+
+
+def _half_shadow(gate: Gate, side: float, depth: float, axis: Vector) -> float:
+    """Return half of the length of a gate box's projection on a horizontal axis, m."""
+    return (depth * abs(_dot(gate.forward, axis)) + side * abs(_dot(gate.left, axis))) / 2
+
+
+def _coordinates(gate: Gate, point: Vector) -> Vector:
+    """Return a world point in a gate's own axes (forward, left, up), m."""
+    difference = [a - b for a, b in zip(point, gate.position, strict=True)]
+    return (_dot(difference, gate.forward), _dot(difference, gate.left), difference[2])
+
+
+def _offset(gate: Gate, forward: float, left: float, up: float) -> Vector:
+    """Return a point given in a gate's own axes in the world, m."""
+    x, y, z = gate.position
+    return (
+        x + forward * gate.forward[0] + left * gate.left[0],
+        y + forward * gate.forward[1] + left * gate.left[1],
+        z + up,
+    )
+
+
+def _dot(a: Vector | list[float], b: Vector) -> float:
+    """Return the scalar product."""
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _inside(point: Vector, low: Vector, high: Vector) -> bool:
+    """Tell whether a point lies in a box, its surface included (to 1 nm, for rounding)."""
+    return all(a - 1e-9 <= x <= b + 1e-9 for a, x, b in zip(low, point, high, strict=True))
+
+
+def _box(track: Track) -> str:
+    """Write the bounding box."""
+    return f"from {_rounded(track.bounds_low)} to {_rounded(track.bounds_high)}"
+
+
+def _rounded(vector: Vector) -> Vector:
+    """Round to millimetres, for a message."""
+    x, y, z = (round(number, 3) for number in vector)
+    return (x, y, z)
+
+
+def _error(source: str, field: str, value: object, allowed: str) -> TrackError:
+    """Return the refusal of one field."""
+    return TrackError(f"{source}: {field} is {value!r}, but must be {allowed}.")

@@ -1,0 +1,148 @@
+"""`RaceWorlds`: simulator, race rules and start poses put together, N drones on N copies of a track.
+
+The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
+"""
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.race import Race, RaceStep, StartSampler
+from dreamer_racing.envs.rewards import RewardWeights
+from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.simulator import MujocoSimulator, Simulator
+from dreamer_racing.envs.tracks import Track, load_track
+
+ACTION_SIZE = 4
+
+
+class RaceWorlds:
+    """N drones, each alone in its own copy of the race.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        num_envs: N.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        evaluation: start at the start pose, at rest, with nominal parameters, and finish after the track's laps.
+        episode_steps: control steps until an episode is truncated; 1000 are 20 s.
+        weights: of the reward, paper Eq. 1.
+        from_pixels: whether to have a renderer at all.
+        renderer: `auto`, `egl`, `osmesa` or `warp`.
+        camera: the nose camera.
+        num_threads: of physics and rendering; all CPUs of the process if None.
+        device: `cpu`; the CUDA backend is not built yet.
+        seed: of start poses and physics randomisation.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+
+    Example:
+        >>> worlds = RaceWorlds("circle", num_envs=2, from_pixels=False)
+        >>> worlds.reset()
+        >>> worlds.step(torch.zeros(2, 4)).terminated.shape
+        torch.Size([2])
+    """
+
+    def __init__(
+        self,
+        track: str | Track,
+        num_envs: int = 1,
+        preset: str | QuadrotorParameters = "easy",
+        *,
+        evaluation: bool = False,
+        episode_steps: int = 1000,
+        weights: RewardWeights | None = None,
+        from_pixels: bool = True,
+        renderer: str = "auto",
+        camera: Camera | None = None,
+        num_threads: int | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
+        if torch.device(device).type != "cpu":
+            raise ValueError(f"device={device!r}: only the CPU simulator exists so far; use device='cpu'.")
+        self.track = load_track(track)
+        self.num_envs = num_envs
+        self.evaluation = evaluation
+        self.camera = camera or Camera()
+        parameters = load_preset(preset)
+        self.parameters = without_randomisation(parameters) if evaluation else parameters
+        self._generator = torch.Generator(device)
+        self.seed(seed)
+        self.simulator: Simulator = MujocoSimulator(
+            self.track,
+            self.parameters,
+            num_envs,
+            self.camera,
+            renderer if from_pixels else None,
+            num_threads,
+            self._generator,
+        )
+        self.device, self.dtype = self.simulator.device, self.simulator.dtype
+        self.race = Race(
+            self.track,
+            num_envs,
+            weights=weights or RewardWeights(),
+            episode_steps=episode_steps,
+            laps=self.track.laps if evaluation else None,
+            control_dt=self.parameters.control_dt,
+            device=self.device,
+            dtype=self.dtype,
+        )
+        self._starts = StartSampler(self.track, self._generator, self.device, self.dtype)
+
+    def seed(self, seed: int | None) -> None:
+        """Seed start poses and physics randomisation; None draws a seed from the operating system."""
+        if seed is None:
+            self._generator.seed()
+        else:
+            self._generator.manual_seed(seed)
+
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Start new episodes in the masked worlds (N,) bool; in all if None."""
+        if mask is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        start = self._starts.sample(self.num_envs, self.evaluation)
+        self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
+        self.race.begin(mask, start.position, start.target_gate)
+
+    def step(self, action: Tensor) -> RaceStep:
+        """Fly one control step.
+
+        Args:
+            action: (N, 4); values beyond [-1, 1] are clipped. A drone with a non-finite action has crashed: its episode
+                ends and the others fly on.
+
+        Raises:
+            ValueError: wrong shape.
+        """
+        if action.shape != (self.num_envs, ACTION_SIZE):
+            raise ValueError(
+                f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
+                f"({self.num_envs}, {ACTION_SIZE}): collective thrust and body rates x, y, z, each in [-1, 1]."
+            )
+        invalid = ~action.isfinite().all(dim=1)
+        path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
+        return self.race.step(path, self.simulator.state.body_rates, invalid)
+
+    def render(self, mask: Tensor | None = None) -> Tensor:
+        """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+        return self.simulator.render(mask)
+
+    def privileged(self) -> dict[str, Tensor]:
+        """Copies of what the pixel agent must not see; see the key table in `docs/architecture.md`."""
+        state = self.simulator.state
+        return {
+            "position": state.position.float(),
+            "attitude": state.attitude.float(),
+            "linear_velocity": state.linear_velocity.float(),
+            "body_rates": state.body_rates.float(),
+            "target_gate": self.race.target_gate.unsqueeze(-1).clone(),
+        }
+
+    def close(self) -> None:
+        """Free rendering contexts and threads."""
+        self.simulator.close()

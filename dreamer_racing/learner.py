@@ -1,0 +1,274 @@
+"""The DreamerV3 learner: networks, losses, optimiser, and one update.
+
+Shape legend: B batch, T time, A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, make_loss
+from dreamer_racing.modules import Actor, Critic, DreamerPolicy, ModelSize, WorldModel, get_size
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """Numbers of the learner, all but the networks' sizes.
+
+    Attributes:
+        batch_size: B, windows in a batch.
+        batch_length: T, records in a window.
+        imagination_horizon: H, imagined actions from each start.
+        imagination_starts: Imagine from a random subset of so many records of the batch; None from all of them.
+        discount: γ.
+        lambda_: λ of the returns.
+        entropy_scale: Weight of the actor's entropy.
+        return_decay: Decay of the return percentiles.
+        dynamics_scale: Weight of the dynamics loss.
+        representation_scale: Weight of the representation loss.
+        free_nats: KL below which there is no gradient, nats.
+        slow_critic_scale: Weight of the regularisation towards the slow critic.
+        slow_critic_rate: Fraction by which the slow critic moves at each update.
+        replay_value_scale: Weight of the critic's loss on replayed returns.
+        replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
+        optimizer: Key of ``OPTIMIZERS``.
+        lr: Learning rate; the reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
+        warmup_updates: Updates over which the learning rate rises from zero.
+        world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
+
+    Reference: danijar/dreamerv3, ``configs.yaml``; horizon 16 from the paper, Section III.
+    """
+
+    batch_size: int = 16
+    batch_length: int = 64
+    imagination_horizon: int = 16
+    imagination_starts: int | None = None
+    discount: float = 0.997
+    lambda_: float = 0.95
+    entropy_scale: float = 3e-4
+    return_decay: float = 0.99
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
+    free_nats: float = 1.0
+    slow_critic_scale: float = 1.0
+    slow_critic_rate: float = 0.02
+    replay_value_scale: float = 0.3
+    replay_value_gradient: bool = True
+    optimizer: str = "laprop"
+    lr: float = 4e-5
+    warmup_updates: int = 1000
+    world_model_loss: str = "reconstruction"
+    actor_loss: str = "reinforce"
+    critic_loss: str = "two_hot"
+
+
+class Agent(nn.Module):
+    """The three networks that are trained together.
+
+    Args:
+        size: Their widths.
+        action_dim: A.
+
+    Attributes:
+        world_model: Predicts.
+        actor: Acts.
+        critic: Judges; holds its slow copy.
+    """
+
+    def __init__(self, size: ModelSize, action_dim: int) -> None:
+        super().__init__()
+        head = (size.actor_critic_layers, size.units, size.norm)
+        self.world_model = WorldModel(size, action_dim)
+        self.actor = Actor(size.features, action_dim, *head)
+        self.critic = Critic(size.features, *head, size.bins)
+
+
+def _laprop(parameters: Iterable[nn.Parameter], config: LearnerConfig) -> torch.optim.Optimizer:
+    """Make the 2025 reference's optimiser: LaProp with adaptive gradient clipping."""
+    from torchrl.trainers.algorithms import DreamerV3Optimizer
+
+    return DreamerV3Optimizer(parameters, lr=config.lr, warmup_steps=config.warmup_updates)
+
+
+OPTIMIZERS: dict[str, Callable[[Iterable[nn.Parameter], LearnerConfig], torch.optim.Optimizer]] = {"laprop": _laprop}
+"""Optimiser factories by the name in ``LearnerConfig``; those of your own must clip gradients themselves."""
+
+
+def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
+    """Refuse the state of a model of another size.
+
+    Args:
+        checkpoint: ``state_dict()["size"]`` of a learner.
+        size: The size of the learner that loads it.
+
+    Raises:
+        ValueError: If they differ in anything but the name; the message says in what, and what to do.
+    """
+    wanted = asdict(size)
+    differences = [
+        f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
+        for field in fields(size)
+        if field.name != "name" and _plain(checkpoint.get(field.name)) != _plain(wanted[field.name])
+    ]
+    if differences:
+        raise ValueError(
+            f"The checkpoint holds a model of size {checkpoint.get('name')!r}, but this learner was made with size "
+            f"{size.name!r} ({'; '.join(differences)}). Weights cannot be converted between sizes: start with "
+            f"model={checkpoint.get('name')} to use this checkpoint, or train size {size.name!r} from the beginning."
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Return tuples as lists, as files keep them."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+class DreamerLearner:
+    """World model, actor and critic with their losses and optimiser.
+
+    Args:
+        size: A ``ModelSize`` or its name.
+        action_dim: A.
+        config: Numbers of the learner.
+        device: Where the networks live and updates run.
+        seed: Seed of the initial weights; None takes them from the global generator. Later sampling always uses the
+            global generator of the device, which a checkpoint of yours should save.
+
+    Example:
+        >>> learner = DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3), seed=0)
+        >>> policy = learner.policy()
+        >>> policy.in_keys
+        ['pixels', 'is_init', 'belief', 'state', 'previous_action']
+    """
+
+    def __init__(
+        self,
+        size: ModelSize | str,
+        action_dim: int = 4,
+        config: LearnerConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        self.size = get_size(size)
+        self.config = config or LearnerConfig()
+        self.device = torch.device(device)
+        with torch.random.fork_rng(devices=[], enabled=seed is not None):
+            if seed is not None:
+                torch.manual_seed(seed)
+            self.agent = Agent(self.size, action_dim).to(self.device)
+        self.losses = nn.ModuleDict(
+            {
+                "world_model": make_loss(WORLD_MODEL_LOSSES, self.config.world_model_loss, self.agent, self.config),
+                "actor": make_loss(ACTOR_LOSSES, self.config.actor_loss, self.agent, self.config),
+                "critic": make_loss(CRITIC_LOSSES, self.config.critic_loss, self.agent, self.config),
+            }
+        ).to(self.device)
+        self._networks = {
+            name: [parameter for parameter in network.parameters() if parameter.requires_grad]
+            for name, network in self.agent.named_children()
+        }
+        self.optimizer = OPTIMIZERS[self.config.optimizer](
+            [parameter for parameters in self._networks.values() for parameter in parameters], self.config
+        )
+        self.updates = 0
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step of everything.
+
+        Args:
+            batch: Replay records, batch size ``[B, T]``: ``pixels``, ``previous_action``, ``reward``, ``is_init``,
+                ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
+
+        Returns:
+            Scalar tensors on the device: every loss and metric of the three losses, ``gradient_norm/<network>`` (before
+            clipping) and ``loss``. Reading one waits for the device; do it seldom.
+        """
+        self.optimizer.zero_grad(set_to_none=True)
+        metrics = self.compute_losses(batch.to(self.device))
+        total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
+        total.backward()
+        norms = {f"gradient_norm/{name}": _gradient_norm(parameters) for name, parameters in self._networks.items()}
+        self.optimizer.step()
+        self.agent.critic.update_slow(self.config.slow_critic_rate)
+        self.updates += 1
+        return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
+
+    def compute_losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""
+        model: TensorDict = self.losses["world_model"](batch)
+        context = model.pop("replay_context")
+        imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
+        imagination = imagined.pop("imagination")
+        replay = batch.select("reward", "is_init", "terminated", "truncated")
+        replay.update(context if self.config.replay_value_gradient else context.detach())
+        if self.config.imagination_starts is None:
+            # Every record was a start: its first imagined return is a better value than the critic's.
+            replay.set("bootstrap", imagination.get("lambda_return")[0].reshape(*batch.batch_size, 1))
+        critic: TensorDict = self.losses["critic"](TensorDict({**replay, "imagination": imagination}, []))
+        return {key: value for part in (model, imagined, critic) for key, value in part.items()}
+
+    def policy(self, deterministic: bool = False) -> DreamerPolicy:
+        """Return the acting step, which shares this learner's parameters."""
+        return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
+
+    def open_loop(self, batch: TensorDictBase, context: int) -> Tensor:
+        """Reconstruct the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
+
+        Returns:
+            Images uint8 ``(B, T, 64, 64, 3)``.
+        """
+        pixels, action, is_init = (batch.get(key).to(self.device) for key in ("pixels", "previous_action", "is_init"))
+        return self.agent.world_model.open_loop(pixels, action, is_init.squeeze(-1), context)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        return {
+            "size": asdict(self.size),
+            "agent": self.agent.state_dict(),
+            "losses": {name: _own_state(loss) for name, loss in self.losses.items()},
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned.
+
+        Raises:
+            ValueError: If it is that of a model of another size.
+        """
+        check_size(state_dict["size"], self.size)
+        self.agent.load_state_dict(state_dict["agent"])
+        for name, loss in self.losses.items():
+            loss.load_state_dict(state_dict["losses"][name], strict=False)
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.updates = state_dict["updates"]
+
+    def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
+        """Return the latents ``[N]`` to imagine from, with their ``terminated``."""
+        starts = TensorDict(
+            {"belief": context.get("belief"), "state": context.get("state"), "terminated": batch.get("terminated")},
+            batch.batch_size,
+        )
+        starts = starts.detach().flatten()
+        count = self.config.imagination_starts
+        if count is None:
+            return starts
+        return starts[torch.randperm(len(starts), device=self.device)[:count]]
+
+
+def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
+    """Return the global norm of the gradients, a scalar."""
+    return nn.utils.get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
+
+
+def _own_state(loss: LossModule) -> dict[str, Tensor]:
+    """Return a loss's state without that of the agent's networks, which it holds under their names."""
+    networks = ("world_model.", "actor.", "critic.")
+    return {key: value for key, value in loss.state_dict().items() if not key.startswith(networks)}

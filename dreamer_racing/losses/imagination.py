@@ -1,0 +1,78 @@
+"""Rollouts inside the world model and the returns along them.
+
+Shape legend: N starts, H horizon, F features, A action. Time comes first here, so that a step is one block of memory.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.rssm import RSSM
+from dreamer_racing.modules.world_model import join_features
+
+
+class Imagination(NamedTuple):
+    """An imagined rollout.
+
+    Attributes:
+        features: Belief and state before each action and after the last, ``(H + 1, N, F)``.
+        action: Unclipped samples of the policy, ``(H, N, A)``.
+    """
+
+    features: Tensor
+    action: Tensor
+
+
+@torch.no_grad()
+def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
+    """Let the policy act in the world model.
+
+    No graph is built: REINFORCE needs none.
+
+    Args:
+        rssm: Dynamics.
+        actor: Policy.
+        belief: Starts, ``(N, D)``.
+        state: Starts, ``(N, S)``.
+        horizon: H, number of actions.
+
+    Returns:
+        The rollout.
+    """
+    features, actions = [join_features(belief, state)], []
+    for _ in range(horizon):
+        action = actor(features[-1]).sample()
+        belief, state = rssm.imagine_step(belief, state, action)
+        actions.append(action)
+        features.append(join_features(belief, state))
+    return Imagination(torch.stack(features), torch.stack(actions))
+
+
+def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:
+    """Compute λ-returns, last step first.
+
+    ``G_t = reward_t + discount_t · ((1 − λ_t) · next_value_t + λ_t · G_{t+1})``, and ``G_H = next_value_{H−1}``.
+
+    Args:
+        reward: Received on leaving step t, ``(H, ...)``.
+        next_value: Value of where step t leads, ``(H, ...)``.
+        discount: γ times the continuation of where step t leads, ``(H, ...)``.
+        lambda_: λ, one number or ``(H, ...)``.
+
+    Returns:
+        Returns, ``(H, ...)``.
+
+    Reference: DreamerV3, Eq. 7.
+    """
+    carried = discount * lambda_
+    # reward + discount · (1 − λ) · next_value, of all steps at once
+    intermediate = torch.addcmul(reward, discount - carried, next_value)
+    current, returns = next_value[-1], []
+    for step, factor in zip(reversed(intermediate.unbind(0)), reversed(carried.unbind(0)), strict=True):
+        current = torch.addcmul(step, factor, current)
+        returns.append(current)
+    return torch.stack(returns[::-1])

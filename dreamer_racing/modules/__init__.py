@@ -1,0 +1,35 @@
+"""The agent's networks; plain tensors inside, TensorDict only in ``DreamerPolicy``."""
+
+from dreamer_racing.modules.actor import ActionDistribution, Actor
+from dreamer_racing.modules.critic import Critic
+from dreamer_racing.modules.decoder import ImageDecoder
+from dreamer_racing.modules.encoder import ImageEncoder
+from dreamer_racing.modules.heads import MLP, ContinueHead, TwoHot, TwoHotHead, symexp, symlog
+from dreamer_racing.modules.policy import DreamerPolicy
+from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, DenseGRUCell, Posterior
+from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
+from dreamer_racing.modules.world_model import WorldModel, join_features
+
+__all__ = [
+    "MLP",
+    "RSSM",
+    "SIZES",
+    "ActionDistribution",
+    "Actor",
+    "BlockGRUCell",
+    "ContinueHead",
+    "Critic",
+    "DenseGRUCell",
+    "DreamerPolicy",
+    "ImageDecoder",
+    "ImageEncoder",
+    "ModelSize",
+    "Posterior",
+    "TwoHot",
+    "TwoHotHead",
+    "WorldModel",
+    "get_size",
+    "join_features",
+    "symexp",
+    "symlog",
+]

@@ -1,0 +1,84 @@
+"""Continuous actor.
+
+Shape legend: N any batch, F features, A action.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dreamer_racing.modules.heads import MLP
+
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+class ActionDistribution(NamedTuple):
+    """Independent normal distributions over the action's dimensions.
+
+    Samples may leave [−1, 1]: the environment and the RSSM clip them, and the log-probability is that of the normal.
+
+    Attributes:
+        mean: ``(..., A)``, in [−1, 1].
+        std: ``(..., A)``, in [min_std, max_std].
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def sample(self) -> Tensor:
+        """Draw an action ``(..., A)``, differentiable with respect to mean and std."""
+        return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean))
+
+    def mode(self) -> Tensor:
+        """Return the likeliest action ``(..., A)``."""
+        return self.mean
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """Return the log-density of an action ``(..., A)``, nats, ``(..., 1)``."""
+        deviation = (action - self.mean) / self.std
+        return -(0.5 * deviation.square() + self.std.log() + _LOG_SQRT_2PI).sum(-1, keepdim=True)
+
+    def entropy(self) -> Tensor:
+        """Return the differential entropy Σ ln(σ√(2πe)), nats, ``(..., 1)``."""
+        return (self.std.log() + (0.5 + _LOG_SQRT_2PI)).sum(-1, keepdim=True)
+
+
+class Actor(nn.Module):
+    """Policy π(a | h, z): a normal of mean tanh(·) and of a standard deviation between two bounds.
+
+    Args:
+        in_features: F.
+        action_dim: A.
+        layers: Number of hidden layers.
+        units: Width of the hidden layers.
+        norm: ``"rms"`` or ``"layer"``.
+        min_std: Smallest standard deviation.
+        max_std: Largest standard deviation.
+
+    Reference: danijar/dreamerv3, ``heads.bounded_normal``: std = lo + (hi − lo)·sigmoid(raw + 2).
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        action_dim: int,
+        layers: int,
+        units: int,
+        norm: str = "rms",
+        min_std: float = 0.1,
+        max_std: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.mlp = MLP(in_features, 2 * action_dim, layers, units, norm, output_scale=0.01)
+        self.min_std = min_std
+        self.max_std = max_std
+
+    def forward(self, features: Tensor) -> ActionDistribution:
+        """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
+        mean, raw_std = self.mlp(features).float().chunk(2, -1)
+        std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + 2.0) + self.min_std
+        return ActionDistribution(torch.tanh(mean), std)

@@ -1,0 +1,103 @@
+"""Image encoder: 64×64 RGB to a flat embedding.
+
+Shape legend: N any batch, C channels, E embedding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dreamer_racing.modules.layers import NORMS, initialize
+
+IMAGE_SIZE = 64
+"""Height and width of the images, pixels."""
+
+
+def make_convolution(in_channels: int, out_channels: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+    """Make a convolution that keeps (stride 1) or halves (stride 2) an even image, in channels-last layout."""
+    padding: str | int = "same" if stride == 1 else (kernel - 1) // 2
+    layer = nn.Conv2d(in_channels, out_channels, kernel, stride, padding)
+    initialize(layer.weight, in_channels * kernel**2)
+    nn.init.zeros_(layer.bias)
+    return layer.to(memory_format=torch.channels_last)
+
+
+def fold_patches(images: Tensor, patch: int) -> Tensor:
+    """Fold pixel blocks into channels: ``(N, H, W, C)`` to ``(N, H / patch, W / patch, patch² · C)``."""
+    if patch == 1:
+        return images
+    count, height, width, channels = images.shape
+    blocks = images.view(count, height // patch, patch, width // patch, patch * channels)
+    return blocks.transpose(2, 3).reshape(count, height // patch, width // patch, patch**2 * channels)
+
+
+def unfold_patches(maps: Tensor, patch: int) -> Tensor:
+    """Undo ``fold_patches``."""
+    if patch == 1:
+        return maps
+    count, rows, columns, channels = maps.shape
+    blocks = maps.reshape(count, rows, columns, patch, channels // patch)
+    return blocks.transpose(2, 3).reshape(count, rows * patch, columns * patch, channels // patch**2)
+
+
+class ImageEncoder(nn.Module):
+    """Convolutions that halve the image, each followed by normalisation over channels and SiLU.
+
+    Args:
+        depth: Channels of a stage are ``depth * multiplier``.
+        multipliers: One per stage; each stage halves the image.
+        kernel: Kernel size, pixels.
+        strided: Halve by stride 2 rather than by a 2×2 max-pool; four times fewer FLOPs.
+        norm: ``"rms"`` or ``"layer"``.
+        patch: Side of the pixel blocks that are folded into channels before the first stage; 1 folds nothing.
+
+    Example:
+        >>> encoder = ImageEncoder(depth=4)
+        >>> encoder(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
+        torch.Size([2, 256])
+
+    Reference: danijar/dreamerv3, ``rssm.Encoder``.
+    """
+
+    def __init__(
+        self,
+        depth: int,
+        multipliers: Sequence[int] = (2, 3, 4, 4),
+        kernel: int = 5,
+        strided: bool = False,
+        norm: str = "rms",
+        patch: int = 1,
+    ) -> None:
+        super().__init__()
+        self.patch = patch
+        channels = [depth * multiplier for multiplier in multipliers]
+        stride = 2 if strided else 1
+        self.convolutions = nn.ModuleList(
+            make_convolution(before, after, kernel, stride)
+            for before, after in zip([3 * patch**2, *channels[:-1]], channels, strict=True)
+        )
+        self.norms = nn.ModuleList(NORMS[norm](count) for count in channels)
+        self.pool = nn.Identity() if strided else nn.MaxPool2d(2)
+        resolution = IMAGE_SIZE // patch // 2 ** len(channels)
+        self.embedding_size = resolution**2 * channels[-1]
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Embed images.
+
+        Args:
+            pixels: uint8 ``(..., 64, 64, 3)``.
+
+        Returns:
+            float32 ``(..., E)``.
+        """
+        batch = pixels.shape[:-3]
+        # Channels-last throughout: (N, H, W, C) in memory, (N, C, H, W) to the convolutions.
+        images = fold_patches(pixels.flatten(0, -4), self.patch).float().div_(255.0).sub_(0.5)
+        for convolution, norm in zip(self.convolutions, self.norms, strict=True):
+            maps = self.pool(convolution(images.permute(0, 3, 1, 2)))
+            images = F.silu(norm(maps.permute(0, 2, 3, 1)))
+        return images.reshape(*batch, self.embedding_size)

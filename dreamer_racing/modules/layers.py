@@ -1,0 +1,138 @@
+"""Building blocks that every network shares: initialisation, normalisation and block-diagonal linear layers.
+
+Shape legend: N any batch, I input features, O output features, G blocks.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+NORM_EPS = 1e-4
+"""Epsilon of every normalisation layer. Reference: danijar/dreamerv3, ``nets.Norm``."""
+
+_TRUNCATED_NORMAL_STD = 0.87962566103423978
+"""Standard deviation of a unit normal truncated at ±2, by which the initial weights are corrected."""
+
+
+def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
+    """Fill a weight in place from a normal truncated at two deviations, of variance ``scale² / fan_in``.
+
+    Args:
+        weight: Parameter to fill, any shape.
+        fan_in: Inputs that each output sums over.
+        scale: Multiplier of the deviation; 0 makes the layer output its bias.
+
+    Reference: danijar/dreamerv3, initialiser ``trunc_normal_in``.
+    """
+    if scale == 0.0:
+        nn.init.zeros_(weight)
+        return
+    std = scale / math.sqrt(fan_in) / _TRUNCATED_NORMAL_STD
+    nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
+
+
+def linear(in_features: int, out_features: int, bias: bool = True, scale: float = 1.0) -> nn.Linear:
+    """Make a linear layer with the reference's initial weights and a zero bias.
+
+    Args:
+        in_features: I.
+        out_features: O.
+        bias: Whether the layer has a bias.
+        scale: Multiplier of the initial weights.
+    """
+    layer = nn.Linear(in_features, out_features, bias=bias)
+    initialize(layer.weight, in_features, scale)
+    if bias:
+        nn.init.zeros_(layer.bias)
+    return layer
+
+
+class RMSNorm(nn.Module):
+    """Divide features by their root mean square, then scale them (no shift).
+
+    Args:
+        features: Size of the last dimension.
+
+    Reference: Zhang & Sennrich 2019; used by the 2025 DreamerV3.
+    """
+
+    shifts = False
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(features))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Normalise ``(..., features)`` over its last dimension."""
+        return F.rms_norm(inputs, self.weight.shape, self.weight, NORM_EPS)
+
+
+class LayerNorm(nn.LayerNorm):
+    """Layer normalisation of the 2023 DreamerV3; on CPU one fused kernel, 4-9 times faster than RMS backward."""
+
+    shifts = True
+
+    def __init__(self, features: int) -> None:
+        super().__init__(features, eps=NORM_EPS)
+
+
+NORMS: dict[str, type[RMSNorm] | type[LayerNorm]] = {"rms": RMSNorm, "layer": LayerNorm}
+"""Normalisation classes by the name that a ``ModelSize`` gives."""
+
+
+class NormedLinear(nn.Module):
+    """Linear layer, normalisation, SiLU.
+
+    The linear layer has a bias only where the normalisation has no shift of its own.
+
+    Args:
+        in_features: I.
+        out_features: O.
+        norm: Key of ``NORMS``.
+    """
+
+    def __init__(self, in_features: int, out_features: int, norm: str) -> None:
+        super().__init__()
+        self.norm = NORMS[norm](out_features)
+        self.linear = linear(in_features, out_features, bias=not self.norm.shifts)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map ``(..., I)`` to ``(..., O)``."""
+        return F.silu(self.norm(self.linear(inputs)))
+
+
+class BlockLinear(nn.Module):
+    """Linear layer whose weight is block-diagonal: output block g sees input block g only.
+
+    Args:
+        in_features: I, divisible by ``blocks``.
+        out_features: O, divisible by ``blocks``.
+        blocks: G.
+        fan_in: Inputs that each output sums over, where other layers add to this one's output; default I / G.
+        bias: Whether the layer has a bias.
+
+    Raises:
+        ValueError: If a size is not divisible by ``blocks``.
+    """
+
+    def __init__(
+        self, in_features: int, out_features: int, blocks: int, fan_in: int | None = None, bias: bool = True
+    ) -> None:
+        super().__init__()
+        if in_features % blocks or out_features % blocks:
+            raise ValueError(f"BlockLinear: {in_features} and {out_features} features must divide into {blocks} blocks")
+        self.blocks = blocks
+        self.weight = nn.Parameter(torch.empty(blocks, in_features // blocks, out_features // blocks))
+        self.bias = nn.Parameter(torch.zeros(out_features)) if bias else None
+        initialize(self.weight, fan_in or in_features // blocks)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map ``(N, I)`` to ``(N, O)``."""
+        # (N, I) -> (G, N, I/G), multiplied, -> (N, O)
+        blocked = inputs.unflatten(-1, (self.blocks, -1)).transpose(0, 1)
+        outputs = torch.bmm(blocked, self.weight).transpose(0, 1).flatten(1)
+        return outputs if self.bias is None else outputs + self.bias

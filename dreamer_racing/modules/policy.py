@@ -1,0 +1,83 @@
+"""The acting step as a TensorDictModule.
+
+Shape legend: N environments, A action, D belief, S state.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+
+from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.world_model import WorldModel, join_features
+
+
+class DreamerPolicy(TensorDictModuleBase):
+    """Observe, update the latent, act.
+
+    The recurrent keys are read at the root and written under ``"next"``, from where the environment's step carries
+    them to the next root; append ``make_primer()`` and ``InitTracker()`` to the environment so that they exist. Where
+    ``is_init``, what the root holds is ignored, so partial and automatic resets need nothing more.
+
+    Args:
+        world_model: Its encoder and RSSM are used (and shared, not copied).
+        actor: The policy head.
+        deterministic: Take the posterior's and the actor's mode instead of samples; may be set at any time.
+
+    | key | read / written | shape |
+    |---|---|---|
+    | ``pixels`` | read | uint8 (N, 64, 64, 3) |
+    | ``is_init`` | read | bool (N, 1) |
+    | ``belief``, ``state``, ``previous_action`` | read | (N, D), (N, S), (N, A) |
+    | ``action`` | written | (N, A) in [−1, 1] |
+    | ``("next", "belief")``, ``("next", "state")``, ``("next", "previous_action")`` | written | as above |
+    """
+
+    def __init__(self, world_model: WorldModel, actor: Actor, deterministic: bool = False) -> None:
+        super().__init__()
+        self.in_keys = ["pixels", "is_init", "belief", "state", "previous_action"]
+        self.out_keys = ["action", ("next", "belief"), ("next", "state"), ("next", "previous_action")]
+        self.encoder = world_model.encoder
+        self.rssm = world_model.rssm
+        self.actor = actor
+        self.deterministic = deterministic
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and the next recurrent keys.
+
+        Args:
+            tensordict: Batch size ``[N]`` or ``[]``.
+
+        Returns:
+            The same tensordict.
+        """
+        batch = tensordict.batch_size
+        flat = {key: tensordict.get(key).reshape(-1, *tensordict.get(key).shape[len(batch) :]) for key in self.in_keys}
+        belief, state = self.rssm.observe_step(
+            self.encoder(flat["pixels"]),
+            flat["previous_action"],
+            flat["is_init"].flatten(),
+            flat["belief"],
+            flat["state"],
+            deterministic=self.deterministic,
+        )
+        policy = self.actor(join_features(belief, state))
+        action = (policy.mode() if self.deterministic else policy.sample()).clamp(-1.0, 1.0)
+        for key, value in zip(self.out_keys, (action, belief, state, action), strict=True):
+            tensordict.set(key, value.reshape(*batch, -1))
+        return tensordict
+
+    def make_primer(self) -> TensorDictPrimer:
+        """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size."""
+        size = {
+            "belief": self.rssm.initial_belief.shape[-1],
+            "state": self.rssm.latents * self.rssm.classes,
+            "previous_action": self.rssm.cell.action_dim,
+        }
+        device = self.rssm.initial_belief.device
+        specs = {key: Unbounded(shape=(width,), device=device) for key, width in size.items()}
+        return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

@@ -1,0 +1,122 @@
+"""Named model sizes: every number that fixes the shape of the agent's networks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ModelSize:
+    """Widths and variants of all networks.
+
+    Attributes:
+        name: Key in ``SIZES``, or any name for a size of your own.
+        belief: Width of the recurrent state h.
+        hidden: Width of the RSSM's inner layers.
+        latents: Number of categorical latents in z.
+        classes: Classes of each categorical latent.
+        units: Width of the reward, continue, actor and critic layers.
+        recurrence: ``"block"`` (2025 block GRU) or ``"dense"`` (2023 GRU).
+        blocks: Diagonal blocks of the block GRU and of the decoder's first layer (1: dense decoder input).
+        prior_layers: Hidden layers from h to the prior's logits.
+        head_layers: Hidden layers of the reward and continue heads.
+        actor_critic_layers: Hidden layers of actor and critic.
+        norm: ``"rms"`` or ``"layer"``; layer norm is much the cheaper on CPU.
+        learned_initial: Whether an episode's first h is learned (2023) or zero (2025).
+        cnn_depth: Channels of a convolution are ``cnn_depth * multiplier``.
+        cnn_multipliers: One per halving of the 64-pixel image.
+        cnn_kernel: Kernel size of every convolution, pixels.
+        strided: Halve by stride (a quarter of the FLOPs) rather than by 2×2 max-pool.
+        cnn_patch: Side of the pixel blocks folded into channels before the first convolution (1: none). With 2, the
+            widest maps and their normalisation disappear, at nearly the same FLOPs.
+        bins: Bins of the two-hot reward and value distributions.
+    """
+
+    name: str
+    belief: int
+    hidden: int
+    classes: int
+    units: int
+    cnn_depth: int
+    latents: int = 32
+    recurrence: str = "block"
+    blocks: int = 8
+    prior_layers: int = 2
+    head_layers: int = 1
+    actor_critic_layers: int = 3
+    norm: str = "rms"
+    learned_initial: bool = False
+    cnn_multipliers: tuple[int, ...] = (2, 3, 4, 4)
+    cnn_kernel: int = 5
+    strided: bool = False
+    cnn_patch: int = 1
+    bins: int = 255
+
+    @property
+    def state(self) -> int:
+        """Width of the stochastic state z: flattened one-hots."""
+        return self.latents * self.classes
+
+    @property
+    def features(self) -> int:
+        """Width of what the heads read: h and z."""
+        return self.belief + self.state
+
+
+def _reference(name: str, belief: int, hidden: int, classes: int) -> ModelSize:
+    """Size of the 2025 reference, where depth equals classes and units equal hidden."""
+    return ModelSize(name, belief=belief, hidden=hidden, classes=classes, units=hidden, cnn_depth=classes)
+
+
+_CPU = {
+    "recurrence": "dense",
+    "blocks": 1,
+    "prior_layers": 1,
+    "norm": "layer",
+    "cnn_multipliers": (2, 3, 4),
+    "cnn_kernel": 4,
+    "strided": True,
+    "cnn_patch": 2,
+}
+"""What makes a size cheap on CPU: fused layer norm, few calls a recurrent step, strided convolutions."""
+
+SIZES: dict[str, ModelSize] = {
+    size.name: size
+    for size in (
+        ModelSize("debug", belief=32, hidden=16, latents=4, classes=4, units=16, cnn_depth=2,
+                  head_layers=1, actor_critic_layers=1, **_CPU),
+        ModelSize("cpu_small", belief=256, hidden=128, latents=16, classes=16, units=128, cnn_depth=12,
+                  actor_critic_layers=2, **_CPU),
+        _reference("size1m", 512, 64, 4),
+        _reference("size12m", 2048, 256, 16),
+        _reference("size25m", 3072, 384, 24),
+        _reference("size50m", 4096, 512, 32),
+        _reference("size100m", 6144, 768, 48),
+        _reference("size200m", 8192, 1024, 64),
+        # The paper's "Large": the 2023 architecture of 77 M parameters, not the block GRU of the same widths.
+        ModelSize("paper_large", belief=2048, hidden=768, classes=32, units=768, cnn_depth=64,
+                  recurrence="dense", blocks=1, prior_layers=1, head_layers=4, actor_critic_layers=4, norm="layer",
+                  learned_initial=True, cnn_multipliers=(1, 2, 4, 8), cnn_kernel=4, strided=True),
+    )
+}  # fmt: skip
+"""Sizes by name. Reference: danijar/dreamerv3 ``configs.yaml``; paper, "Large (L)" configuration."""
+
+
+def get_size(size: ModelSize | str) -> ModelSize:
+    """Return a size itself, or the one of that name.
+
+    Args:
+        size: A ``ModelSize`` or a key of ``SIZES``.
+
+    Raises:
+        ValueError: If no size has that name; the message lists those that exist.
+
+    Example:
+        >>> get_size("size12m").belief
+        2048
+    """
+    if isinstance(size, ModelSize):
+        return size
+    if size not in SIZES:
+        raise ValueError(f"Unknown model size {size!r}. Known sizes: {', '.join(SIZES)}.")
+    return SIZES[size]
