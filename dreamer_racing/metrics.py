@@ -252,10 +252,10 @@ class EpisodeTracker:
         """
         if not len(episodes):
             return {}
-        names = [name for name in ("return", "length", "gates_passed") if name in episodes.keys()]
+        names = [name for name in ("return", "length", "gates_passed") if name in episodes]
         metrics = {f"episode/{name}": episodes[name].double().mean().item() for name in names}
         for cause in self.crash_causes or ():
-            if cause and "crash" in episodes.keys():
+            if cause and "crash" in episodes:
                 metrics[f"crash/{cause.name.lower()}"] = (episodes["crash"] == cause).double().mean().item()
         return metrics
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers import RandomSampler, Storage, Writer
 from torchrl.envs.transforms import Compose, DeviceCastTransform, Transform
 
@@ -103,13 +103,21 @@ def _check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
         raise ValueError(f"The replay stores {key!r} as {expected}, got {layout}.")
 
 
-class _RecordAccess:
-    """Storage mixin: indexed copies of whole records. Its length is the number of filled slots, wherever they lie."""
+class _RecordAccess(TensorStorage):
+    """Indexed copies of whole records, over slots of which any may be filled; its length is how many are."""
+
+    def fields(self) -> Iterator[tuple[NestedKey, Tensor]]:
+        """Yields what a record has: key and values of all slots ``(N·L, ...)``. Nothing before the first write."""
+        if self.initialized:
+            yield from self._storage.items(include_nested=True, leaves_only=True)
+
+    def set_length(self, filled: int) -> None:
+        self._len = filled
 
     def set(self, cursor: Tensor | slice, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         if not self.initialized:
             self._init(data[0])
-        for key, stored in self._storage.items(include_nested=True, leaves_only=True):
+        for key, stored in self.fields():
             new = data.get(key).to(self.device, non_blocking=True)
             _check_layout(key, new, stored)
             if isinstance(cursor, slice):
@@ -119,13 +127,11 @@ class _RecordAccess:
         self._bump_mutation_revision()
 
     def get(self, index: Tensor | slice) -> TensorDictBase:
-        if not self.initialized:
-            raise RuntimeError("The replay holds no record yet: call extend() first.")
         if not isinstance(index, Tensor):
             return self._storage[index]
         index = index.to(self.device)
         out = TensorDict({}, batch_size=index.shape, device=self.device)
-        for key, stored in self._storage.items(include_nested=True, leaves_only=True):
+        for key, stored in self.fields():
             rows = _rows(stored).index_select(0, index.flatten())
             out.set(key, rows.view(stored.dtype).view(*index.shape, *stored.shape[1:]))
         return out
@@ -153,6 +159,8 @@ class StreamWriter(Writer):
         filled: int64 ``(N,)``, records each stream holds.
     """
 
+    _storage: _RecordAccess
+
     def __init__(self, num_streams: int, stream_length: int) -> None:
         super().__init__()
         self.num_streams = num_streams
@@ -172,14 +180,11 @@ class StreamWriter(Writer):
             Slots, int64 ``(M,)``, on the CPU.
 
         Raises:
-            ValueError: if a record belongs to no stream of this replay.
+            ValueError: if the rollout is of another number of environments.
         """
         stream, order = torch.stack([data["stream"], data["order"]]).cpu()
-        if stream.min() < 0 or stream.max() >= self.num_streams:
-            raise ValueError(
-                f"The rollout has environment {int(stream.max())}, but the replay was made for "
-                f"num_envs={self.num_streams} environments."
-            )
+        if (found := int(stream.max()) + 1) != self.num_streams:
+            raise ValueError(f"The rollout is of {found} environments, the replay was made for {self.num_streams}.")
         count = torch.bincount(stream, minlength=self.num_streams)  # (N,)
         slots = stream * self.stream_length + (self.cursor[stream] + order) % self.stream_length
         kept = order >= (count - self.stream_length)[stream]
@@ -191,7 +196,7 @@ class StreamWriter(Writer):
         self.cursor = (self.cursor + count) % self.stream_length
         self.filled = (self.filled + count).clamp(max=self.stream_length)
         self._write_count += len(stream)
-        self._storage._len = int(self.filled.sum())
+        self._storage.set_length(int(self.filled.sum()))
         return slots
 
     def slots(self, stream: int) -> Tensor:
@@ -229,7 +234,7 @@ class StreamWriter(Writer):
         self.cursor = torch.tensor(state_dict["cursor"], dtype=torch.int64)
         self.filled = torch.tensor(state_dict["filled"], dtype=torch.int64)
         self._write_count = state_dict["write_count"]
-        self._storage._len = int(self.filled.sum())
+        self._storage.set_length(int(self.filled.sum()))
 
     def dumps(self, path: str | Path) -> None:
         Path(path).write_text(json.dumps(self.state_dict()), encoding="utf-8")
@@ -289,6 +294,10 @@ class StreamReplay(TensorDictReplayBuffer):
         **kwargs: of `TensorDictReplayBuffer`.
     """
 
+    _storage: _RecordAccess
+    _writer: StreamWriter
+    _rng: torch.Generator
+
     def __init__(self, *, observation_keys: Sequence[NestedKey] = ("pixels",), **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.observation_keys = tuple(observation_keys)
@@ -309,8 +318,7 @@ class StreamReplay(TensorDictReplayBuffer):
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
         fields = []
-        leaves = self._storage._storage.items(include_nested=True, leaves_only=True) if len(self) else ()
-        for number, (key, stored) in enumerate(leaves):
+        for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
             fields.append({"key": key, "shape": list(stored.shape[1:]), "dtype": str(stored.dtype)})
             with (path / f"{number}.bin").open("wb") as file:
                 for part in self._filled():
@@ -349,13 +357,9 @@ class StreamReplay(TensorDictReplayBuffer):
             size = count * math.prod(field["shape"])
             values = torch.from_file(str(path / f"{number}.bin"), shared=False, size=size, dtype=dtype)
             saved.set(key, values.view(count, *field["shape"]))
-        if self._storage.initialized and fields:
-            for key, stored in self._storage._storage.items(include_nested=True, leaves_only=True):
-                _check_layout(key, saved.get(key), stored)
+        for key, stored in self._storage.fields() if fields else ():
+            _check_layout(key, saved.get(key), stored)
         return saved
-
-    def state_dict(self) -> dict[str, Any]:
-        raise NotImplementedError("A replay is too large for a state dict: use dump(path) and load(path).")
 
 
 def replay_bytes(capacity: int, image_shape: Sequence[int] = (64, 64, 3), action_size: int = 4) -> int:
@@ -412,7 +416,7 @@ def make_replay(
         records = StreamMemmapStorage(slots, scratch_dir=scratch_dir, existsok=True)
     else:
         records = StreamTensorStorage(slots, device=storage_device or device)
-    transforms = [] if transform is None else [transform]
+    transforms: list[Transform] = [] if transform is None else [transform]
     if records.device != torch.empty((), device=device).device:
         transforms.insert(0, DeviceCastTransform(device))
     writer = StreamWriter(num_envs, stream_length)

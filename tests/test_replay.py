@@ -49,7 +49,7 @@ class CountingEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDict | None = None) -> TensorDict:
         reset = torch.ones(len(self.seen), dtype=torch.bool)
-        if tensordict is not None and "_reset" in tensordict.keys():
+        if tensordict is not None and "_reset" in tensordict:
             reset = tensordict["_reset"].squeeze(-1)
         self.seen += reset
         extra = {"reward_base": torch.zeros(len(self.seen), 1), "body_rate_norm": torch.zeros(len(self.seen), 1)}
@@ -59,9 +59,7 @@ class CountingEnv(EnvBase):
         self.seen += 1
         ended, crashed = self._rand() < self.end, self._rand() < 0.5
         flags = {"done": ended, "terminated": ended & crashed, "truncated": ended & ~crashed}
-        return TensorDict(
-            {**self._observation(), **flags, **{key: self._rand() for key in REWARDS}}, [len(self.seen)]
-        )
+        return TensorDict({**self._observation(), **flags, **{key: self._rand() for key in REWARDS}}, [len(self.seen)])
 
     def _set_seed(self, seed: int | None) -> None: ...
 
@@ -260,10 +258,15 @@ def test_dump_and_load_continue_the_same_samples(tmp_path):
 
 
 def test_an_empty_replay_is_saved_too(tmp_path):
-    make_replay(100, 2, 4, 5).dump(tmp_path)
-    restored = make_replay(100, 2, 4, 5)
-    restored.load(tmp_path)
-    assert len(restored) == 0
+    emptied = make_replay(100, 2, 4, 5)
+    emptied.extend(collect(CountingEnv(2), steps=5, batches=1)[0])
+    emptied.empty()
+    for replay in (make_replay(100, 2, 4, 5), emptied):
+        replay.dump(tmp_path)
+        restored = make_replay(100, 2, 4, 5)
+        restored.load(tmp_path)
+        assert len(restored) == 0
+        assert len(restored.records(0)) == 0
 
 
 def test_load_refuses_other_shapes(tmp_path):
@@ -283,7 +286,7 @@ def test_errors_say_what_is_wrong():
     rollout = collect(CountingEnv(3), steps=5, batches=1)[0]
     with pytest.raises(ValueError, match="at least 64"):
         make_replay(10, 1, 6, 64)
-    with pytest.raises(ValueError, match="num_envs=2"):
+    with pytest.raises(ValueError, match="of 3 environments, the replay was made for 2"):
         make_replay(100, 2, 6, 4).extend(rollout)
     with pytest.raises(KeyError, match="InitTracker"):
         records_from_rollout(rollout.exclude("is_init"))
@@ -301,3 +304,10 @@ def test_size_is_known_before_allocation():
     replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
     assert replay.storage._storage.bytes() == replay_bytes(60, (2, 2, 2))
     assert replay_bytes(1_000_000) == pytest.approx(12.3e9, rel=0.01)
+
+
+def test_samples_are_delivered_where_the_learner_is():
+    replay = make_replay(60, 3, 6, 4, device="meta", storage_device="cpu")
+    replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
+    assert replay.records(0)["pixels"].device.type == "cpu"
+    assert {value.device.type for value in replay.sample().values()} == {"meta"}

@@ -6,7 +6,7 @@ The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: 
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import Camera
@@ -23,7 +23,7 @@ class RaceWorlds:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        evaluation: start at the start pose, at rest, with nominal parameters, and finish after the track's laps.
+        evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
         episode_steps: control steps until an episode is truncated; 1000 are 20 s.
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
@@ -68,8 +68,7 @@ class RaceWorlds:
         self.num_envs = num_envs
         self.evaluation = evaluation
         self.camera = camera or Camera()
-        parameters = load_preset(preset)
-        self.parameters = without_randomisation(parameters) if evaluation else parameters
+        self.parameters = load_preset(preset)
         self._generator = torch.Generator(device)
         self.seed(seed)
         self.simulator: Simulator = MujocoSimulator(

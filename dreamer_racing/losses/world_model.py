@@ -114,8 +114,7 @@ class WorldModelLoss(LossModule):
         return TensorDict({**losses, "replay_context": context}, [])
 
     def _image_losses(self, posterior: Posterior, pixels: Tensor) -> dict[str, Tensor]:
-        predicted = self.world_model.decoder(posterior.belief, posterior.state)
-        error = F.mse_loss(predicted.float(), pixels.float().div_(255.0))
+        error = self.world_model.decoder.squared_error(posterior.belief, posterior.state, pixels)
         # Mean over the batch of the sum over an image.
         return {"loss_image": error * pixels.shape[-3:].numel(), "image_error": error.detach()}
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.encoder import IMAGE_SIZE, make_convolution, unfold_patches
+from dreamer_racing.modules.encoder import IMAGE_SIZE, fold_patches, make_convolution, unfold_patches
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize, linear
 
 
@@ -131,8 +131,26 @@ class ImageDecoder(nn.Module):
         Returns:
             Mean of the image in [0, 1], ``(..., 64, 64, 3)``.
         """
-        batch = belief.shape[:-1]
+        images = unfold_patches(self._folded(belief, state), self.patch)
+        return images.reshape(*belief.shape[:-1], IMAGE_SIZE, IMAGE_SIZE, 3)
+
+    def squared_error(self, belief: Tensor, state: Tensor, pixels: Tensor) -> Tensor:
+        """Compare predicted images with true ones, in whatever order of pixels is cheapest.
+
+        Args:
+            belief: ``(..., belief)``.
+            state: ``(..., state)``.
+            pixels: uint8 ``(..., 64, 64, 3)``.
+
+        Returns:
+            Mean over batch, pixels and channels of the squared error of values in [0, 1], a scalar.
+        """
+        target = fold_patches(pixels.flatten(0, -4), self.patch).float().div_(255.0)
+        return F.mse_loss(self._folded(belief, state).float(), target)
+
+    def _folded(self, belief: Tensor, state: Tensor) -> Tensor:
+        """Predict images ``(N, 64 / patch, 64 / patch, patch² · 3)``."""
         maps = self.projection(belief.flatten(0, -2), state.flatten(0, -2))
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
             maps = convolution(F.silu(norm(maps)).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-        return torch.sigmoid(unfold_patches(maps, self.patch)).reshape(*batch, IMAGE_SIZE, IMAGE_SIZE, 3)
+        return torch.sigmoid(maps)

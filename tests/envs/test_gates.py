@@ -19,7 +19,7 @@ HALF_OPENING, HALF_OUTER = 0.65, 1.025  # m: 1.5 / 2 less the margin of 0.1, and
 # Gate 0 faces +x, so that a point's x is its distance beyond the plane; gate 1 is far away.
 PLAIN = make_track(
     "plain",
-    [Gate((0.0, 0.0, 3.0), 0.0), Gate((20.0, 0.0, 3.0), 90.0)],
+    [Gate((0.0, 0.0, 3.0), 0.0), Gate((20.0, 7.0, 3.0), 90.0)],
     decoys=[Gate((5.0, 0.0, 3.0), 0.0, kind="decoy")],
     bounds_low=(-50.0, -50.0, 0.0),
     bounds_high=(50.0, 50.0, 50.0),
@@ -260,11 +260,13 @@ class Reference(NamedTuple):
     offset: float
     crash: int
     doubt: float  # how near the path comes to a different answer, m or segments
+    nearest_sample: float  # least distance of a sample from a gate's plane, m: near 0, rounding decides its side
 
 
 def reference(track: Track, points, target: int) -> Reference:
     """The rules again, event by event, for one drone whose positions are finite."""
     events, doubts = [], [1.0]
+    nearest_sample = min(abs(_in_gate_axes(gate, point)[0]) for gate in track.gates for point in points)
     for segment, (start, end) in enumerate(zip(points, points[1:], strict=False)):
         for index, gate in enumerate(track.gates):
             a, b = (_in_gate_axes(gate, point) for point in (start, end))
@@ -273,7 +275,7 @@ def reference(track: Track, points, target: int) -> Reference:
             fraction = a[0] / (a[0] - b[0])
             left, up = (a[axis] + fraction * (b[axis] - a[axis]) for axis in (1, 2))
             far = max(abs(left), abs(up))
-            doubts += [abs(far - HALF_OPENING), abs(far - HALF_OUTER)]
+            doubts += [abs(far - HALF_OPENING), abs(far - HALF_OUTER), abs(a[0] - b[0])]
             if far < HALF_OUTER:
                 if far >= HALF_OPENING:
                     events.append((segment + fraction, FRAME, 0.0))
@@ -296,10 +298,10 @@ def reference(track: Track, points, target: int) -> Reference:
     passed, offset = False, 0.0
     for _, cause, distance in events:
         if cause != NONE:
-            return Reference(passed, offset, cause, min(doubts))
+            return Reference(passed, offset, cause, min(doubts), nearest_sample)
         if not passed:
             passed, offset = True, distance
-    return Reference(passed, offset, NONE, min(doubts))
+    return Reference(passed, offset, NONE, min(doubts), nearest_sample)
 
 
 def _in_gate_axes(gate: Gate, point):
@@ -319,7 +321,8 @@ def _out_of_gate_axes(gate: Gate, point):
     )
 
 
-near = st.floats(-1.4, 1.4, allow_nan=False)
+# Hypothesis loves zeros: moved a little, they seldom put a sample on a plane, which has tests of its own above.
+near = st.floats(-1.4, 1.4).map(lambda number: number + 0.0137)
 local_paths = st.lists(st.tuples(near, near, near), min_size=2, max_size=7)  # in a gate's axes
 tracks = st.sampled_from([load_track(name) for name in ("circle", "kidney", "figure8", "split_s")] + [PLAIN])
 
@@ -339,10 +342,8 @@ def flights(draw):
 def test_agrees_with_the_reference(flight):
     track, target, points = flight
     expected = reference(track, points, target)
-    assume(expected.doubt > 1e-6)
-    inside = all(
-        low <= x <= high for low, x, high in zip(track.bounds_low, points[0], track.bounds_high, strict=True)
-    )
+    assume(min(expected.doubt, expected.nearest_sample) > 1e-6)
+    inside = all(low <= x <= high for low, x, high in zip(track.bounds_low, points[0], track.bounds_high, strict=True))
     assume(inside and points[0][2] >= GROUND_HEIGHT)
     result = sweep(track, points, target)
     assert (result.passed, result.crash) == (expected.passed, expected.crash)
@@ -401,11 +402,10 @@ def test_cutting_a_control_step_in_two_changes_nothing(flight, data):
 @given(local_paths, st.floats(-180, 180), st.tuples(*[st.floats(-20, 20)] * 2), st.floats(0, 20))
 def test_moving_track_and_path_together_changes_nothing(points, turn, shift, lift):
     points = [(x, y, z + 3) for x, y, z in points]
-    assume(reference(PLAIN, points, 0).doubt > 1e-6)
+    expected = reference(PLAIN, points, 0)
+    assume(min(expected.doubt, expected.nearest_sample) > 1e-6)
     mover = Gate((*shift, lift), turn)  # its axes are the moved world's
-    gates = tuple(
-        Gate(_out_of_gate_axes(mover, gate.position), gate.yaw_degrees + turn) for gate in PLAIN.gates
-    )
+    gates = tuple(Gate(_out_of_gate_axes(mover, gate.position), gate.yaw_degrees + turn) for gate in PLAIN.gates)
     wide = {"bounds_low": (-100.0, -100.0, 0.0), "bounds_high": (100.0, 100.0, 100.0)}
     here = sweep(dataclasses.replace(PLAIN, **wide), points)
     there = sweep(dataclasses.replace(PLAIN, gates=gates, **wide), [_out_of_gate_axes(mover, p) for p in points])

@@ -16,6 +16,9 @@ from itertools import permutations
 
 from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
 
+ROUNDING = 1e-9
+"""How far (m) rounding may carry a point over a limit that it stands on."""
+
 START_CLEARANCE = 0.3
 """Distance (m) that every start keeps from the bounding box and the ground [choice]."""
 
@@ -157,14 +160,14 @@ def _check_start(track: Track, source: str) -> None:
         allowed = f"at least {START_CLEARANCE} m inside the bounding box {_box(track)} and above {GROUND_HEIGHT} m"
         raise _error(source, "start.position", start, allowed)
     forward, _, _ = _coordinates(track.gates[0], start)
-    if forward > -GATE_CLEARANCE:
+    if forward > -GATE_CLEARANCE + ROUNDING:
         state = f"{-forward:.2f} m before" if forward <= 0 else f"{forward:.2f} m behind"
         allowed = f"at least {GATE_CLEARANCE} m before the plane of gates[0]: it is {state}"
         raise _error(source, "start.position", start, allowed)
     reach = track.shape.outer / 2 + GATE_CLEARANCE
     for index, gate in enumerate(track.gates):
         forward, left, up = _coordinates(gate, start)
-        if abs(forward) < GATE_CLEARANCE and max(abs(left), abs(up)) < reach:
+        if abs(forward) < GATE_CLEARANCE - ROUNDING and max(abs(left), abs(up)) < reach:
             allowed = f"at least {GATE_CLEARANCE} m from the plane or the frame of gates[{index}] at {gate.position}"
             raise _error(source, "start.position", start, allowed)
 
@@ -212,8 +215,8 @@ def _dot(a: Vector | list[float], b: Vector) -> float:
 
 
 def _inside(point: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether a point lies in a box, its surface included (to 1 nm, for rounding)."""
-    return all(a - 1e-9 <= x <= b + 1e-9 for a, x, b in zip(low, point, high, strict=True))
+    """Tell whether a point lies in a box, its surface included."""
+    return all(a - ROUNDING <= x <= b + ROUNDING for a, x, b in zip(low, point, high, strict=True))
 
 
 def _box(track: Track) -> str:

@@ -1,0 +1,116 @@
+"""What an evaluation leaves to look at: numbers, a plot of the flight, and the world model's dream beside it.
+
+Shapes: K control steps of a recorded episode.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
+from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.plotting import plot_top_down
+from dreamer_racing.recording import side_by_side, write_video
+
+CONTEXT, DREAM = 10, 40  # control steps the model sees, then predicts on its own, in the video
+
+
+class EvaluationReport:
+    """Evaluates a learner's policy and writes plot, video and numbers into its run directory.
+
+    Args:
+        directory: of the run; files go to its `plots`, `videos` and `evaluations` folders.
+        learner: whose policy flies and whose world model dreams.
+        worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
+        episodes: episodes of an evaluation.
+        video_steps: control steps K that the video shows at most.
+        num_envs: episodes flown side by side.
+        seed: of the evaluation's environment.
+    """
+
+    def __init__(
+        self,
+        directory: str | Path,
+        learner: DreamerLearner,
+        worlds: dict[str, Any],
+        episodes: int,
+        video_steps: int = 500,
+        num_envs: int = 8,
+        seed: int = 0,
+    ) -> None:
+        self.directory = Path(directory)
+        self.episodes = episodes
+        self.video_steps = video_steps
+        self._learner = learner
+        self._policy = learner.policy()
+        self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
+        self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer().cpu()))
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+
+        Returns:
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+        """
+        metrics = self._one(f"{env_steps:09d}", "evaluation", deterministic=True)
+        if stochastic:
+            metrics |= self._one(f"{env_steps:09d}_stochastic", "evaluation_stochastic", deterministic=False)
+        return metrics
+
+    def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
+        result = self.evaluate(deterministic)
+        self.write(name, result)
+        numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
+        return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
+
+    def evaluate(self, deterministic: bool) -> Evaluation:
+        """Fly the episodes."""
+        self._policy.deterministic = deterministic
+        return evaluate(self._env, self._policy, self.episodes, max_recorded_steps=1000)
+
+    def write(self, name: str, result: Evaluation) -> None:
+        """Write `evaluations/<name>.json`, `plots/<name>.png` and `videos/<name>.mp4`."""
+        for folder in ("evaluations", "plots", "videos"):
+            (self.directory / folder).mkdir(parents=True, exist_ok=True)
+        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
+        trajectory = result.trajectories[0]
+        plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
+        frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
+        write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+
+    def close(self) -> None:
+        """Free the evaluation's simulator."""
+        self._env.close(raise_if_closed=False)
+
+
+@torch.no_grad()
+def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_steps: int) -> Tensor:
+    """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
+
+    Args:
+        learner: whose world model dreams.
+        trajectory: a recorded episode with images.
+        max_steps: K at most.
+
+    Returns:
+        uint8 frames (K, height, width, 3).
+    """
+    assert trajectory.pixels is not None
+    pixels = trajectory.pixels[:max_steps]
+    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))[:max_steps]  # (K, A) the action that led here
+    is_init = torch.zeros(len(pixels), 1, dtype=torch.bool)
+    is_init[0] = True
+    shown = []
+    for start in range(0, len(pixels), CONTEXT + DREAM):
+        part = slice(start, start + CONTEXT + DREAM)
+        window = {"pixels": pixels[part], "previous_action": action[part], "is_init": is_init[part]}
+        batch = TensorDict({key: value.unsqueeze(0) for key, value in window.items()}, [1, len(pixels[part])])
+        dream = learner.open_loop(batch, min(CONTEXT, batch.shape[1]))[0].cpu()
+        shown.append(torch.as_tensor(side_by_side(pixels[part], dream, CONTEXT)))
+    return torch.cat(shown)

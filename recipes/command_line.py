@@ -1,0 +1,76 @@
+"""What every recipe does around its own work: plain errors for bad input, logging, device choice, run directories."""
+
+import logging
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import torch
+from torchrl.checkpoint import CheckpointError
+
+CONFIG_DIR = Path(__file__).parent / "config"
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Turn errors that a person can mend into one paragraph on stderr and exit status 2.
+
+    Wrap set-up only: the same error types inside training are defects, and keep their tracebacks.
+    """
+    try:
+        yield
+    except (ValueError, OSError, CheckpointError, RendererError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+def _renderer_error() -> type[Exception]:
+    from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+
+    return RendererUnavailableError
+
+
+RendererError = _renderer_error()
+
+
+def start_logging() -> None:
+    """Show what the package chose and why, one line each."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
+    logging.getLogger("dreamer_racing").setLevel(logging.INFO)
+
+
+def choose_device(device: str) -> torch.device:
+    """Resolve `auto`, and refuse a device that is not there.
+
+    Raises:
+        ValueError: not a device of this machine.
+    """
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        chosen = torch.device(device)
+        torch.empty(1, device=chosen)
+    except (RuntimeError, AssertionError) as error:
+        available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        raise ValueError(
+            f"device={device}: {str(error).splitlines()[0]} This machine has: {', '.join(available)}; "
+            "device=auto takes the best."
+        ) from error
+    return chosen
+
+
+def new_run_dir(recipe: str, track: str) -> Path:
+    """A fresh folder name below `runs/`."""
+    return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def merge_overrides(saved: Sequence[str], given: Sequence[str]) -> list[str]:
+    """Overrides of a run that is continued: those it was started with, replaced by the ones given now."""
+
+    def key(override: str) -> str:
+        return override.partition("=")[0].lstrip("+~")
+
+    replaced = {key(override) for override in given}
+    return [override for override in saved if key(override) not in replaced] + list(given)

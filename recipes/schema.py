@@ -1,0 +1,144 @@
+"""Typed configuration of the recipes: hydra refuses a value of the wrong type, naming the field."""
+
+from dataclasses import dataclass, field
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+
+@dataclass
+class EnvConfig:
+    """The simulated race."""
+
+    preset: str = "easy"  # physics: easy | faithful
+    num_envs: int = 32  # worlds flown side by side
+    episode_steps: int = 1000  # control steps of 20 ms
+    renderer: str = "auto"  # auto | egl | osmesa | warp
+    camera_tilt: float = 25.0  # degrees upwards
+
+
+@dataclass
+class ModelConfig:
+    """Size of the networks, and the numbers that go with it. `auto` chooses by device; null takes the size's own."""
+
+    size: str = MISSING
+    batch_size: int | None = None  # windows in a batch
+    batch_length: int | None = None  # records in a window
+    replay_ratio: float | None = None  # records trained on per environment step
+    learning_rate: float | None = None
+    imagination_horizon: int | None = None
+
+
+@dataclass
+class LossConfig:
+    """Losses by the names of their registries in `dreamer_racing.losses`, and their weights."""
+
+    world_model: str = "reconstruction"
+    actor: str = "reinforce"
+    critic: str = "two_hot"
+    discount: float = 0.997
+    lambda_: float = 0.95
+    entropy_scale: float = 3e-4
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
+    free_nats: float = 1.0
+    replay_value_scale: float = 0.3
+
+
+@dataclass
+class CurriculumConfig:
+    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1."""
+
+    threshold: float = 50.0  # mean return above which b₂ grows
+    increment: float = 0.001
+    maximum: float = 0.01
+    window: int = 100  # episodes
+    cooldown: int = 100  # episodes
+    relabel: bool = True  # recompute rewards of replayed steps with today's b₂
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides metrics.csv."""
+
+    tensorboard: bool = True
+    every: int = 2_000  # env_steps between rows
+
+
+@dataclass
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = 250_000  # records, 12.3 KB each
+    storage: str = "tensor"  # tensor (memory) | memmap (files)
+
+
+@dataclass
+class EvaluationConfig:
+    """Evaluation during training."""
+
+    every: int = 25_000  # env_steps; 0 never
+    episodes: int = 8
+    stochastic: bool = False  # also fly the sampling policy
+    video_steps: int = 500  # control steps in the video
+
+
+@dataclass
+class CheckpointConfig:
+    """Checkpoints during training."""
+
+    every: int = 50_000  # env_steps
+    keep: int = 2
+
+
+@dataclass
+class DreamerConfig:
+    """`recipes/dreamer_v3.py`."""
+
+    track: str = "kidney"  # name of a built-in track, or path to a YAML file
+    total_env_steps: int = 1_000_000  # control steps summed over environments
+    prefill: int = 4_000  # env_steps collected before the first update
+    rollout_steps: int = 8  # control steps of every environment between updates
+    seed: int = 0
+    device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
+    run_dir: str | None = None  # null: runs/dreamer_v3_<track>_<time>
+    resume: str | None = None  # run directory or checkpoint to continue
+    env: EnvConfig = field(default_factory=EnvConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+
+@dataclass
+class EvaluateConfig:
+    """`recipes/evaluate.py`."""
+
+    checkpoint: str = MISSING  # run directory or checkpoint
+    episodes: int = 100
+    num_envs: int = 20
+    track: str | None = None  # null: the track it was trained on
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
+    video_steps: int = 500
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = 0
+
+
+def register() -> None:
+    """Make the schemas known to hydra."""
+    store = ConfigStore.instance()
+    store.store(name="dreamer_v3_schema", node=DreamerConfig)
+    store.store(name="evaluate_schema", node=EvaluateConfig)
+    for group, node in (
+        ("env", EnvConfig),
+        ("model", ModelConfig),
+        ("loss", LossConfig),
+        ("curriculum", CurriculumConfig),
+        ("logger", LoggerConfig),
+    ):
+        store.store(group=group, name="schema", node=node)

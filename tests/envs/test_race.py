@@ -1,0 +1,378 @@
+"""Episodes by hand: laps, times, ends, crashes; and where episodes start."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.race import Race, RaceStep, StartSampler
+from dreamer_racing.envs.rotation import rotate
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
+
+CIRCLE = load_track("circle")
+CENTRES = CIRCLE.gate_positions(dtype=torch.float64)
+NORMALS = CIRCLE.gate_normals(dtype=torch.float64)
+HOVER = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)  # in the middle of the circle, above all frames
+
+
+def begin(num_envs: int = 1, target: int = 0, **arguments) -> Race:
+    """Begin an episode of each drone on the circle, hovering in its middle."""
+    race = Race(CIRCLE, num_envs, dtype=torch.float64, **arguments)
+    race.begin(torch.ones(num_envs, dtype=torch.bool), HOVER.repeat(num_envs, 1), torch.full((num_envs,), target))
+    return race
+
+
+def fly(race: Race, *points, rates=(0.0, 0.0, 0.0), invalid: bool = False) -> RaceStep:
+    """Take every drone along the same points in one control step."""
+    num_envs = len(race.target_gate)
+    path = torch.stack([torch.as_tensor(point, dtype=torch.float64) for point in points])
+    path = path.unsqueeze(1).repeat(1, num_envs, 1)
+    return race.step(
+        path,
+        torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1),
+        torch.full((num_envs,), invalid),
+    )
+
+
+def through(gate: int):
+    """Return a path through the centre of a gate."""
+    return CENTRES[gate] - 0.1 * NORMALS[gate], CENTRES[gate] + 0.1 * NORMALS[gate]
+
+
+def hover(race: Race, steps: int = 1) -> RaceStep:
+    """Stay in the middle for some control steps and return the last outcome."""
+    for _ in range(steps):
+        outcome = fly(race, HOVER, HOVER)
+    return outcome
+
+
+# ---------------------------------------------------------------- reward and target
+
+
+def test_progress_and_body_rate():
+    race = begin()
+    # Gate 0 is at (4, 0, 1.35). Along x at its height, from x = 0 (4 m away) to 0.3.
+    race.begin(torch.tensor([True]), torch.tensor([[0.0, 0.0, 1.35]]), torch.tensor([0]))
+    outcome = fly(race, (0, 0, 1.35), (0.3, 0, 1.35), rates=(0.0, 3.0, 4.0))
+    assert outcome.reward_base.item() == pytest.approx(0.3)
+    assert outcome.body_rate_norm.item() == pytest.approx(5.0)
+    assert not (outcome.terminated | outcome.truncated | outcome.passed | outcome.finished).item()
+    assert outcome.crash.item() == CrashCause.NONE
+
+
+def test_progress_adds_up_to_the_distance_covered():
+    race = begin(target=2)
+    points = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + HOVER
+    points[0] = HOVER
+    total = sum(fly(race, a, b).reward_base for a, b in zip(points, points[1:], strict=False))
+    covered = (CENTRES[2] - HOVER).norm() - (CENTRES[2] - points[-1]).norm()
+    torch.testing.assert_close(total, covered.view(1))
+
+
+def test_a_pass_pays_ten_and_moves_the_target_on():
+    race = begin()
+    outcome = fly(race, *through(0), rates=(1.0, 0.0, 0.0))
+    assert outcome.reward_base.item() == 10.0
+    assert outcome.body_rate_norm.item() == 0.0
+    assert (outcome.gates_passed.item(), outcome.target_gate.item()) == (1, 1)
+    # From (4, 0.1, 1.35) towards gate 1 at (0, 4, 1.35): both distances are to the new gate.
+    outcome = fly(race, (4, 0.1, 1.35), (4, 0.2, 1.35))
+    expected = math.hypot(4, 3.9) - math.hypot(4, 3.8)
+    assert outcome.reward_base.item() == pytest.approx(expected)
+    assert outcome.gate_offset.item() == 0.0
+
+
+def test_gate_offset():
+    race = begin()
+    sideways = torch.tensor([0.3, 0.0, -0.4], dtype=torch.float64)
+    assert fly(race, *(point + sideways for point in through(0))).gate_offset.item() == pytest.approx(0.5)
+
+
+def test_flying_round_a_gate_is_not_the_end():
+    race = begin()
+    beside = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64)
+    outcome = fly(race, *(point + beside for point in through(0)))
+    assert (outcome.target_gate.item(), outcome.gates_passed.item(), outcome.terminated.item()) == (0, 0, False)
+
+
+# ---------------------------------------------------------------- laps and time
+
+
+def test_lap_times():
+    race = begin()
+    hover(race, 5)
+    for gate in range(3):
+        assert fly(race, *through(gate)).lap_time.item() == 0.0
+    outcome = fly(race, *through(3))  # the ninth step of the episode
+    assert outcome.lap_time.item() == pytest.approx(0.18)
+    assert (outcome.target_gate.item(), outcome.gates_passed.item()) == (0, 4)
+    assert hover(race, 2).lap_time.item() == 0.0
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times == [0.0, 0.0, 0.0, pytest.approx(0.12)]  # two hovering and four passing
+
+
+def test_control_dt_scales_lap_times():
+    race = begin(control_dt=0.05)
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times[-1] == pytest.approx(0.2)
+
+
+def test_a_lap_may_begin_at_any_gate():
+    race = begin(target=2)
+    times = [fly(race, *through(gate)).lap_time.item() for gate in (2, 3, 0, 1)]
+    assert times == [0.0, 0.0, 0.0, pytest.approx(0.08)]
+    assert race.target_gate.item() == 2
+
+
+def test_the_last_lap_truncates_as_finished():
+    race = begin(laps=3)
+    for passes in range(1, 13):
+        outcome = fly(race, *through((passes - 1) % 4))
+        assert outcome.finished.item() == outcome.truncated.item() == (passes == 12)
+        assert not outcome.terminated.item()
+    assert outcome.reward_base.item() == 10.0
+
+
+def test_without_laps_an_episode_never_finishes():
+    race = begin()
+    for passes in range(20):
+        outcome = fly(race, *through(passes % 4))
+        assert not (outcome.finished | outcome.truncated).item()
+
+
+def test_time_limit_truncates():
+    race = begin(episode_steps=3)
+    assert not hover(race, 2).truncated.item()
+    outcome = hover(race)
+    assert (outcome.truncated.item(), outcome.terminated.item(), outcome.finished.item()) == (True, False, False)
+
+
+def test_a_crash_in_the_last_step_is_terminated_only():
+    race = begin(episode_steps=1)
+    outcome = fly(race, HOVER, (0, 0, 0.01))
+    assert (outcome.truncated.item(), outcome.terminated.item()) == (False, True)
+    assert (outcome.crash.item(), outcome.reward_base.item()) == (CrashCause.GROUND, -4.0)
+
+
+def test_the_last_lap_in_the_last_step():
+    race = begin(episode_steps=4, laps=1)
+    for gate in range(4):
+        outcome = fly(race, *through(gate))
+    assert (outcome.truncated.item(), outcome.finished.item()) == (True, True)
+
+
+def test_a_crash_behind_the_finish_is_a_crash():
+    race = begin(laps=1)
+    for gate in range(3):
+        fly(race, *through(gate))
+    outcome = fly(race, *through(3), (0, -4, 0.01))
+    assert (outcome.passed.item(), outcome.gates_passed.item()) == (True, 4)
+    assert outcome.lap_time.item() == pytest.approx(0.08)  # the lap was flown
+    assert (outcome.finished.item(), outcome.truncated.item(), outcome.terminated.item()) == (False, False, True)
+    assert (outcome.reward_base.item(), outcome.body_rate_norm.item()) == (-4.0, 0.0)
+
+
+# ---------------------------------------------------------------- broken numbers
+
+
+def test_lost_drones_crash_alone():
+    race = begin(num_envs=4)
+    path = HOVER.repeat(3, 4, 1)
+    path[1, 1, 0] = math.nan
+    path[2, 2] = math.inf
+    rates = torch.zeros(4, 3, dtype=torch.float64)
+    rates[3, 1] = math.nan
+    outcome = race.step(path, rates, torch.zeros(4, dtype=torch.bool))
+    lost = CrashCause.NON_FINITE_STATE
+    assert outcome.crash.tolist() == [CrashCause.NONE, lost, lost, lost]
+    assert outcome.reward_base.tolist() == [0.0, -4.0, -4.0, -4.0]
+    assert outcome.body_rate_norm.tolist() == [0.0] * 4
+    assert outcome.terminated.tolist() == [False, True, True, True]
+
+
+def test_a_lost_drone_can_begin_again():
+    race = begin()
+    fly(race, HOVER, (math.nan, 0, 3))
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([0]))
+    outcome = hover(race)
+    assert (outcome.crash.item(), outcome.reward_base.item()) == (CrashCause.NONE, 0.0)
+
+
+def test_an_invalid_action_voids_the_step():
+    race = begin()
+    outcome = fly(race, *through(0), (4, 0.1, 0.01), invalid=True)
+    assert outcome.crash.item() == CrashCause.INVALID_ACTION
+    assert (outcome.passed.item(), outcome.gates_passed.item(), outcome.gate_offset.item()) == (False, 0, 0.0)
+    assert (outcome.terminated.item(), outcome.reward_base.item()) == (True, -4.0)
+
+
+# ---------------------------------------------------------------- bookkeeping
+
+
+def test_begin_leaves_the_others_alone():
+    race = begin(num_envs=2)
+    fly(race, *through(0))
+    race.begin(
+        torch.tensor([False, True]),
+        torch.full((2, 3), math.nan).index_fill(0, torch.tensor([1]), 2.0),
+        torch.tensor([3, 3]),
+    )
+    assert race.target_gate.tolist() == [1, 3]
+    assert race.gates_passed.tolist() == [1, 0]
+    assert race.step_count.tolist() == [1, 0]
+    assert race.lap_start_step.tolist() == [0, 0]
+    assert race.position.tolist() == [through(0)[1].tolist(), [2.0, 2.0, 2.0]]
+
+
+def test_a_new_episode_forgets_the_old_lap():
+    race = begin()
+    for gate in range(4):
+        fly(race, *through(gate))
+    assert race.lap_start_step.item() == 4
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([0]))
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times[-1] == pytest.approx(0.08)
+
+
+def test_outcomes_are_not_changed_by_later_steps():
+    race = begin()
+    first = fly(race, *through(0))
+    before = {field.name: getattr(first, field.name).clone() for field in dataclasses.fields(first)}
+    fly(race, *through(1))
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([2]))
+    for name, value in before.items():
+        assert torch.equal(getattr(first, name), value), name
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_any_flight_keeps_the_books(seed):
+    """Random flights of many drones: invariants of every outcome, and each drone alone fares the same."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.randint(4, (8,), generator=generator)
+    start = CENTRES[target] - 0.2 * NORMALS[target]
+    moves = 0.3 * torch.randn(15, 3, 8, 3, generator=generator, dtype=torch.float64) / 3
+    points = start + torch.cat((torch.zeros(1, 8, 3), moves.flatten(0, 1))).cumsum(0)
+    paths = [points[3 * k : 3 * k + 4] for k in range(15)]
+
+    def run(drones):
+        race = Race(CIRCLE, len(drones), episode_steps=12, laps=1, dtype=torch.float64)
+        race.begin(torch.ones(len(drones), dtype=torch.bool), start[drones], target[drones])
+        no = torch.zeros(len(drones), dtype=torch.bool)
+        return [race.step(path[:, drones], torch.zeros(len(drones), 3, dtype=torch.float64), no) for path in paths]
+
+    together = run(list(range(8)))
+    alone = [run([n]) for n in range(8)]
+    passes = torch.zeros(8, dtype=torch.int64)
+    for step, outcome in enumerate(together):
+        passes += outcome.passed
+        assert torch.equal(outcome.gates_passed, passes)
+        assert torch.equal(outcome.target_gate, (target + passes) % 4)
+        assert torch.equal(outcome.terminated, outcome.crash != 0)
+        assert not (outcome.terminated & outcome.truncated).any()
+        assert torch.equal(outcome.truncated, ~outcome.terminated & (outcome.finished | (step >= 11)))
+        for field in dataclasses.fields(outcome):
+            single = torch.cat([getattr(steps[step], field.name) for steps in alone])
+            torch.testing.assert_close(getattr(outcome, field.name), single)
+
+
+def test_float32_and_nothing_waits_for_the_host():
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        race = Race(CIRCLE, 4)
+        starts = StartSampler(CIRCLE)
+        pose = starts.sample(4)
+        race.begin(torch.ones(4, dtype=torch.bool), pose.position, pose.target_gate)
+        outcome = race.step(torch.zeros(11, 4, 3), torch.zeros(4, 3), torch.zeros(4, dtype=torch.bool))
+    floats = (outcome.reward_base, outcome.body_rate_norm, outcome.gate_offset, outcome.lap_time)
+    assert {value.dtype for value in floats} == {torch.float32}
+    assert {value.shape for value in vars(outcome).values()} == {(4,)}
+
+
+# ---------------------------------------------------------------- starts
+
+
+def sampler(name: str, seed: int = 0) -> StartSampler:
+    return StartSampler(load_track(name), torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_evaluation_starts_at_rest_at_the_start(name):
+    track = load_track(name)
+    pose = sampler(name).sample(3, evaluation=True)
+    start = torch.tensor(track.start_position, dtype=torch.float64).repeat(3, 1)
+    torch.testing.assert_close(pose.position, start)
+    assert pose.linear_velocity.eq(0).all()
+    assert pose.target_gate.tolist() == [0, 0, 0]
+    heading = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    to_gate = torch.tensor(track.gates[0].position, dtype=torch.float64) - start
+    to_gate[:, 2] = 0  # the start is level
+    torch.testing.assert_close(heading, to_gate / to_gate.norm(dim=-1, keepdim=True))
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_training_starts(name):
+    track = load_track(name)
+    pose = sampler(name).sample(5000)
+    centre = track.gate_positions(dtype=torch.float64)[pose.target_gate]
+    normal = track.gate_normals(dtype=torch.float64)[pose.target_gate]
+    distance = ((centre - pose.position) * normal).sum(-1)  # before the plane
+    assert distance.min() > 0.29
+    low = torch.tensor(track.bounds_low, dtype=torch.float64)
+    low[2] = max(low[2], 0.05)
+    assert (pose.position - low).min() >= 0.3 - 1e-9
+    assert (torch.tensor(track.bounds_high, dtype=torch.float64) - pose.position).min() >= 0.3 - 1e-9
+
+    speed = pose.linear_velocity.norm(dim=-1)
+    at_gate = speed > 0
+    assert at_gate.double().mean() == pytest.approx(0.5, abs=0.03)
+    assert set(pose.target_gate[at_gate].tolist()) == set(range(track.num_gates))
+    assert set(pose.target_gate[~at_gate].tolist()) == {0}
+    assert 1.5 <= speed[at_gate].min() < 1.6
+    assert 2.4 < speed[at_gate].max() <= 2.5
+    # Towards the centre, and before the gate as described.
+    miss = torch.linalg.cross(pose.linear_velocity, centre - pose.position)[at_gate].norm(dim=-1)
+    torch.testing.assert_close(miss, torch.zeros_like(miss))
+    assert distance[at_gate].max() < 3.5
+    start = torch.tensor(track.start_position, dtype=torch.float64)
+    assert (pose.position[~at_gate] - start)[:, :2].norm(dim=-1).max() <= math.hypot(0.5, 0.5)
+
+
+def test_attitude_noise():
+    pose = sampler("circle").sample(5000)
+    forward, left = (
+        rotate(pose.attitude, torch.tensor([axis], dtype=torch.float64)) for axis in ((1.0, 0, 0), (0, 1.0, 0))
+    )
+    yaws = CIRCLE.gate_yaws(dtype=torch.float64)[pose.target_gate]  # the start faces gate 0 along its yaw
+    yaw_error = torch.atan2(forward[:, 1], forward[:, 0]) - yaws
+    yaw_error = torch.atan2(yaw_error.sin(), yaw_error.cos()).abs().rad2deg().max().item()
+    pitch = forward[:, 2].asin().abs().rad2deg().max().item()
+    roll = (left[:, 2] / (1 - forward[:, 2] ** 2).sqrt()).asin().abs().rad2deg().max().item()
+    assert yaw_error == pytest.approx(10, abs=0.1)
+    assert pitch == pytest.approx(5, abs=0.1)
+    assert roll == pytest.approx(5, abs=0.1)
+    torch.testing.assert_close(pose.attitude.norm(dim=-1), torch.ones(5000, dtype=torch.float64))
+
+
+def test_starts_follow_the_generator():
+    first, again, other = (sampler("kidney", seed).sample(16) for seed in (1, 1, 2))
+    assert torch.equal(first.position, again.position)
+    assert torch.equal(first.attitude, again.attitude)
+    assert not torch.equal(first.position, other.position)
+
+
+@given(st.floats(-180, 180), st.integers(0, 100))
+@settings(max_examples=40, deadline=None)
+def test_no_start_is_past_its_gate_however_tight_the_box(yaw, seed):
+    gates = [Gate((0.0, 0.0, 1.35), yaw), Gate((0.0, 0.0, 4.0), yaw)]
+    start = gates[0].position[0] - gates[0].forward[0], -gates[0].forward[1], 1.35  # 1 m before the plane
+    track = make_track("tight", gates, start_position=start, bounds_low=(-1.31,) * 3, bounds_high=(1.31, 1.31, 6.0))
+    validate_track(track, "tight")
+    pose = StartSampler(track, torch.Generator().manual_seed(seed), dtype=torch.float64).sample(500)
+    distance = -(pose.position * track.gate_normals(dtype=torch.float64)[0]).sum(-1)
+    assert distance.min() > 0.29
+    assert pose.position[:, :2].abs().max() <= 1.01 + 1e-9

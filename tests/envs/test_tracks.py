@@ -1,0 +1,411 @@
+"""Built-in tracks, the form of a track file, and every refusal."""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dreamer_racing.envs import tracks
+from dreamer_racing.envs.tracks import (
+    BUILTIN_TRACKS,
+    Gate,
+    GateShape,
+    Track,
+    TrackError,
+    load_track,
+    make_track,
+    validate_track,
+)
+from dreamer_racing.envs.tracks.validation import _boxes_intersect
+
+GOOD = """\
+name: mine
+laps: 2
+gates:
+  - {position: [0, 0, 1.35], yaw_degrees: 0}
+  - {position: [6, 0, 1.35], yaw_degrees: 0, kind: race, color: [1, 0.5, 0]}
+  - {position: [6, 6, 1.35], yaw_degrees: 180}
+decoys:
+  - {position: [0, 6, 1.35], yaw_degrees: 45}
+shape: {opening: 1.4, margin: 0.2}
+start: {position: [-2, 0.5, 1], yaw_degrees: 10}
+bounds: {low: [-5, -5, 0], high: [10, 10, 5]}
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes a track file and returns its path."""
+
+    def write_file(text: str) -> Path:
+        path = tmp_path / "mine.yaml"
+        path.write_text(text)
+        return path
+
+    return write_file
+
+
+# ---------------------------------------------------------------- built-in tracks
+
+
+def test_every_file_is_a_builtin_track():
+    assert {path.stem for path in Path(tracks.__file__).parent.glob("*.yaml")} == set(BUILTIN_TRACKS)
+
+
+@pytest.mark.parametrize(
+    ("name", "num_gates"), [("circle", 4), ("kidney", 6), ("figure8", 6), ("split_s", 7), ("figure8_decoys", 6)]
+)
+def test_builtin_tracks(name, num_gates):
+    track = load_track(name)
+    assert (track.name, track.num_gates, track.laps, track.shape) == (name, num_gates, 3, GateShape())
+    assert load_track(track) is track
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_yaws_agree_with_the_order_of_flight(name):
+    """Each gate is approached from before its plane and left behind it.
+
+    Two turns are of more than a quarter circle on purpose: split_s's dive (gate 3 to the one below it) and its second
+    gate, which is left at a right angle (0.15 m back over 10 m).
+    """
+    gates = load_track(name).gates
+    for index, gate in enumerate(gates):
+        for other, sign in ((gates[index - 1], 1), (gates[(index + 1) % len(gates)], -1)):
+            along = sign * sum((a - b) * n for a, b, n in zip(gate.position, other.position, gate.forward, strict=True))
+            assert along > -0.2, (name, index)
+    if name != "split_s":
+        assert all(
+            sum((a - b) * n for a, b, n in zip(gate.position, gates[i - 1].position, gate.forward, strict=True)) > 1
+            for i, gate in enumerate(gates)
+        )
+
+
+def test_circle_is_a_circle():
+    for index, gate in enumerate(load_track("circle").gates):
+        angle = math.radians(90 * index)
+        assert gate.position == pytest.approx((4 * math.cos(angle), 4 * math.sin(angle), 1.35))
+        assert gate.forward == pytest.approx((-math.sin(angle), math.cos(angle), 0.0))
+
+
+def test_split_s_is_the_published_track():
+    track = load_track("split_s")
+    assert track.gates[3].position == (-4.3, -5.6, 3.4)
+    assert track.gates[4].position == (-4.3, -5.6, 1.42)
+    assert [gate.yaw_degrees for gate in track.gates] == [-20, 0, -130, 180, 0, 80, -150]
+    assert track.start_position == (-5.0, 4.7, 0.61)
+    assert (track.bounds_low, track.bounds_high) == ((-10, -8, 0.05), (14, 9, 6))
+
+
+def test_decoys_change_nothing_else():
+    plain, decoyed = load_track("figure8"), load_track("figure8_decoys")
+    assert len(decoyed.decoys) == 2
+    assert all(gate.kind == "decoy" and gate.color for gate in decoyed.decoys)
+    assert dataclasses.replace(decoyed, name="figure8", decoys=()) == plain
+
+
+def test_defaults():
+    track = load_track("kidney")
+    assert track.start_position == pytest.approx((-5.5, -2.5, 1.35))  # 2.5 m before gate 0, which faces +y
+    assert track.start_yaw_degrees == pytest.approx(90)
+    # Frames reach from -6.525 to 6.525 (gates 0 and 4 face along y) and from -4 - 1.025 to 3.2 + 1.025.
+    assert track.bounds_low == pytest.approx((-9.525, -8.025, 0))
+    assert track.bounds_high == pytest.approx((9.525, 7.225, 6))
+    # With only a position given, the start faces the first gate.
+    assert load_track("split_s").start_yaw_degrees == pytest.approx(math.degrees(math.atan2(-5.56, 4.4)))
+
+
+def test_tensors():
+    track = load_track("circle")
+    assert track.gate_positions().tolist()[1] == [0.0, 4.0, pytest.approx(1.35)]
+    assert track.gate_yaws(dtype=torch.float64).tolist() == pytest.approx([math.pi / 2, math.pi, -math.pi / 2, 0])
+    rotations = load_track("split_s").gate_rotations(dtype=torch.float64)
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(7, 3, 3))
+    torch.testing.assert_close(rotations[..., 0], load_track("split_s").gate_normals(dtype=torch.float64))
+    # Gate 0 of the circle faces +y: its left is -x.
+    torch.testing.assert_close(
+        track.gate_rotations()[0], torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    )
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_a_good_file(write):
+    path = write(GOOD)
+    for argument in (path, str(path)):
+        assert load_track(argument) == Track(
+            name="mine",
+            gates=(
+                Gate((0, 0, 1.35), 0),
+                Gate((6, 0, 1.35), 0, color=(1, 0.5, 0)),
+                Gate((6, 6, 1.35), 180),
+            ),
+            decoys=(Gate((0, 6, 1.35), 45, kind="decoy"),),
+            shape=GateShape(opening=1.4, margin=0.2),
+            start_position=(-2, 0.5, 1),
+            start_yaw_degrees=10,
+            bounds_low=(-5, -5, 0),
+            bounds_high=(10, 10, 5),
+            laps=2,
+        )
+
+
+def test_only_gates_are_needed(write):
+    path = write("gates:\n- {position: [0, 0, 2], yaw_degrees: 0}\n- {position: [5, 0, 2], yaw_degrees: 0}\n")
+    assert load_track(path) == make_track("mine", [Gate((0, 0, 2), 0), Gate((5, 0, 2), 0)])
+
+
+# Each case: what to replace in GOOD, by what, and the pieces that the message must have.
+REFUSALS = {
+    "unknown field": ("laps: 2", "lapps: 2", ["lapps", "2", "did you mean 'laps'"]),
+    "unknown field of a gate": ("kind: race", "colour: red", ["gates[1].colour", "red", "did you mean 'color'"]),
+    "missing gates": ("gates:", "gatez:", ["gatez", "did you mean 'gates'"]),
+    "missing yaw": ("yaw_degrees: 180", "", ["gates[2].yaw_degrees", "missing", "position"]),
+    "missing high": (", high: [10, 10, 5]", "", ["bounds.high", "missing"]),
+    "wrong kind": ("kind: race", "kind: rase", ["gates[1].kind", "'rase'", "'race'", "'decoy'"]),
+    "decoy among gates": ("kind: race", "kind: decoy", ["gates[1].kind", "'decoy'", "listed under decoys"]),
+    "text for a number": ("yaw_degrees: 180", "yaw_degrees: north", ["gates[2].yaw_degrees", "'north'", "finite"]),
+    "bool for a number": ("yaw_degrees: 180", "yaw_degrees: true", ["gates[2].yaw_degrees", "True", "finite"]),
+    "not finite": ("[6, 6, 1.35]", "[6, .nan, 1.35]", ["gates[2].position[1]", "nan", "finite"]),
+    "infinite": ("[6, 6, 1.35]", "[6, .inf, 1.35]", ["gates[2].position[1]", "inf", "finite"]),
+    "huge integer": ("[6, 6, 1.35]", f"[6, 1{'0' * 400}, 1.35]", ["gates[2].position[1]", "finite"]),
+    "two coordinates": ("[6, 6, 1.35]", "[6, 6]", ["gates[2].position", "[6, 6]", "three numbers"]),
+    "a mapping for a vector": ("[6, 6, 1.35]", "{x: 6}", ["gates[2].position", "{'x': 6}", "three numbers"]),
+    "gate is a list": ("{position: [6, 6, 1.35], yaw_degrees: 180}", "[6, 6]", ["gates[2]", "[6, 6]", "mapping"]),
+    "decoys is a mapping": ("  - {position: [0, 6", "    {position: [0, 6", ["decoys", "a list of gates"]),
+    "color out of range": ("[1, 0.5, 0]", "[255, 0.5, 0]", ["gates[1].color", "255", "from 0 to 1"]),
+    "color too short": ("[1, 0.5, 0]", "[1]", ["gates[1].color", "[1]", "red, green, blue"]),
+    "laps of zero": ("laps: 2", "laps: 0", ["laps", "0", "at least 1"]),
+    "laps of a half": ("laps: 2", "laps: 2.5", ["laps", "2.5", "whole number"]),
+    "empty name": ("name: mine", "name: ''", ["name", "''", "not empty"]),
+    "opening too large": ("opening: 1.4", "opening: 2.1", ["shape.outer", "2.05", "2.1"]),
+    "opening of zero": ("opening: 1.4", "opening: 0", ["shape.opening", "0.0", "greater than 0"]),
+    "flat gate": ("opening: 1.4", "depth: 0", ["shape.depth", "0.0", "greater than 0"]),
+    "margin too large": ("margin: 0.2", "margin: 0.7", ["shape.margin", "0.7", "half of shape.opening"]),
+    "bounds inverted": ("high: [10, 10, 5]", "high: [10, -10, 5]", ["bounds.high[1]", "-10.0", "-5.0", "y axis"]),
+    "gate outside": ("[6, 6, 1.35]", "[6, 9.8, 1.35]", ["gates[2].position", "9.8", "inside the bounding box", "10.3"]),
+    "gate under ground": ("[6, 6, 1.35]", "[6, 6, 0.5]", ["gates[2].position", "0.5", "above 0.05 m"]),
+    "gate above the box": ("[6, 6, 1.35]", "[6, 6, 4.6]", ["gates[2].position", "4.6", "inside the bounding box"]),
+    "no way to the gate": ("[6, 6, 1.35]", "[9.2, 6, 1.35]", ["gates[2].position", "9.2", "1.0 m before it", "10.2"]),
+    "decoy outside": ("[0, 6, 1.35]", "[0, 60, 1.35]", ["decoys[0].position", "60", "bounding box"]),
+    "gates overlap": ("[6, 6, 1.35]", "[6, 1, 1.35]", ["gates[1].position", "gates[2]", "opening", "farther from"]),
+    "decoy in a gate": ("[0, 6, 1.35]", "[6, 6, 1.35]", ["gates[2].position", "decoys[0]", "opening"]),
+    "start outside": ("[-2, 0.5, 1]", "[-20, 0.5, 1]", ["start.position", "-20", "bounding box"]),
+    "start on the ground": ("[-2, 0.5, 1]", "[-2, 0.5, 0.1]", ["start.position", "0.1", "above 0.05 m"]),
+    "start behind": ("[-2, 0.5, 1]", "[2, 0.5, 1]", ["start.position", "gates[0]", "2.00 m behind"]),
+    "start too near": ("[-2, 0.5, 1]", "[-0.6, 0.5, 1]", ["start.position", "gates[0]", "0.60 m before"]),
+    "start in another gate": ("[6, 6, 1.35]", "[-2, -0.5, 1.35]", ["start.position", "gates[2]"]),
+    "start is a list": ("start: {position: [-2, 0.5, 1], yaw_degrees: 10}", "start: [1]", ["start", "[1]", "mapping"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_refusals_name_file_field_and_value(write, case):
+    old, new, pieces = REFUSALS[case]
+    assert GOOD.count(old) == 1
+    path = write(GOOD.replace(old, new))
+    with pytest.raises(TrackError) as refusal:
+        load_track(path)
+    message = str(refusal.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    for piece in pieces:
+        assert piece in message
+
+
+@pytest.mark.parametrize(("count", "listed"), [(0, "[]"), (1, "[{position: [0, 0, 1.35], yaw_degrees: 0}]")])
+def test_a_lap_needs_two_gates(write, count, listed):
+    with pytest.raises(TrackError, match=re.escape("gates is [") + ".*at least 2 race gates"):
+        load_track(write(f"gates: {listed}\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gates: [\nname: x", "not valid YAML at line 2"),
+        ("name: a\nname: b\n", "line 2.*'name' is given twice"),
+        ("name: !!python/object/apply:os.getcwd []", "not valid YAML at line 1"),
+        ("name: 2020-99-99", "not valid YAML"),
+        ("", "the file is None.*a mapping"),
+        ("- 1", r"the file is \[1\].*a mapping"),
+        ("{}", "gates is missing"),
+    ],
+)
+def test_files_that_are_no_track(write, text, message):
+    path = write(text)
+    with pytest.raises(TrackError, match=message) as refusal:
+        load_track(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    path = tmp_path / "binary.yaml"
+    path.write_bytes(b"\xff\xfe\x00\xd8")
+    with pytest.raises(TrackError, match=r"binary\.yaml: the track file cannot be read"):
+        load_track(path)
+
+
+def test_unknown_names():
+    with pytest.raises(TrackError, match=r"'kidny' \(did you mean 'kidney'\?\).*circle, kidney.*path of a \.yaml file"):
+        load_track("kidny")
+    with pytest.raises(TrackError, match=r"unknown track 'xyz': the known tracks"):
+        load_track("xyz")
+
+
+def test_missing_files(tmp_path):
+    with pytest.raises(TrackError, match=r"'nowhere/kidney\.yaml' does not exist.*known tracks: circle"):
+        load_track("nowhere/kidney.yaml")
+    with pytest.raises(TrackError, match="is not a file"):
+        load_track(tmp_path)
+
+
+# ---------------------------------------------------------------- tracks built in Python
+
+
+def test_tracks_built_in_python_are_checked_too():
+    good = load_track("circle")
+    for change, field in (
+        ({"gates": good.gates[:1]}, "gates is"),
+        ({"laps": 0}, "laps is 0"),
+        ({"start_position": (0.0, math.nan, 1.0)}, r"start\.position is \(0\.0, nan, 1\.0\)"),
+        ({"start_position": (0.0, 1.0)}, r"start\.position is \(0\.0, 1\.0\)"),
+        ({"start_yaw_degrees": math.inf}, r"start\.yaw_degrees is inf"),
+        ({"shape": GateShape(margin=math.nan)}, r"shape\.margin is nan"),
+        ({"decoys": good.gates[:1]}, r"decoys\[0\]\.kind is 'race'"),
+        ({"gates": (Gate((0.0, 0.0, 1.35), 0.0, kind="decoy"), *good.gates)}, r"gates\[0\]\.kind is 'decoy'"),
+    ):
+        with pytest.raises(TrackError, match=r"Track\('circle'\): " + field):
+            load_track(dataclasses.replace(good, **change))
+
+
+# ---------------------------------------------------------------- overlaps
+
+
+def pair(distance, turn: float = 0.0) -> Track:
+    """Two gates in a large hall, the second one moved and turned."""
+    gates = [Gate((0.0, 0.0, 3.0), 0.0), Gate(tuple(a + b for a, b in zip(distance, (0, 0, 3), strict=True)), turn)]
+    return make_track(
+        "pair", gates, start_position=(-8.0, 0.0, 3.0), bounds_low=(-15.0, -15.0, 0.0), bounds_high=(15.0, 15.0, 9.0)
+    )
+
+
+# The opening reaches 0.75 m and the frame 1.025 m from a gate's centre: they meet at 1.775 m.
+@pytest.mark.parametrize(
+    ("distance", "turn", "overlaps"),
+    [
+        ((0, 0, 1.98), 180, False),  # split_s: frames share 7 cm, openings are free
+        ((0, 0, 1.78), 180, False),
+        ((0, 0, 1.77), 180, True),
+        ((0, 1.78, 0), 0, False),
+        ((0, 1.77, 0), 0, True),
+        ((0.11, 0, 0), 0, False),  # one behind the other, 0.1 m deep each
+        ((0.09, 0, 0), 0, True),
+        ((0, 0, 0), 90, True),  # crossed through the centre
+        ((0, 0.9, 0), 90, True),  # the first gate's bar stands in the middle of the second's opening
+        ((0, 1.78, 0), 90, False),
+        ((1.08, 0, 0), 90, False),  # a T: the second frame's end stops 1.08 - 1.025 > 0.05 m before the first plane
+        ((1.07, 0, 0), 90, True),
+        ((1.3, 1.3, 0), 45, False),  # the frames' circles about their centres meet, the gates do not
+    ],
+)
+def test_overlaps(distance, turn, overlaps):
+    if overlaps:
+        with pytest.raises(TrackError, match=r"gates\[[01]\]\.position .* reaches into the opening"):
+            validate_track(pair(distance, turn), "test")
+    else:
+        validate_track(pair(distance, turn), "test")
+
+
+near = st.floats(-2.5, 2.5)
+sides = st.floats(0.1, 2.5)
+
+
+@given(st.tuples(near, near, near), st.floats(-180, 180), st.floats(-180, 180), sides, sides, st.integers(0, 2**31))
+def test_box_intersection_against_points(centre, yaw, other_yaw, side, other_side, seed):
+    """A point in both boxes proves an intersection; and the answer is symmetric."""
+    gate, other, depth = Gate((0.0, 0.0, 0.0), yaw), Gate(centre, other_yaw), 0.3
+    answer = _boxes_intersect(gate, side, other, other_side, depth)
+    assert answer == _boxes_intersect(other, other_side, gate, side, depth)
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5
+    points *= torch.tensor([depth, side, side])
+    world = points @ _axes(gate)
+    local = (world - torch.tensor(centre, dtype=torch.float64)) @ _axes(other).mT
+    in_other = (local.abs() < torch.tensor([depth, other_side, other_side]) / 2).all(-1).any()
+    assert answer or not in_other
+
+
+@given(st.tuples(near, near, near), st.floats(-180, 180), sides, sides)
+def test_boxes_apart_can_be_told_apart(centre, yaw, side, other_side):
+    """Where the answer is no, the boxes shrunk to nothing or moved farther off along the same line stay apart."""
+    gate, depth = Gate((0.0, 0.0, 0.0), 0.0), 0.3
+    if not _boxes_intersect(gate, side, Gate(centre, yaw), other_side, depth):
+        farther = Gate(tuple(2 * number for number in centre), yaw)
+        assert not _boxes_intersect(gate, side, farther, other_side, depth)
+        assert not _boxes_intersect(gate, side / 2, Gate(centre, yaw), other_side, depth)
+    assert _boxes_intersect(gate, side, Gate((0.0, 0.0, 0.0), yaw), other_side, depth)
+
+
+def _axes(gate: Gate) -> torch.Tensor:
+    return torch.tensor([gate.forward, gate.left, (0.0, 0.0, 1.0)], dtype=torch.float64)
+
+
+# ---------------------------------------------------------------- any file at all
+
+scalars = st.one_of(
+    st.none(), st.booleans(), st.integers(-10, 10), st.floats(), st.text(max_size=5), st.sampled_from(["race", "decoy"])
+)
+vectors = st.lists(st.one_of(st.floats(-10, 10), scalars), min_size=2, max_size=4)
+values = st.recursive(scalars, lambda inner: st.one_of(st.lists(inner, max_size=3), vectors), max_leaves=6)
+gates = st.one_of(
+    st.fixed_dictionaries(
+        {"position": st.one_of(st.tuples(*[st.floats(-9, 9)] * 3).map(list), values), "yaw_degrees": scalars},
+        optional={"kind": scalars, "color": values, "size": values},
+    ),
+    values,
+)
+contents = st.one_of(
+    values,
+    st.fixed_dictionaries(
+        {"gates": st.one_of(st.lists(gates, max_size=3), values)},
+        optional={
+            "name": scalars,
+            "laps": scalars,
+            "decoys": st.one_of(st.lists(gates, max_size=2), values),
+            "shape": st.one_of(values, st.dictionaries(st.sampled_from(["opening", "outer", "depth"]), scalars)),
+            "start": st.one_of(values, st.dictionaries(st.sampled_from(["position", "yaw_degrees"]), values)),
+            "bounds": st.one_of(values, st.fixed_dictionaries({"low": vectors, "high": vectors})),
+        },
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def scratch_file(tmp_path_factory):
+    return tmp_path_factory.mktemp("tracks") / "any.yaml"
+
+
+@given(content=contents)
+@settings(deadline=None)
+def test_any_content_is_a_track_or_a_refusal(scratch_file, content):
+    scratch_file.write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
+    _load_or_refuse(scratch_file)
+
+
+@given(text=st.text(alphabet="{}[]:-,&*!|>#'\"\n\t ab1.", max_size=60))
+@settings(deadline=None)
+def test_any_text_is_a_track_or_a_refusal(scratch_file, text):
+    scratch_file.write_text(text, encoding="utf-8")
+    _load_or_refuse(scratch_file)
+
+
+def _load_or_refuse(path: Path) -> None:
+    try:
+        assert load_track(path).num_gates >= 2
+    except TrackError as refusal:
+        assert str(path) in str(refusal)

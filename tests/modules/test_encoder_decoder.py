@@ -1,0 +1,65 @@
+import pytest
+import torch
+
+from dreamer_racing.modules.decoder import ImageDecoder
+from dreamer_racing.modules.encoder import ImageEncoder, fold_patches, unfold_patches
+
+VARIANTS = [
+    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": False, "norm": "rms"},
+    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": True, "norm": "rms"},
+    {"multipliers": (1, 2, 4, 8), "kernel": 4, "strided": True, "norm": "layer"},
+    {"multipliers": (1, 2, 4), "kernel": 4, "strided": True, "norm": "layer", "patch": 2},
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_encoder_and_decoder_shapes(variant):
+    encoder = ImageEncoder(depth=2, **variant)
+    embedding = encoder(torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8))
+    assert embedding.shape == (2, 3, encoder.embedding_size)
+    for blocks in (1, 2):
+        decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=blocks, **variant)
+        images = decoder(torch.randn(2, 3, 8), torch.randn(2, 3, 6))
+        assert images.shape == (2, 3, 64, 64, 3)
+        assert images.min() > 0
+        assert images.max() < 1
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_squared_error_is_that_of_the_images(variant):
+    torch.manual_seed(0)
+    decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **variant)
+    belief, state = torch.randn(2, 3, 8), torch.randn(2, 3, 6)
+    pixels = torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8)
+    expected = (decoder(belief, state) - pixels / 255).square().mean()
+    torch.testing.assert_close(decoder.squared_error(belief, state, pixels), expected)
+
+
+def test_folding_is_undone_by_unfolding():
+    images = torch.arange(2 * 4 * 4 * 3).view(2, 4, 4, 3)
+    folded = fold_patches(images, 2)
+    assert folded.shape == (2, 2, 2, 12)
+    assert folded[0, 0, 0].tolist() == [*range(6), *range(12, 18)]  # the top left block: two pixels of two rows
+    assert torch.equal(unfold_patches(folded, 2), images)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_first_stage_sees_pixels_scaled_to_half(variant):
+    encoder = ImageEncoder(depth=2, **variant)
+    seen = []
+    encoder.convolutions[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    encoder(torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 64, 64, 3))
+    torch.testing.assert_close(seen[0][0], torch.full_like(seen[0][0], -0.5))
+    torch.testing.assert_close(seen[0][1], torch.full_like(seen[0][1], 0.5))
+    assert seen[0].is_contiguous(memory_format=torch.channels_last)
+
+
+def test_embedding_depends_on_every_region_of_the_image():
+    torch.manual_seed(0)
+    for variant in VARIANTS:
+        encoder = ImageEncoder(depth=2, **variant)
+        black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
+        for row, column in ((0, 0), (0, 60), (60, 0), (30, 30)):
+            spotted = black.clone()
+            spotted[:, row : row + 4, column : column + 4] = 255
+            assert not torch.allclose(encoder(spotted), encoder(black))

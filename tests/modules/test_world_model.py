@@ -1,0 +1,34 @@
+import pytest
+import torch
+
+from dreamer_racing.modules.world_model import WorldModel
+
+
+def make_records(batch: int = 2, time: int = 5) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    pixels = torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8)
+    return pixels, torch.rand(batch, time, 4) * 2 - 1, torch.zeros(batch, time, dtype=torch.bool)
+
+
+def test_open_loop_never_sees_what_lies_beyond_its_context():
+    world_model = WorldModel("debug", action_dim=4)
+    pixels, action, is_init = make_records()
+    changed = pixels.clone()
+    changed[:, 2:] = 0
+    images = []
+    for version in (pixels, changed):
+        torch.manual_seed(1)
+        images.append(world_model.open_loop(version, action, is_init, context=2))
+    assert images[0].shape == pixels.shape
+    assert images[0].dtype == torch.uint8
+    assert torch.equal(*images)
+
+
+@pytest.mark.parametrize("context", [0, 6])
+def test_open_loop_refuses_a_context_outside_the_window(context):
+    with pytest.raises(ValueError, match="context"):
+        WorldModel("debug", action_dim=4).open_loop(*make_records(), context=context)
+
+
+def test_whole_window_may_be_context():
+    assert WorldModel("debug", action_dim=4).open_loop(*make_records(), context=5).shape == (2, 5, 64, 64, 3)
