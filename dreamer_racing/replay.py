@@ -24,7 +24,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers import RandomSampler, Storage, Writer
-from torchrl.envs.transforms import Compose, DeviceCastTransform, Transform
+from torchrl.envs.transforms import Transform
 
 _REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
 _END_KEYS = ("terminated", "truncated")
@@ -416,16 +416,16 @@ def make_replay(
         records = StreamMemmapStorage(slots, scratch_dir=scratch_dir, existsok=True)
     else:
         records = StreamTensorStorage(slots, device=storage_device or device)
-    transforms: list[Transform] = [] if transform is None else [transform]
-    if records.device != torch.empty((), device=device).device:
-        transforms.insert(0, DeviceCastTransform(device))
     writer = StreamWriter(num_envs, stream_length)
-    return StreamReplay(
+    replay = StreamReplay(
         storage=records,
         writer=writer,
         sampler=StreamSampler(writer, batch_length),
         generator=torch.Generator().manual_seed(seed),
-        transform=Compose(*transforms),
+        transform=transform,
         batch_size=batch_size,
         observation_keys=observation_keys,
     )
+    if records.device != torch.empty((), device=device).device:
+        replay.append_transform(lambda sample: sample.to(device))
+    return replay

@@ -37,7 +37,7 @@ class QuadrotorParameters:
 
     Example:
         >>> QuadrotorParameters().hover_action
-        -0.26425
+        -0.26407
     """
 
     mass: float = 0.6  # kg [paper]

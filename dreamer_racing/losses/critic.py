@@ -138,9 +138,14 @@ class CriticLoss(LossModule):
         bootstrap = tensordict.get("bootstrap", None)
         if bootstrap is None:
             bootstrap = self.critic.two_hot.decode(logits.detach())
-        records = (tensordict.get(key) for key in ("is_init", "terminated", "truncated"))
         returns, weight = replay_return(
-            tensordict.get("reward"), bootstrap, *records, discount=self.discount, lambda_=self.lambda_
+            tensordict.get("reward"),
+            bootstrap,
+            tensordict.get("is_init"),
+            tensordict.get("terminated"),
+            tensordict.get("truncated"),
+            self.discount,
+            self.lambda_,
         )
         return (weight * self._regression(features, logits, returns)).mean()
 

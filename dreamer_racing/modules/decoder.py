@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dreamer_racing.modules.encoder import IMAGE_SIZE, fold_patches, make_convolution, unfold_patches
-from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize, linear
+from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize_convolution, linear
 
 
 class DenseProjection(nn.Module):
@@ -29,7 +29,7 @@ class DenseProjection(nn.Module):
 
 
 class BlockProjection(nn.Module):
-    """Block-diagonal layer for the belief, whose block g makes channel group g, plus two layers for the state (2025)."""
+    """Block-diagonal layer for the belief, one channel group a block, plus two layers for the state (2025)."""
 
     def __init__(
         self, belief: int, state: int, resolution: int, channels: int, blocks: int, units: int, norm: str
@@ -69,9 +69,7 @@ class StridedConvolution(nn.ConvTranspose2d):
     def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
         super().__init__(in_channels, out_channels, kernel, 2, (kernel - 1) // 2, output_padding=kernel % 2)
         # Each output pixel sums over a quarter of the kernel's positions.
-        initialize(self.weight, in_channels * kernel**2 // 4)
-        nn.init.zeros_(self.bias)
-        self.to(memory_format=torch.channels_last)
+        initialize_convolution(self, in_channels * kernel**2 // 4)
 
 
 class ImageDecoder(nn.Module):

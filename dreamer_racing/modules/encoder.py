@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.layers import NORMS, initialize
+from dreamer_racing.modules.layers import NORMS, initialize_convolution
 
 IMAGE_SIZE = 64
 """Height and width of the images, pixels."""
@@ -21,9 +20,8 @@ def make_convolution(in_channels: int, out_channels: int, kernel: int, stride: i
     """Make a convolution that keeps (stride 1) or halves (stride 2) an even image, in channels-last layout."""
     padding: str | int = "same" if stride == 1 else (kernel - 1) // 2
     layer = nn.Conv2d(in_channels, out_channels, kernel, stride, padding)
-    initialize(layer.weight, in_channels * kernel**2)
-    nn.init.zeros_(layer.bias)
-    return layer.to(memory_format=torch.channels_last)
+    initialize_convolution(layer, in_channels * kernel**2)
+    return layer
 
 
 def fold_patches(images: Tensor, patch: int) -> Tensor:

@@ -5,6 +5,8 @@ Shape legend: N any batch, F features, K bins.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -44,9 +46,7 @@ class MLP(nn.Module):
     ) -> None:
         super().__init__()
         widths = [in_features] + [units] * layers
-        self.hidden = nn.Sequential(
-            *(NormedLinear(before, after, norm) for before, after in zip(widths[:-1], widths[1:], strict=True))
-        )
+        self.hidden = nn.Sequential(*(NormedLinear(before, after, norm) for before, after in pairwise(widths)))
         self.output = linear(widths[-1], out_features, scale=output_scale)
 
     def forward(self, inputs: Tensor) -> Tensor:

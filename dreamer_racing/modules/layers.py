@@ -51,6 +51,19 @@ def linear(in_features: int, out_features: int, bias: bool = True, scale: float 
     return layer
 
 
+def initialize_convolution(layer: nn.Conv2d | nn.ConvTranspose2d, fan_in: int) -> None:
+    """Fill a convolution with the reference's initial weights and a zero bias, in channels-last layout.
+
+    Args:
+        layer: Convolution with a bias.
+        fan_in: Inputs that each output sums over.
+    """
+    initialize(layer.weight, fan_in)
+    layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+
+
 class RMSNorm(nn.Module):
     """Divide features by their root mean square, then scale them (no shift).
 
@@ -103,6 +116,34 @@ class NormedLinear(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``(..., I)`` to ``(..., O)``."""
         return F.silu(self.norm(self.linear(inputs)))
+
+
+class SplitNormedLinear(nn.Module):
+    """``NormedLinear`` of two inputs side by side, whose second product can be computed ahead of a time loop.
+
+    W·[a, b] = W_a·a + W_b·b: ``project`` gives W_b·b (plus bias) for a whole sequence at once.
+
+    Args:
+        first_features: Size of a.
+        second_features: Size of b.
+        out_features: O.
+        norm: Key of ``NORMS``.
+    """
+
+    def __init__(self, first_features: int, second_features: int, out_features: int, norm: str) -> None:
+        super().__init__()
+        self.norm = NORMS[norm](out_features)
+        fan_in = first_features + second_features
+        self.first = linear(first_features, out_features, False, (first_features / fan_in) ** 0.5)
+        self.second = linear(second_features, out_features, not self.norm.shifts, (second_features / fan_in) ** 0.5)
+
+    def project(self, second: Tensor) -> Tensor:
+        """Map the second input ``(..., second_features)`` to its part of the sum ``(..., O)``."""
+        return self.second(second)
+
+    def forward(self, first: Tensor, projected: Tensor) -> Tensor:
+        """Map the first input ``(..., first_features)`` and the projected second one to ``(..., O)``."""
+        return F.silu(self.norm(self.first(first) + projected))
 
 
 class BlockLinear(nn.Module):

@@ -78,6 +78,5 @@ class DreamerPolicy(TensorDictModuleBase):
             "state": self.rssm.latents * self.rssm.classes,
             "previous_action": self.rssm.cell.action_dim,
         }
-        device = self.rssm.initial_belief.device
-        specs = {key: Unbounded(shape=(width,), device=device) for key, width in size.items()}
+        specs = {key: Unbounded(shape=(width,)) for key, width in size.items()}
         return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

@@ -6,13 +6,14 @@ S state = L·K, U hidden. Everything here is plain tensors, so that a time loop 
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, linear
+from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear
 
 
 class Posterior(NamedTuple):
@@ -60,9 +61,8 @@ def sample_one_hot(probabilities: Tensor, noise: Tensor | None) -> Tensor:
     return one_hot + (probabilities - fixed)
 
 
-def _gated_update(gates: tuple[Tensor, Tensor, Tensor], belief: Tensor) -> Tensor:
-    """Return the next belief ``(N, D)`` from reset, candidate and update gates ``(N, D)`` before activation."""
-    reset, candidate, update = gates
+def _gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
+    """Return the next belief ``(N, D)`` from the gates before activation and the belief, each ``(N, D)``."""
     candidate = torch.tanh(torch.sigmoid(reset) * candidate)
     # The shift of -1 makes a fresh cell remember rather than overwrite.
     return torch.lerp(belief, candidate, torch.sigmoid(update - 1.0))
@@ -83,23 +83,13 @@ class DenseGRUCell(nn.Module):
     def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
         super().__init__()
         self.action_dim = action
-        normalization = NORMS[norm]
-        joint = linear(state + action, hidden)
-        # Two layers with the initial weights of one, so that the action's product leaves the time loop.
-        self.from_state = nn.Linear(state, hidden, bias=False)
-        self.from_action = nn.Linear(action, hidden, bias=not normalization.shifts)
-        with torch.no_grad():
-            self.from_state.weight.copy_(joint.weight[:, :state])
-            self.from_action.weight.copy_(joint.weight[:, state:])
-        if self.from_action.bias is not None:
-            nn.init.zeros_(self.from_action.bias)
-        self.input_norm = normalization(hidden)
-        self.gates = linear(hidden + belief, 3 * belief, bias=not normalization.shifts)
-        self.gates_norm = normalization(3 * belief)
+        self.inputs = SplitNormedLinear(state, action, hidden, norm)
+        self.gates_norm = NORMS[norm](3 * belief)
+        self.gates = linear(hidden + belief, 3 * belief, bias=not self.gates_norm.shifts)
 
     def project_action(self, action: Tensor) -> Tensor:
         """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
-        return self.from_action(action)
+        return self.inputs.project(action)
 
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
         """Return the next belief.
@@ -112,9 +102,9 @@ class DenseGRUCell(nn.Module):
         Returns:
             ``(N, D)``.
         """
-        inputs = F.silu(self.input_norm(self.from_state(state) + projected_action))
-        gates = self.gates_norm(self.gates(torch.cat((inputs, belief), -1)))
-        return _gated_update(gates.chunk(3, -1), belief)
+        inputs = self.inputs(state, projected_action)
+        reset, candidate, update = self.gates_norm(self.gates(torch.cat((inputs, belief), -1))).chunk(3, -1)
+        return _gated_update(reset, candidate, update, belief)
 
 
 class BlockGRUCell(nn.Module):
@@ -158,7 +148,7 @@ class BlockGRUCell(nn.Module):
         # Each block holds its reset, candidate and update gates: (N, 3D) -> three of (N, D)
         gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
         reset, candidate, update = (gate.flatten(1) for gate in gates)
-        return _gated_update((reset, candidate, update), belief)
+        return _gated_update(reset, candidate, update, belief)
 
 
 CELLS: dict[str, type[DenseGRUCell] | type[BlockGRUCell]] = {"dense": DenseGRUCell, "block": BlockGRUCell}
@@ -215,19 +205,10 @@ class RSSM(nn.Module):
         self.cell = CELLS[recurrence](belief, state, action, hidden, norm, blocks)
         widths = [belief] + [hidden] * prior_layers
         self.prior = nn.Sequential(
-            *(NormedLinear(before, after, norm) for before, after in zip(widths[:-1], widths[1:], strict=True)),
+            *(NormedLinear(before, after, norm) for before, after in pairwise(widths)),
             linear(hidden, state),
         )
-        # One layer of [h, e], in two parts so that the embedding's product leaves the time loop.
-        joint = linear(belief + embedding, hidden)
-        self.posterior_from_belief = nn.Linear(belief, hidden, bias=False)
-        self.posterior_from_embedding = nn.Linear(embedding, hidden, bias=not NORMS[norm].shifts)
-        with torch.no_grad():
-            self.posterior_from_belief.weight.copy_(joint.weight[:, :belief])
-            self.posterior_from_embedding.weight.copy_(joint.weight[:, belief:])
-        if self.posterior_from_embedding.bias is not None:
-            nn.init.zeros_(self.posterior_from_embedding.bias)
-        self.posterior_norm = NORMS[norm](hidden)
+        self.posterior_hidden = SplitNormedLinear(belief, embedding, hidden, norm)
         self.posterior_output = linear(hidden, state)
         self.learned_initial = learned_initial
         self.initial_belief = nn.Parameter(torch.zeros(1, belief), requires_grad=learned_initial)
@@ -272,7 +253,7 @@ class RSSM(nn.Module):
         belief, state = initial or (value.expand(batch, -1) for value in start)
         resets = is_init.unsqueeze(-1)
         actions = self._project_action(previous_action, resets).unbind(1)
-        embeddings = self.posterior_from_embedding(embedding).unbind(1)
+        embeddings = self.posterior_hidden.project(embedding).unbind(1)
         noises = [None] * time if deterministic else self.draw_noise(time, batch).unbind(0)
         beliefs, states, logits = [], [], []
         for reset, action, embedded, noise in zip(resets.unbind(1), actions, embeddings, noises, strict=True):
@@ -307,7 +288,7 @@ class RSSM(nn.Module):
         """
         reset = is_init.unsqueeze(-1)
         action = self._project_action(previous_action, reset)
-        embedded = self.posterior_from_embedding(embedding)
+        embedded = self.posterior_hidden.project(embedding)
         noise = None if deterministic else self.draw_noise(len(is_init))
         return self._observe(belief, state, self.initial(), reset, action, embedded, noise)[:2]
 
@@ -347,8 +328,11 @@ class RSSM(nn.Module):
         belief = torch.where(reset, start[0], belief)
         state = torch.where(reset, start[1], state)
         belief = self.cell(belief, state, projected_action)
-        hidden = F.silu(self.posterior_norm(self.posterior_from_belief(belief) + embedded))
-        logits = self.posterior_output(hidden).float().unflatten(-1, (self.latents, self.classes))
+        logits = (
+            self.posterior_output(self.posterior_hidden(belief, embedded))
+            .float()
+            .unflatten(-1, (self.latents, self.classes))
+        )
         return belief, self._sample(logits, noise), logits
 
     def _sample(self, logits: Tensor, noise: Tensor | None) -> Tensor:

@@ -39,15 +39,9 @@ class WorldModel(nn.Module):
         super().__init__()
         size = get_size(size)
         self.size = size
-        convolution = {
-            "depth": size.cnn_depth,
-            "multipliers": size.cnn_multipliers,
-            "kernel": size.cnn_kernel,
-            "strided": size.strided,
-            "norm": size.norm,
-            "patch": size.cnn_patch,
-        }
-        self.encoder = ImageEncoder(**convolution)
+        self.encoder = ImageEncoder(
+            size.cnn_depth, size.cnn_multipliers, size.cnn_kernel, size.strided, size.norm, size.cnn_patch
+        )
         self.rssm = RSSM(
             self.encoder.embedding_size,
             action_dim,
@@ -61,7 +55,18 @@ class WorldModel(nn.Module):
             norm=size.norm,
             learned_initial=size.learned_initial,
         )
-        self.decoder = ImageDecoder(size.belief, size.state, size.units, blocks=size.blocks, **convolution)
+        self.decoder = ImageDecoder(
+            size.belief,
+            size.state,
+            size.units,
+            size.cnn_depth,
+            size.cnn_multipliers,
+            size.cnn_kernel,
+            size.strided,
+            size.blocks,
+            size.norm,
+            size.cnn_patch,
+        )
         self.reward_head = TwoHotHead(size.features, size.head_layers, size.units, size.norm, size.bins)
         self.continue_head = ContinueHead(size.features, size.head_layers, size.units, size.norm)
 
@@ -101,7 +106,9 @@ class WorldModel(nn.Module):
         """
         time = previous_action.shape[1]
         if not 1 <= context <= time:
-            raise ValueError(f"open_loop: context must lie between 1 and the {time} records of the batch, got {context}")
+            raise ValueError(
+                f"open_loop: context must lie between 1 and the {time} records of the batch, got {context}"
+            )
         seen = slice(0, context)
         posterior = self.observe(pixels[:, seen], previous_action[:, seen], is_init[:, seen])
         beliefs, states = list(posterior.belief.unbind(1)), list(posterior.state.unbind(1))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import pytest
@@ -228,16 +229,17 @@ distances = st.lists(st.sampled_from([-0.2, -0.1, 0.0, 0.1, 0.2]), min_size=2, m
 
 
 @given(distances)
+@settings(deadline=None)
 def test_no_crossing_is_lost_or_counted_twice(xs):
     """Judged segment by segment, forward and backward crossings alternate and add up to the change of side."""
     crossings = []
-    for before, after in zip(xs, xs[1:], strict=False):
+    for before, after in pairwise(xs):
         result = sweep(PLAIN, [(before, 0, 3), (after, 0, 3)])
         assert not (result.passed and result.crash)
         if result.passed or result.crash == BACKWARDS:
             crossings.append(1 if result.passed else -1)
     assert sum(crossings) == (xs[-1] >= 0) - (xs[0] >= 0)
-    assert all(a == -b for a, b in zip(crossings, crossings[1:], strict=False))
+    assert all(a == -b for a, b in pairwise(crossings))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 33.0, 90.0, -150.0])
@@ -267,7 +269,7 @@ def reference(track: Track, points, target: int) -> Reference:
     """The rules again, event by event, for one drone whose positions are finite."""
     events, doubts = [], [1.0]
     nearest_sample = min(abs(_in_gate_axes(gate, point)[0]) for gate in track.gates for point in points)
-    for segment, (start, end) in enumerate(zip(points, points[1:], strict=False)):
+    for segment, (start, end) in enumerate(pairwise(points)):
         for index, gate in enumerate(track.gates):
             a, b = (_in_gate_axes(gate, point) for point in (start, end))
             if (a[0] >= 0) == (b[0] >= 0):
@@ -294,7 +296,7 @@ def reference(track: Track, points, target: int) -> Reference:
                 if a >= 0 > b:
                     events.append((segment + a / (a - b), cause, 0.0))
     events.sort()
-    doubts += [later[0] - earlier[0] for earlier, later in zip(events, events[1:], strict=False)]
+    doubts += [later[0] - earlier[0] for earlier, later in pairwise(events)]
     passed, offset = False, 0.0
     for _, cause, distance in events:
         if cause != NONE:
@@ -338,7 +340,7 @@ def flights(draw):
 
 
 @given(flights())
-@settings(max_examples=400)
+@settings(max_examples=400, deadline=None)
 def test_agrees_with_the_reference(flight):
     track, target, points = flight
     expected = reference(track, points, target)
@@ -354,6 +356,7 @@ def test_agrees_with_the_reference(flight):
 
 
 @given(near, near, near, near, st.floats(0.01, 0.5), st.floats(0.01, 0.5), st.sampled_from([0, 1]))
+@settings(deadline=None)
 def test_inside_the_outer_square_every_crossing_counts(left0, up0, left1, up1, behind, beyond, target):
     """Exactly one of pass (or nothing, if not the target) and crash forwards; always a crash backwards."""
     start, end = (-behind, left0, 3 + up0), (beyond, left1, 3 + up1)
@@ -371,6 +374,7 @@ def test_inside_the_outer_square_every_crossing_counts(left0, up0, left1, up1, b
 
 
 @given(flights(), st.data())
+@settings(deadline=None)
 def test_cutting_a_segment_changes_nothing(flight, data):
     track, target, points = flight
     assume(reference(track, points, target).doubt > 1e-6)
@@ -384,6 +388,7 @@ def test_cutting_a_segment_changes_nothing(flight, data):
 
 
 @given(flights(), st.data())
+@settings(deadline=None)
 def test_cutting_a_control_step_in_two_changes_nothing(flight, data):
     """Two control steps see together what one would, as long as the first neither passes nor crashes."""
     track, target, points = flight
@@ -400,6 +405,7 @@ def test_cutting_a_control_step_in_two_changes_nothing(flight, data):
 
 
 @given(local_paths, st.floats(-180, 180), st.tuples(*[st.floats(-20, 20)] * 2), st.floats(0, 20))
+@settings(deadline=None)
 def test_moving_track_and_path_together_changes_nothing(points, turn, shift, lift):
     points = [(x, y, z + 3) for x, y, z in points]
     expected = reference(PLAIN, points, 0)
@@ -420,7 +426,7 @@ def test_decoys_never_matter(flight, decoys):
 
 
 @given(st.integers(0, 2**31), st.integers(1, 33))
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 def test_drones_together_are_drones_alone(seed, num_drones):
     generator = torch.Generator().manual_seed(seed)
     track = load_track("split_s")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -69,7 +70,7 @@ def test_progress_adds_up_to_the_distance_covered():
     race = begin(target=2)
     points = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + HOVER
     points[0] = HOVER
-    total = sum(fly(race, a, b).reward_base for a, b in zip(points, points[1:], strict=False))
+    total = sum(fly(race, a, b).reward_base for a, b in pairwise(points))
     covered = (CENTRES[2] - HOVER).norm() - (CENTRES[2] - points[-1]).norm()
     torch.testing.assert_close(total, covered.view(1))
 

@@ -137,6 +137,7 @@ class OpenGLWorker:
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
         option.geomgroup[HALL_GROUP] = 1
+        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         view = mujoco.MjvCamera()
@@ -177,10 +178,11 @@ class RayCasterWorker:
     """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int) -> None:
-        import mujoco_warp
         import warp
 
-        warp.config.quiet = True
+        warp.config.quiet = True  # must be set before mujoco_warp initialises warp
+        import mujoco_warp
+
         self._render, self._device = mujoco_warp.render, warp.get_device("cpu")
         with warp.ScopedDevice(self._device):
             data = mujoco.MjData(model)

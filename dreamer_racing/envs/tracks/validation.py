@@ -145,7 +145,7 @@ def _check_overlaps(track: Track, source: str) -> None:
     """Refuse a gate whose opening is blocked by the frame of another gate."""
     shape = track.shape
     for (name, gate), (other_name, other) in permutations(_named_gates(track), 2):
-        if _boxes_intersect(gate, shape.opening, other, shape.outer, shape.depth):
+        if boxes_intersect(gate, shape.opening, other, shape.outer, shape.depth):
             allowed = (
                 f"farther from {other_name} at {other.position}: the frame of {other_name} ({shape.outer} m square, "
                 f"{shape.depth} m deep) reaches into the opening of {name} ({shape.opening} m square)"
@@ -172,7 +172,7 @@ def _check_start(track: Track, source: str) -> None:
             raise _error(source, "start.position", start, allowed)
 
 
-def _boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:
+def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:
     """Tell whether two upright boxes (depth × side × side) share more than their surface.
 
     The boxes stand upright, so they intersect if their heights do and if their ground plans do: two rectangles are

@@ -1,0 +1,360 @@
+"""The race for Gymnasium: `gymnasium.make("dreamer_racing/Kidney-v0")` and `gymnasium.make_vec(..., num_envs=16)`.
+
+Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Observation, by the argument `observation`:
+
+| `observation` | space |
+|---|---|
+| `"pixels"` | `Box(0, 255, (64, 64, 3), uint8)`, the nose camera |
+| `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
+| `"both"` | the same `Dict` with `pixels` |
+
+`render` draws the on-board view, larger (`render_mode="rgb_array"`). All in SI units.
+
+`info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (name of the `CrashCause`, `"none"` while flying),
+`finished`, `reward_base` and `body_rate_norm` rad/s (`reward = reward_base − b₂ · body_rate_norm`), and with
+`privileged=True` a dictionary `privileged` of the state. Zeros after a reset.
+
+Importing `dreamer_racing` registers the environments; `gymnasium.make("dreamer_racing:dreamer_racing/Kidney-v0")` does
+both. Shapes: N environments.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.race import RaceStep
+from dreamer_racing.envs.scene import build_scene
+from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
+
+OBSERVATIONS = ("pixels", "state", "both")
+FRAME_SIZE = 256  # width and height of the images of `render`, pixels
+CRASH_NAMES = np.array([cause.name.lower() for cause in CrashCause], dtype=object)
+
+Observation = np.ndarray | dict[str, np.ndarray]
+
+
+class GymWorlds:
+    """What the single and the vector environment share: N worlds in Gymnasium's terms, always batched.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        num_envs: N.
+        observation: `pixels`, `state` or `both`.
+        privileged: whether `info` has the state.
+        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
+        render_mode: `rgb_array` or None.
+        worlds: further arguments of `RaceWorlds`.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+    """
+
+    def __init__(
+        self,
+        track: str | Track,
+        num_envs: int,
+        observation: str,
+        privileged: bool,
+        body_rate_weight: float | None,
+        render_mode: str | None,
+        worlds: dict[str, Any],
+    ) -> None:
+        if observation not in OBSERVATIONS:
+            raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
+        self.observation = observation
+        self.privileged = privileged
+        self.renderer_name = worlds.get("renderer", "auto")
+        self.worlds = RaceWorlds(track, num_envs, from_pixels=observation != "state", **worlds)
+        self.body_rate_weight = (
+            self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
+        )
+        self._onboard: Renderer | None = None
+
+    def action_space(self) -> Box:
+        """The action space of one environment."""
+        return Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+    def observation_space(self) -> gymnasium.Space:
+        """The observation space of one environment."""
+        camera = self.worlds.camera
+        pixels = Box(0, 255, (camera.height, camera.width, 3), np.uint8)
+        if self.observation == "pixels":
+            return pixels
+        spaces: dict[str, gymnasium.Space] = {
+            name: Box(-np.inf, np.inf, (size,), np.float32)
+            for name, size in (("position", 3), ("attitude", 4), ("linear_velocity", 3), ("body_rates", 3))
+        }
+        spaces["target_gate"] = Discrete(self.worlds.track.num_gates)
+        return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
+
+    def step(self, actions: Any) -> tuple[RaceStep, np.ndarray]:
+        """Fly one control step; return what it did and the rewards (N,)."""
+        outcome = self.worlds.step(torch.as_tensor(np.asarray(actions, np.float64)))
+        return outcome, (outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm).numpy()
+
+    def observe(self) -> Observation:
+        """The observations of all environments."""
+        if self.observation == "pixels":
+            return self.worlds.render().numpy()
+        state = self.state()
+        return state if self.observation == "state" else {"pixels": self.worlds.render().numpy(), **state}
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The privileged state of all environments; `target_gate` is (N,)."""
+        state = {name: value.numpy() for name, value in self.worlds.privileged().items()}
+        return {**state, "target_gate": state["target_gate"][:, 0]}
+
+    def info(self, outcome: RaceStep | None, begun: np.ndarray | None = None) -> dict[str, Any]:
+        """What happened in the race, arrays (N,); zeros where an episode has begun (N,) bool, or without outcome."""
+        num_envs = self.worlds.num_envs
+
+        def values(name: str, kind: type) -> np.ndarray:
+            column = np.zeros(num_envs, kind) if outcome is None else getattr(outcome, name).numpy().astype(kind)
+            return column if begun is None else np.where(begun, kind(0), column)
+
+        info: dict[str, Any] = {
+            "gates_passed": values("gates_passed", np.int64),
+            "gate_offset": values("gate_offset", np.float64),
+            "lap_time": values("lap_time", np.float64),
+            "crash": CRASH_NAMES[values("crash", np.int64)],
+            "finished": values("finished", np.bool_),
+            "reward_base": values("reward_base", np.float64),
+            "body_rate_norm": values("body_rate_norm", np.float64),
+        }
+        if self.privileged:
+            info["privileged"] = self.state()
+        return info
+
+    def frames(self) -> np.ndarray:
+        """The on-board views, uint8 (N, 256, 256, 3); their renderer is made on first use."""
+        worlds = self.worlds
+        if self._onboard is None:
+            camera = replace(worlds.camera, width=FRAME_SIZE, height=FRAME_SIZE)
+            scene = build_scene(worlds.track, worlds.parameters, camera).compile()
+            self._onboard = make_renderer(self.renderer_name, scene, camera, worlds.num_envs, num_workers=1)
+        state = worlds.simulator.state
+        return self._onboard.render(state.position, state.attitude).numpy()
+
+    def close(self) -> None:
+        """Free rendering contexts and threads."""
+        self.worlds.close()
+        if self._onboard is not None:
+            self._onboard.close()
+            self._onboard = None
+
+
+class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
+    """One drone on one track; spaces and `info` are in the module's tables.
+
+    The episode ends by itself after `episode_steps` (truncated). `gymnasium.make(..., max_episode_steps=...)` can make
+    it shorter, but not longer: for that, pass `episode_steps`.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        observation: `pixels`, `state` or `both`.
+        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        privileged: whether `info` has the state.
+        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
+            `num_threads`.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+
+    Example:
+        >>> env = gymnasium.make("dreamer_racing/Kidney-v0", observation="state")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> info["crash"]
+        'none'
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        track: str | Track = "kidney",
+        observation: str = "pixels",
+        render_mode: str | None = None,
+        privileged: bool = False,
+        body_rate_weight: float | None = None,
+        preset: str | QuadrotorParameters = "easy",
+        **worlds: Any,
+    ) -> None:
+        worlds["preset"] = preset
+        self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.render_mode = render_mode
+        self.action_space = self.race.action_space()
+        self.observation_space = self.race.observation_space()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; a seed makes it and those after it reproducible. There are no options."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.race.worlds.seed(seed)
+        self.race.worlds.reset()
+        return self._first(self.race.observe()), self._first(self.race.info(None))
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Fly one control step of 20 ms.
+
+        Args:
+            action: (4,); values beyond [-1, 1] are clipped, and one that is not finite is a crash.
+
+        Raises:
+            ValueError: wrong shape.
+        """
+        if np.shape(action) != (ACTION_SIZE,):
+            raise ValueError(
+                f"Action of shape {np.shape(action)}: this environment takes one of shape ({ACTION_SIZE},): collective "
+                "thrust and body rates x, y, z, each in [-1, 1]."
+            )
+        outcome, reward = self.race.step(np.asarray(action)[None])
+        return (
+            self._first(self.race.observe()),
+            float(reward[0]),
+            bool(outcome.terminated[0]),
+            bool(outcome.truncated[0]),
+            self._first(self.race.info(outcome)),
+        )
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The on-board view, uint8 (256, 256, 3); None without a render mode."""
+        return self.race.frames()[0] if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free rendering contexts and threads."""
+        self.race.close()
+
+    def _first(self, batch: Any) -> Any:
+        """The only row of a batch, with NumPy's scalars as Python's."""
+        if isinstance(batch, dict):
+            return {name: self._first(value) for name, value in batch.items()}
+        row = batch[0]
+        return row.item() if isinstance(row, np.generic) else row
+
+
+class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
+    """N drones racing at once in one process, much faster than N single environments.
+
+    Episodes begin by themselves in Gymnasium's mode NEXT_STEP: the step in which an episode ends returns its last
+    observation, and the step after it ignores that environment's action and returns the first observation of the next
+    episode with reward 0. Every entry of `info` is there for every environment (`info["_" + name]` is all true).
+
+    Args:
+        num_envs: N.
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        observation: `pixels`, `state` or `both`.
+        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        privileged: whether `info` has the state.
+        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
+        worlds: further arguments of `RaceWorlds`, as for `DroneRaceGymEnv`.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+
+    Example:
+        >>> envs = gymnasium.make_vec("dreamer_racing/Kidney-v0", num_envs=16, observation="state")
+        >>> observations, infos = envs.reset(seed=0)
+        >>> observations["position"].shape
+        (16, 3)
+    """
+
+    metadata = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 50,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        track: str | Track = "kidney",
+        observation: str = "pixels",
+        render_mode: str | None = None,
+        privileged: bool = False,
+        body_rate_weight: float | None = None,
+        preset: str | QuadrotorParameters = "easy",
+        max_episode_steps: int | None = None,
+        **worlds: Any,
+    ) -> None:
+        worlds["preset"] = preset
+        if max_episode_steps is not None:
+            worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps", max_episode_steps))
+        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_action_space = self.race.action_space()
+        self.single_observation_space = self.race.observation_space()
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode everywhere; a seed makes all that follow reproducible. There are no options.
+
+        Raises:
+            ValueError: the seed is a list: all environments draw from one generator.
+        """
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise ValueError(f"seed={seed!r}: one number seeds all {self.num_envs} environments together.")
+        super().reset(seed=seed)
+        if seed is not None:
+            self.race.worlds.seed(int(seed))
+        self.race.worlds.reset()
+        self._ended[:] = False
+        return self.race.observe(), self._masked(self.race.info(None))
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Fly one control step of 20 ms, or begin an episode where the last one has ended.
+
+        Args:
+            actions: (N, 4); values beyond [-1, 1] are clipped, and one that is not finite is a crash of its drone.
+
+        Raises:
+            ValueError: wrong shape.
+        """
+        begun = self._ended
+        outcome, reward = self.race.step(actions)
+        if begun.any():
+            self.race.worlds.reset(torch.from_numpy(begun))
+        terminated = outcome.terminated.numpy() & ~begun
+        truncated = outcome.truncated.numpy() & ~begun
+        self._ended = terminated | truncated
+        info = self._masked(self.race.info(outcome, begun))
+        return self.race.observe(), np.where(begun, 0.0, reward), terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
+        return tuple(self.race.frames()) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free rendering contexts and threads."""
+        self.race.close()
+
+    def _masked(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Add Gymnasium's masks of which environments an entry is there for: all of them."""
+        entries = {name: self._masked(value) if isinstance(value, dict) else value for name, value in info.items()}
+        return entries | {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in info}

@@ -1,0 +1,73 @@
+"""Fly a trained policy and measure how well it races.
+
+    python recipes/evaluate.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 episodes=100
+
+Flies the deterministic and the stochastic policy from the start pose for the track's laps, prints both, and writes
+evaluation.json beside plots, videos and the episodes' own numbers.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from command_line import choose_device, plain_errors, start_logging
+from omegaconf import DictConfig, OmegaConf
+from schema import DreamerConfig, EvaluateConfig, register
+
+from dreamer_racing.checkpoint import ensure_writable, latest_checkpoint, load_components
+from dreamer_racing.envs.scene import Camera
+from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.reporting import EvaluationReport
+
+register()
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Restore the policy, fly it both ways, report."""
+    start_logging()
+    with plain_errors():
+        report, directory = build(OmegaConf.to_object(config))
+    results: dict[str, Any] = {}
+    for name in ("deterministic", "stochastic"):
+        result = report.evaluate(deterministic=name == "deterministic")
+        report.write(name, result)
+        results[name] = result.to_dict()
+        print(f"\n{name} policy, {len(result.episodes)} episodes\n{result.summary()}")
+    (directory / "evaluation.json").write_text(json.dumps(results, indent=2))
+    print(f"\nwritten to {directory}")
+    report.close()
+
+
+def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
+    """Restore the learner of a checkpoint and make the races that its policy is to fly."""
+    device = choose_device(config.device)
+    checkpoint = latest_checkpoint(config.checkpoint)
+    run_dir = checkpoint.parent.parent
+    trained: DreamerConfig = OmegaConf.to_object(
+        OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
+    )
+    torch.manual_seed(config.seed)
+    learner = DreamerLearner(trained.model.size, device=device)
+    counters: dict[str, int] = {}
+    load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
+    directory = ensure_writable(config.run_dir or run_dir / "evaluation")
+    track, preset = config.track or trained.track, config.preset or trained.env.preset
+    print(f"checkpoint: {checkpoint} ({trained.model.size}, {counters['env_steps']:,} env_steps)")
+    print(f"race: {track}, {preset}, {config.episodes} episodes")
+    worlds = {
+        "track": track,
+        "preset": preset,
+        "renderer": config.renderer,
+        "camera": Camera(tilt=trained.env.camera_tilt),
+    }
+    report = EvaluationReport(
+        directory, learner, worlds, config.episodes, config.video_steps, num_envs=config.num_envs, seed=config.seed
+    )
+    return report, directory
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives.dreamer_v3 import categorical_kl_terms
+
+from dreamer_racing.losses import WorldModelLoss, kl_losses
+from dreamer_racing.modules import WorldModel
+
+
+def make_batch(batch: int = 2, time: int = 4) -> TensorDict:
+    torch.manual_seed(0)
+    flag = torch.zeros(batch, time, 1, dtype=torch.bool)
+    is_init, terminated = flag.clone(), flag.clone()
+    is_init[0, 2] = True
+    terminated[0, 1] = True
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
+            "previous_action": torch.rand(batch, time, 4) * 2 - 1,
+            "reward": torch.randn(batch, time, 1),
+            "is_init": is_init,
+            "terminated": terminated,
+            "truncated": flag.clone(),
+        },
+        [batch, time],
+    )
+
+
+def test_kl_with_unimix_by_hand():
+    posterior, prior = torch.tensor([[[math.log(3.0), 0.0]]]), torch.zeros(1, 1, 2)
+    first, second = 0.99 * 0.75 + 0.005, 0.99 * 0.25 + 0.005
+    expected = first * math.log(first / 0.5) + second * math.log(second / 0.5)
+    _, _, kl = kl_losses(posterior, prior, free_nats=0.0, unimix=0.01)
+    torch.testing.assert_close(kl, torch.tensor([expected]))
+
+
+def test_kl_agrees_with_torchrl():
+    torch.manual_seed(0)
+    ours = [torch.randn(2, 3, 4, 8, requires_grad=True) for _ in range(2)]
+    theirs = [value.detach().clone().requires_grad_() for value in ours]
+    dynamics, representation, _ = kl_losses(*ours, free_nats=1.0, unimix=0.01)
+    expected = categorical_kl_terms(*theirs, free_nats=1.0, unimix=0.01)
+    torch.testing.assert_close((dynamics.mean(), representation.mean()), expected)
+    (dynamics.mean() + 0.1 * representation.mean()).backward()
+    (expected[0] + 0.1 * expected[1]).backward()
+    for our, their in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(our.grad, their.grad)
+
+
+def test_dynamics_moves_the_prior_and_representation_the_posterior():
+    posterior, prior = torch.randn(1, 4, 8, requires_grad=True), torch.randn(1, 4, 8, requires_grad=True)
+    dynamics, representation, _ = kl_losses(posterior, prior, free_nats=0.0, unimix=0.01)
+    dynamics.sum().backward()
+    assert posterior.grad is None
+    assert prior.grad.abs().sum() > 0
+    prior.grad = None
+    representation.sum().backward()
+    assert prior.grad is None
+    assert posterior.grad.abs().sum() > 0
+
+
+def test_free_nats_bound_the_sum_over_latents():
+    """Eight latents of 0.3 nats each are 2.4 nats: above the threshold, though each is below it."""
+    prior = torch.zeros(1, 8, 2, requires_grad=True)
+    posterior = torch.tensor([1.8, 0.0]).expand(1, 8, 2)
+    dynamics, _, kl = kl_losses(posterior, prior, free_nats=1.0, unimix=0.0)
+    assert kl.item() / 8 < 1 < kl.item()
+    torch.testing.assert_close(dynamics, kl)
+    dynamics.sum().backward()
+    assert prior.grad.abs().sum() > 0
+    close = torch.zeros(1, 8, 2, requires_grad=True)
+    clamped, _, _ = kl_losses(posterior * 0.1, close, free_nats=1.0, unimix=0.0)
+    assert clamped.item() == 1.0
+    clamped.sum().backward()
+    assert close.grad.abs().sum() == 0
+
+
+def test_losses_of_a_new_model():
+    world_model = WorldModel("debug", action_dim=4)
+    batch = make_batch()
+    loss = WorldModelLoss(world_model)
+    losses = loss(batch)
+    assert set(loss.out_keys) == set(losses.keys())
+    # Uniform over 255 bins, whatever the reward.
+    assert losses["loss_reward"].item() == pytest.approx(math.log(255), rel=1e-5)
+    torch.testing.assert_close(losses["loss_image"], losses["image_error"] * 64 * 64 * 3)
+    torch.testing.assert_close(losses["reward_error"], batch["reward"].abs().mean())
+    assert losses["replay_context"].batch_size == (2, 4)
+    assert losses["replay_context", "belief"].requires_grad
+
+
+def test_continue_target_is_one_minus_terminated():
+    world_model = WorldModel("debug", action_dim=4)
+    output = world_model.continue_head.mlp.output
+    with torch.no_grad():
+        output.weight.zero_()
+        output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
+    batch = make_batch()
+    batch["truncated"][1, 1] = True
+    loss = WorldModelLoss(world_model)(batch)["loss_continue"]
+    expected = -(7 * math.log(0.75) + 1 * math.log(0.25)) / 8
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_every_parameter_of_the_world_model_gets_a_gradient():
+    world_model = WorldModel("debug", action_dim=4)
+    with torch.no_grad():
+        world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
+    losses = WorldModelLoss(world_model, free_nats=0.0)(make_batch())
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    for name, parameter in world_model.named_parameters():
+        assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name

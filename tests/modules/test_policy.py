@@ -1,0 +1,127 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+
+from dreamer_racing.learner import Agent
+from dreamer_racing.modules.policy import DreamerPolicy
+from dreamer_racing.modules.sizes import SIZES
+
+
+class NoiseEnv(EnvBase):
+    """Drones that see noise; drone i crashes every i + 2 steps, so that resets are partial."""
+
+    def __init__(self, num_envs: int = 3) -> None:
+        super().__init__(batch_size=[num_envs])
+        self.generator = torch.Generator().manual_seed(0)
+        self.steps = torch.zeros(num_envs, 1, dtype=torch.int64)
+        self.observation_spec = Composite(
+            pixels=Bounded(0, 255, shape=(num_envs, 64, 64, 3), dtype=torch.uint8), shape=[num_envs]
+        )
+        self.action_spec = Bounded(-1, 1, shape=(num_envs, 4))
+        self.reward_spec = Unbounded(shape=(num_envs, 1))
+        flags = {
+            key: Binary(1, shape=(num_envs, 1), dtype=torch.bool, device="cpu")
+            for key in ("done", "terminated", "truncated")
+        }
+        self.full_done_spec = Composite(**flags, shape=[num_envs])
+
+    def _observe(self) -> torch.Tensor:
+        shape = (*self.batch_size, 64, 64, 3)
+        return torch.randint(0, 256, shape, dtype=torch.uint8, generator=self.generator)
+
+    def _reset(self, tensordict: TensorDict | None = None) -> TensorDict:
+        reset = None if tensordict is None else tensordict.get("_reset", None)
+        if reset is None:
+            reset = torch.ones_like(self.steps, dtype=torch.bool)
+        self.steps[reset] = 0
+        flags = {key: torch.zeros_like(self.steps, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        return TensorDict({"pixels": self._observe(), **flags}, self.batch_size)
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        assert tensordict["action"].abs().max() <= 1
+        self.steps += 1
+        done = self.steps >= torch.arange(2, 2 + len(self.steps)).unsqueeze(-1)
+        flags = {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
+        reward = torch.zeros(*self.batch_size, 1)
+        return TensorDict({"pixels": self._observe(), "reward": reward, **flags}, self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator.manual_seed(seed or 0)
+
+
+def make_policy(deterministic: bool = False) -> tuple[Agent, DreamerPolicy]:
+    torch.manual_seed(0)
+    agent = Agent(SIZES["debug"], action_dim=4)
+    with torch.no_grad():
+        agent.actor.mlp.output.weight.mul_(200.0)  # so that actions differ from one another
+    return agent, DreamerPolicy(agent.world_model, agent.actor, deterministic)
+
+
+def make_env(policy: DreamerPolicy) -> TransformedEnv:
+    env = TransformedEnv(NoiseEnv(), InitTracker())
+    env.append_transform(policy.make_primer())
+    return env
+
+
+def test_collected_latents_equal_those_of_training():
+    """Across partial resets, unrolling over what a collector recorded gives the latents that acted."""
+    agent, policy = make_policy(deterministic=True)
+    collector = Collector(make_env(policy), policy, frames_per_batch=36, total_frames=36)
+    data = next(iter(collector))
+    collector.shutdown()
+    is_init = data["is_init"].squeeze(-1)
+    assert data.batch_size == (3, 12)
+    assert is_init.sum(-1).tolist() == [6, 4, 3]
+    posterior = agent.world_model.observe(data["pixels"], data["previous_action"], is_init, deterministic=True)
+    torch.testing.assert_close(posterior.belief, data["next", "belief"])
+    torch.testing.assert_close(posterior.state, data["next", "state"])
+    follows = ~is_init[:, 1:]
+    assert torch.equal(data["previous_action"][:, 1:][follows], data["action"][:, :-1][follows])
+    assert data["action"].std() > 0.01
+
+
+def test_rollout_of_the_policy_samples_and_needs_no_gradient():
+    _, policy = make_policy()
+    data = make_env(policy).rollout(5, policy, auto_reset=True, break_when_any_done=False)
+    assert data["action"].shape == (3, 5, 4)
+    assert not data["action"].requires_grad
+    assert not data["next", "belief"].requires_grad
+
+
+def test_deterministic_flag_switches_sampling_off():
+    _, policy = make_policy()
+    root = make_env(policy).reset()
+    assert not torch.equal(policy(root.clone())["action"], policy(root.clone())["action"])
+    policy.deterministic = True
+    assert torch.equal(policy(root.clone())["action"], policy(root.clone())["action"])
+
+
+def test_is_init_makes_old_latents_irrelevant():
+    _, policy = make_policy(deterministic=True)
+    root = make_env(policy).reset()
+    stale = root.clone()
+    for key in ("belief", "state", "previous_action"):
+        stale[key] = torch.randn_like(stale[key])
+    assert torch.equal(policy(root)["action"], policy(stale)["action"])
+
+
+@pytest.mark.parametrize("batch", [[], [4], [2, 3]])
+def test_policy_takes_any_batch_size(batch):
+    _, policy = make_policy()
+    size = SIZES["debug"]
+    tensordict = TensorDict(
+        {
+            "pixels": torch.zeros(*batch, 64, 64, 3, dtype=torch.uint8),
+            "is_init": torch.ones(*batch, 1, dtype=torch.bool),
+            "belief": torch.zeros(*batch, size.belief),
+            "state": torch.zeros(*batch, size.state),
+            "previous_action": torch.zeros(*batch, 4),
+        },
+        batch,
+    )
+    out = policy(tensordict)
+    assert out["action"].shape == (*batch, 4)
+    assert out["next", "state"].shape == (*batch, size.state)

@@ -1,0 +1,221 @@
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss
+from dreamer_racing.modules import SIZES
+
+CONFIG = LearnerConfig(imagination_horizon=4, lr=1e-3, warmup_updates=0)
+
+
+def make_batch(batch: int = 3, time: int = 6) -> TensorDict:
+    """Windows with a crash, a truncation and the resets that follow them."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.zeros(batch, time, 64, 64, 3, dtype=torch.uint8)
+    for step in range(time):
+        pixels[:, step, 8 * step : 8 * step + 16, 10:30] = 200  # a bar that moves
+    flag = torch.zeros(batch, time, 1, dtype=torch.bool)
+    is_init, terminated, truncated = flag.clone(), flag.clone(), flag.clone()
+    terminated[0, 2] = truncated[1, 3] = True
+    is_init[0, 3] = is_init[1, 4] = is_init[2, 0] = True
+    return TensorDict(
+        {
+            "pixels": pixels,
+            "previous_action": (torch.rand(batch, time, 4, generator=generator) * 2 - 1).masked_fill(is_init, 0.0),
+            "reward": torch.randn(batch, time, 1, generator=generator).masked_fill(is_init, 0.0),
+            "is_init": is_init,
+            "terminated": terminated,
+            "truncated": truncated,
+        },
+        [batch, time],
+    )
+
+
+def test_update_returns_scalar_tensors_and_moves_every_network():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    before = copy.deepcopy(learner.agent.state_dict())
+    batch = make_batch()
+    metrics = learner.update(batch)
+    metrics = learner.update(batch)
+    for key, value in metrics.items():
+        assert value.shape == (), key
+        assert not value.requires_grad, key
+        assert value.isfinite(), key
+    expected = {"loss", "loss_image", "kl", "entropy", "return_scale", "return_mean", "reward_error", "image_error"}
+    assert expected < metrics.keys()
+    assert {f"gradient_norm/{name}" for name in ("world_model", "actor", "critic")} < metrics.keys()
+    for name, value in learner.agent.state_dict().items():
+        still = name.endswith("initial_belief")
+        assert torch.equal(value, before[name]) == still, name
+
+
+def test_losses_fall_on_a_fixed_batch():
+    torch.manual_seed(0)
+    learner = DreamerLearner("debug", config=replace(CONFIG, lr=3e-3), seed=0)
+    batch = make_batch()
+    first = learner.update(batch)
+    for _ in range(100):
+        last = learner.update(batch)
+    assert last["image_error"] < 0.4 * first["image_error"]
+    assert last["loss_reward"] < 0.5 * first["loss_reward"]
+    assert last["loss_continue"] < 0.5 * first["loss_continue"]
+    assert last["loss_critic"] < first["loss_critic"]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_gradients_do_not_leak_between_networks(shared):
+    """The actor's and the imagined critic's losses stay theirs; the replayed one enters the model only if asked to."""
+    learner = DreamerLearner("debug", config=replace(CONFIG, replay_value_gradient=shared), seed=0)
+    with torch.no_grad():
+        learner.agent.critic.head.mlp.output.weight.normal_()
+    losses = learner.compute_losses(make_batch())
+    reached = {}
+    for key in [key for key in losses if key.startswith("loss_")]:
+        learner.agent.zero_grad(set_to_none=True)
+        losses[key].backward(retain_graph=True)
+        reached[key] = {
+            name
+            for name, network in learner.agent.named_children()
+            if any(parameter.grad is not None for parameter in network.parameters())
+        }
+    world_model = {key for key in reached if reached[key] == {"world_model"}}
+    assert world_model == {"loss_image", "loss_reward", "loss_continue", "loss_dynamics", "loss_representation"}
+    assert reached["loss_actor"] == {"actor"}
+    assert reached["loss_critic"] == {"critic"}
+    assert reached["loss_replay_critic"] == ({"critic", "world_model"} if shared else {"critic"})
+
+
+def test_resume_equals_never_having_stopped():
+    batch = make_batch()
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(batch)
+    saved = copy.deepcopy(learner.state_dict())
+    resumed = DreamerLearner("debug", config=CONFIG, seed=1)
+    resumed.load_state_dict(saved)
+    assert resumed.updates == 1
+    results = []
+    for each in (learner, resumed):
+        torch.manual_seed(5)
+        results.append([each.update(batch) for _ in range(2)][-1])
+    assert results[0].keys() == results[1].keys()
+    for key, value in results[0].items():
+        assert torch.equal(value, results[1][key]), key
+    for name, value in learner.agent.state_dict().items():
+        assert torch.equal(value, resumed.agent.state_dict()[name]), name
+
+
+def test_return_normaliser_is_saved():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.losses["actor"].return_normalizer.high.fill_(7.0)
+    resumed = DreamerLearner("debug", config=CONFIG, seed=0)
+    resumed.load_state_dict(learner.state_dict())
+    assert resumed.losses["actor"].return_normalizer.scale().item() == 7.0
+
+
+def test_state_survives_a_file(tmp_path):
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(make_batch())
+    torch.save(learner.state_dict(), tmp_path / "learner.pt")
+    DreamerLearner("debug", config=CONFIG).load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=True))
+
+
+def test_state_of_another_size_is_refused_with_what_to_do():
+    learner = DreamerLearner("debug", config=CONFIG)
+    other = DreamerLearner(replace(SIZES["debug"], name="wider", units=32), config=CONFIG)
+    with pytest.raises(ValueError, match=r"'debug'.*'wider'.*units 16 there, 32 here.*model=debug") as error:
+        other.load_state_dict(learner.state_dict())
+    assert "\n" not in str(error.value)
+
+
+def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
+    first = DreamerLearner("debug", config=CONFIG, seed=0)
+    assert torch.equal(torch.rand(1), expected)
+    second = DreamerLearner("debug", config=CONFIG, seed=0)
+    for name, value in first.agent.state_dict().items():
+        assert torch.equal(value, second.agent.state_dict()[name]), name
+
+
+def test_imagination_may_start_from_a_subset():
+    learner = DreamerLearner("debug", config=replace(CONFIG, imagination_starts=5), seed=0)
+    seen = []
+    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    metrics = learner.update(make_batch())
+    assert seen[0].batch_size == (4, 5)
+    assert metrics["loss_replay_critic"].isfinite()
+
+
+def test_every_terminal_record_is_a_start_of_no_weight():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    seen = []
+    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    learner.update(make_batch())
+    weight = seen[0]["weight"].view(4, 3, 6)
+    assert torch.equal(weight[0], 1.0 - make_batch()["terminated"].squeeze(-1).float())
+    assert torch.equal(weight[:, 0, 2], torch.zeros(4))
+
+
+def test_open_loop_video():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    images = learner.open_loop(make_batch(), context=2)
+    assert images.shape == (3, 6, 64, 64, 3)
+    assert images.dtype == torch.uint8
+
+
+def test_policy_shares_the_parameters():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    policy = learner.policy(deterministic=True)
+    assert policy.deterministic
+    assert policy.actor is learner.agent.actor
+    assert policy.rssm is learner.agent.world_model.rssm
+
+
+def test_losses_are_chosen_by_name(monkeypatch):
+    class BoldActorLoss(ActorLoss):
+        """Has ten times the entropy."""
+
+        def forward(self, tensordict):
+            self.entropy_scale = 3e-3
+            return super().forward(tensordict)
+
+    monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss.from_config)
+    learner = DreamerLearner("debug", config=replace(CONFIG, actor_loss="bold"), seed=0)
+    assert isinstance(learner.losses["actor"], BoldActorLoss)
+    learner.update(make_batch())
+    with pytest.raises(ValueError, match="'timid'.*reinforce"):
+        DreamerLearner("debug", config=replace(CONFIG, actor_loss="timid"))
+
+
+@pytest.mark.parametrize("recurrence", ["block", "dense"])
+@pytest.mark.parametrize("norm", ["rms", "layer"])
+def test_every_variant_updates(recurrence, norm):
+    size = replace(
+        SIZES["debug"],
+        name="variant",
+        recurrence=recurrence,
+        blocks=2 if recurrence == "block" else 1,
+        norm=norm,
+        learned_initial=norm == "layer",
+        strided=norm == "layer",
+        cnn_kernel=4 if norm == "layer" else 5,
+    )
+    learner = DreamerLearner(size, config=CONFIG, seed=0)
+    assert learner.update(make_batch())["loss"].isfinite()
+
+
+@pytest.mark.parametrize("recurrence", ["block", "dense"])
+def test_mixed_precision_is_close_to_full(recurrence):
+    size = replace(SIZES["debug"], name="variant", recurrence=recurrence, blocks=2, norm="rms")
+    results = []
+    for mixed_precision in (False, True):
+        learner = DreamerLearner(size, config=replace(CONFIG, mixed_precision=mixed_precision), seed=0)
+        torch.manual_seed(0)
+        results.append(learner.update(make_batch()))
+        assert all(parameter.dtype == torch.float32 for parameter in learner.agent.parameters())
+    torch.testing.assert_close(results[0]["loss"], results[1]["loss"], rtol=1e-2, atol=0)
