@@ -1,10 +1,11 @@
 """Resident memory over many steps of random actions: it must not grow.
 
-    python benchmarks/memory.py --steps 100000 --json results/memory.json
+python benchmarks/memory.py --steps 100000 --json results/memory.json
 """
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from measuring import print_table, write_json
 from torchrl.collectors import Collector
@@ -27,7 +28,7 @@ def main() -> None:
     env = DroneRacingEnv(arguments.track, arguments.num_envs, renderer=arguments.renderer, seed=0)
     frames = 16 * arguments.num_envs
     collector = Collector(env, RandomPolicy(env.action_spec), frames_per_batch=frames, total_frames=-1)
-    records = []
+    records: list[dict[str, Any]] = []
     env_steps, every = 0, arguments.steps // SAMPLES
     for rollout in collector:
         if env_steps // every != (env_steps + rollout.numel()) // every or not records:

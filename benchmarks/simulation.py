@@ -30,7 +30,9 @@ def main() -> None:
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
     parser.add_argument("--renderers", nargs="*", default=["none", "egl", "osmesa", "warp"])
-    parser.add_argument("--num-envs", nargs="*", type=int, help="N to try; default: 64 128 256, without pixels 512 1024")
+    parser.add_argument(
+        "--num-envs", nargs="*", type=int, help="N to try; default: 64 128 256, without pixels 512 1024"
+    )
     parser.add_argument("--seconds", type=float, default=5.0, help="least time of a measurement")
     parser.add_argument("--json")
     arguments = parser.parse_args()

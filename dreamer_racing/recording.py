@@ -162,7 +162,7 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail:
         for step in range(max(1, now - length), now + 1):
             draw.line([*points[step - 1], *points[step]], fill=tuple(colors[step].tolist()), width=8)
         crashed = trajectory.crashed and now == len(points) - 1
-        _draw_drone(draw, points[now], view[now], size / 14, CRASH_COLOR if crashed else INK)
+        _draw_drone(draw, points[now], view[now], size / 10, CRASH_COLOR if crashed else INK)
         frames[now] = np.asarray(image.resize((size, size), Image.Resampling.BOX))
     return frames
 

@@ -9,7 +9,7 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -76,7 +76,7 @@ def main(config: DictConfig) -> None:
         overrides = list(HydraConfig.get().overrides.task)
         if config.resume:
             config, overrides = resumed_config(config.resume, overrides)
-        run = build(OmegaConf.to_object(resolve(config)), overrides)
+        run = build(cast(DreamerConfig, OmegaConf.to_object(resolve(config))), overrides)
     try:
         train(run)
     finally:
@@ -92,7 +92,7 @@ def resumed_config(resume: str, overrides: list[str]) -> tuple[DictConfig, list[
 
 
 def resolve(config: DictConfig) -> DictConfig:
-    """Replace every `auto` and null by what it stands for on this machine, and say what was chosen."""
+    """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
     device = choose_device(config.device)
     if config.device == "auto":
         print(f"device: {device} (device=auto)")
@@ -102,8 +102,8 @@ def resolve(config: DictConfig) -> DictConfig:
         print(f"model: {size} (model=auto on {device.type})")
     config.device, config.model.size = str(device), size
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
-    for name, value in config.model.items():
-        if value is None:
+    for name in config.model:
+        if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
     if config.run_dir is None:
         config.run_dir = str(new_run_dir("dreamer_v3", config.track))
@@ -112,6 +112,7 @@ def resolve(config: DictConfig) -> DictConfig:
 
 def build(config: DreamerConfig, overrides: list[str]) -> Run:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
+    assert config.run_dir is not None, "resolve() names it"
     directory = ensure_writable(config.run_dir)
     worlds: dict[str, Any] = {
         "track": config.track,
@@ -122,8 +123,12 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
     learner = DreamerLearner(config.model.size, config=learner_config(config), device=config.device, seed=config.seed)
     torch.manual_seed(config.seed)
     env = DroneRacingEnv(
-        num_envs=config.env.num_envs, episode_steps=config.env.episode_steps, privileged=False, seed=config.seed, **worlds
-    )  # fmt: skip
+        num_envs=config.env.num_envs,
+        episode_steps=config.env.episode_steps,
+        privileged=False,
+        seed=config.seed,
+        **worlds,
+    )
     policy = learner.policy()
     collector = Collector(
         TransformedEnv(env, Compose(InitTracker(), policy.make_primer())),
@@ -144,7 +149,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
         config.model.batch_size,
         config.model.batch_length,
         config.device,
-        storage=config.replay.storage,
+        storage=config.replay.storage.value,
         storage_device="cpu",
         seed=config.seed,
         transform=RelabelReward(curriculum) if config.curriculum.relabel else None,
@@ -162,7 +167,9 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
         env.set_seed(config.seed + counters["env_steps"])
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     OmegaConf.save(OmegaConf.structured(config), directory / "config.yaml")
-    OmegaConf.save(OmegaConf.create([o for o in overrides if not o.startswith("resume=")]), directory / "overrides.yaml")
+    OmegaConf.save(
+        OmegaConf.create([o for o in overrides if not o.startswith("resume=")]), directory / "overrides.yaml"
+    )
     report = EvaluationReport(directory, learner, worlds, config.evaluation.episodes, config.evaluation.video_steps)
     metrics = MetricsLog(
         directory,

@@ -8,7 +8,7 @@ evaluation.json beside plots, videos and the episodes' own numbers.
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -29,7 +29,7 @@ def main(config: DictConfig) -> None:
     """Restore the policy, fly it both ways, report."""
     start_logging()
     with plain_errors():
-        report, directory = build(OmegaConf.to_object(config))
+        report, directory = build(cast(EvaluateConfig, OmegaConf.to_object(config)))
     results: dict[str, Any] = {}
     for name in ("deterministic", "stochastic"):
         result = report.evaluate(deterministic=name == "deterministic")
@@ -46,9 +46,8 @@ def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
     device = choose_device(config.device)
     checkpoint = latest_checkpoint(config.checkpoint)
     run_dir = checkpoint.parent.parent
-    trained: DreamerConfig = OmegaConf.to_object(
-        OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
-    )
+    saved = OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
+    trained = cast(DreamerConfig, OmegaConf.to_object(saved))
     torch.manual_seed(config.seed)
     learner = DreamerLearner(trained.model.size, device=device)
     counters: dict[str, int] = {}

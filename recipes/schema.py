@@ -1,6 +1,7 @@
 """Typed configuration of the recipes: hydra refuses a value of the wrong type, naming the field."""
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
@@ -19,14 +20,14 @@ class EnvConfig:
 
 @dataclass
 class ModelConfig:
-    """Size of the networks, and the numbers that go with it. `auto` chooses by device; null takes the size's own."""
+    """Size of the networks and the numbers that go with it: `auto` chooses by device, what is missing by size."""
 
     size: str = MISSING
-    batch_size: int | None = None  # windows in a batch
-    batch_length: int | None = None  # records in a window
-    replay_ratio: float | None = None  # records trained on per environment step
-    learning_rate: float | None = None
-    imagination_horizon: int | None = None
+    batch_size: int = MISSING  # windows in a batch
+    batch_length: int = MISSING  # records in a window
+    replay_ratio: float = MISSING  # records trained on per environment step
+    learning_rate: float = MISSING
+    imagination_horizon: int = MISSING
 
 
 @dataclass
@@ -65,12 +66,19 @@ class LoggerConfig:
     every: int = 2_000  # env_steps between rows
 
 
+class Storage(Enum):
+    """Where replay records live."""
+
+    tensor = "tensor"
+    memmap = "memmap"
+
+
 @dataclass
 class ReplayConfig:
     """The replay buffer."""
 
     capacity: int = 250_000  # records, 12.3 KB each
-    storage: str = "tensor"  # tensor (memory) | memmap (files)
+    storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
 
 
 @dataclass

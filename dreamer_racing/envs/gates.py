@@ -192,13 +192,18 @@ class GateSweeper:
         """
         clearance = torch.cat((position - self._low, self._high - position))  # (6, P + 1, N), negative outside
         before, after = clearance[:, :-1].clamp(min=0), clearance[:, 1:]
-        time = torch.where(after < 0, segment + before / (before - after), math.inf)
+        # `before` is NaN, hence not >= 0, where the position was lost: that crash has been found already.
+        leaving = (after < 0) & (before >= 0)
+        time = torch.where(leaving, segment + before / (before - after), math.inf)
         return time.amin(1)
 
     def _first_crash(
         self, frame: torch.Tensor, backwards: torch.Tensor, non_finite: torch.Tensor, box: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the earliest of the times (N,), (N,), (N,) and (6, N), and its cause, both (N,)."""
+        """Return the earliest of the times (N,), (N,), (N,) and (6, N), and its cause, both (N,).
+
+        Of causes at the same time the first row wins.
+        """
         time, row = torch.cat((torch.stack((frame, backwards, non_finite)), box)).min(0)
         return time, torch.where(time.isfinite(), self._causes[row], int(CrashCause.NONE))
 

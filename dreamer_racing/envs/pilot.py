@@ -37,6 +37,7 @@ class LineLimits:
         speed: the fraction of the greatest collective thrust that the line may use; the one knob of aggressiveness.
         gate_offset: greatest distance from a gate's centre, to the left and up, m.
         body_rate_max: greatest roll and pitch rate, rad/s.
+        angular_acceleration_max: greatest roll and pitch acceleration, rad/s².
         thrust_min: least collective thrust, m/s²; below it the drone's attitude has no direction.
         gate_cosine: least cosine of the angle between the flight and a gate's normal.
         clearance: distance from the bounding box, m.
@@ -47,6 +48,7 @@ class LineLimits:
     speed: float = 0.9
     gate_offset: float = 0.25
     body_rate_max: float = 6.0
+    angular_acceleration_max: float = 40.0
     thrust_min: float = 3.0
     gate_cosine: float = 0.75
     clearance: float = 0.5
@@ -125,14 +127,15 @@ class _LineNodes:
         self.gates, self.normals = track.gate_positions(dtype=dtype), track.gate_normals(dtype=dtype)
         self.left = track.gate_rotations(dtype=dtype)[:, :, 1]
         self.gate_offset = gate_offset
-        position, velocity, duration, first = [], [], [], []
+        position, velocity, duration, counts, first = [], [], [], [], []
         for here in range(len(self.gates)):
             there = (here + 1) % len(self.gates)
             gap = self.gates[there] - self.gates[here]
             length = 1.1 * float(gap.norm()) + 0.5
             count = max(2, round(float(gap.norm()) / self.SPACING))
-            first.append(len(duration))
-            duration += [length / self.START_SPEED / count] * count
+            first.append(sum(counts))
+            duration.append(length / self.START_SPEED)
+            counts.append(count)
             t = (torch.arange(count, dtype=dtype) / count).unsqueeze(-1)
             bend, out, into = 3 * t**2 - 2 * t**3, t**3 - 2 * t**2 + t, t**3 - t**2
             tangents = length * (out * self.normals[here] + into * self.normals[there])
@@ -144,14 +147,15 @@ class _LineNodes:
         self.gate_nodes = torch.tensor(first)
         self._start = torch.stack((torch.cat(position), torch.cat(velocity)), dim=1)  # (M, 2, 3)
         self._start = torch.nn.functional.pad(self._start, (0, 0, 0, 2))  # (M, 4, 3)
-        self._start_duration = torch.tensor(duration, dtype=dtype)
+        self._counts = torch.tensor(counts)
+        self._start_duration = torch.tensor(duration, dtype=dtype) / self._counts
         self._scales = torch.tensor(self.SCALES, dtype=dtype).view(4, 1)
         self.change = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
-        self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (M,)
+        self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (G,)
 
     def durations(self) -> Tensor:
-        """Seconds from each node to the next (M,)."""
-        return self._start_duration * self.log_duration.exp()
+        """Seconds from each node to the next (M,); between two gates they are equal."""
+        return (self._start_duration * self.log_duration.exp()).repeat_interleave(self._counts)
 
     def nodes(self) -> Tensor:
         """Position, velocity, acceleration and jerk of each node (M, 4, 3)."""
@@ -217,6 +221,9 @@ def _lap_cost(
     penalty = 300.0 * (_excess(thrust, limits.speed * dynamics.thrust_max) + outside.sum(-1))
     penalty = penalty + 30.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
     penalty = penalty + 50.0 * _excess(body_rate.norm(dim=-1), limits.body_rate_max)
+    turn = body_rate.flatten(0, 1)
+    turn = (turn.roll(-1, 0) - turn).view_as(body_rate).norm(dim=-1) * basis.shape[1] / durations.unsqueeze(-1)
+    penalty = penalty + 10.0 * _excess(turn, limits.angular_acceleration_max)
     at_gates = torch.nn.functional.normalize(values[nodes.gate_nodes, 1], dim=-1)
     slant = (limits.gate_cosine - (at_gates * nodes.normals).sum(-1)).clamp(min=0.0)
     return durations.sum() + (durations * penalty.mean(-1)).sum() + 10.0 * slant.square().sum()
@@ -300,7 +307,7 @@ class PilotGains:
     correction_max: float = 10.0
     progress_max: float = 8.0
     look_ahead: float = 0.5
-    adaptation: float = 2.0
+    adaptation: float = 0.0
 
 
 class ScriptedPilot:

@@ -157,10 +157,10 @@ class Quadrotor:
         self.parameters = p = parameters
         self.num_drones = num_drones
         self._generator = generator
-        self._factory = {"device": torch.device(device), "dtype": dtype}
+        self._device, self._dtype = torch.device(device), dtype
 
         def tensor(values: object) -> Tensor:
-            return torch.tensor(values, **self._factory)
+            return torch.tensor(values, device=device, dtype=dtype)
 
         self._inertia = tensor(p.inertia)  # (3,)
         self._rate_gain = self._inertia * p.rate_gain  # (3,)
@@ -179,18 +179,18 @@ class Quadrotor:
 
         hover_speed = math.sqrt(p.mass * GRAVITY / 4.0)
         self._hover_speed = hover_speed
-        self.rotor_speed = torch.full((num_drones, 4), hover_speed, **self._factory)  # √N: thrust = speed²
+        self.rotor_speed = torch.full((num_drones, 4), hover_speed, device=device, dtype=dtype)  # √N: thrust = speed²
         delay_max = p.randomisation.delay_max if p.randomisation else p.command_delay
         self._nominal_delay_steps = round(p.command_delay / p.physics_dt)
         history = math.ceil(round(delay_max / p.physics_dt) / p.physics_steps)
         self._hover_setpoint = tensor((p.mass * GRAVITY, 0.0, 0.0, 0.0))
         self._setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
         self._drones = self._nominal_drones() if p.randomisation or history else None
-        self._everyone = torch.arange(num_drones, device=self._factory["device"])
+        self._everyone = torch.arange(num_drones, device=device)
 
     def _nominal_drones(self) -> _Drones:
-        one = torch.ones(self.num_drones, 1, **self._factory)
-        delay = torch.full((self.num_drones,), self._nominal_delay_steps, device=self._factory["device"])
+        one = torch.ones(self.num_drones, 1, device=self._device, dtype=self._dtype)
+        delay = torch.full((self.num_drones,), self._nominal_delay_steps, device=self._device)
         return _Drones(one, one.repeat(1, 3), one.clone(), one.clone(), one.clone(), delay)
 
     def reset(self, mask: Tensor) -> None:
@@ -206,15 +206,17 @@ class Quadrotor:
         assert drones is not None
         for name in drones.tensors:
             current = getattr(drones, name)
-            noise = torch.rand(current.shape, generator=self._generator, **self._factory) * 2.0 - 1.0
+            noise = 2.0 * self._uniform(*current.shape) - 1.0
             setattr(drones, name, torch.where(rows, 1.0 + getattr(widths, name) * noise, current))
-        uniform = torch.rand((self.num_drones,), generator=self._generator, **self._factory)
-        delay = (uniform * widths.delay_max / self.parameters.physics_dt).round().long()
+        delay = (self._uniform(self.num_drones) * widths.delay_max / self.parameters.physics_dt).round().long()
         drones.delay_steps = torch.where(rows[:, 0], delay, drones.delay_steps)
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
 
     def command(self, action: Tensor) -> None:
         """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
-        action = action.to(**self._factory).clamp(-1.0, 1.0)
+        action = action.to(self._device, self._dtype).clamp(-1.0, 1.0)
         setpoint = torch.addcmul(self._setpoint_offset, action, self._setpoint_scale)
         self._setpoints = torch.cat((setpoint.unsqueeze(0), self._setpoints[:-1]))
 

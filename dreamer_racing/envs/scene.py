@@ -100,12 +100,12 @@ def _add_light(spec: mujoco.MjSpec) -> None:
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, low: Sequence[float], high: Sequence[float], rgb: Sequence[float]) -> None:
-    low, high = np.asarray(low), np.asarray(high)
+    corners = np.array((low, high))
     spec.worldbody.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=(low + high) / 2,
-        size=(high - low) / 2,
+        pos=corners.mean(axis=0),
+        size=(corners[1] - corners[0]) / 2,
         material=_material(spec, rgb),
         contype=0,
         conaffinity=0,
@@ -238,9 +238,7 @@ def _add_airframe(spec: mujoco.MjSpec, body: mujoco.MjsBody, parameters: Quadrot
     """What a spectator sees of the drone; massless, and hidden from its own camera."""
     look = {"contype": 0, "conaffinity": 0, "group": DRONE_GROUP, "mass": 0.0}
     dark, front, rear = (0.12, 0.12, 0.13), (0.95, 0.95, 0.95), (0.15, 0.75, 0.25)
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.06, 0.03, 0.02), material=_material(spec, dark), **look
-    )
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.06, 0.03, 0.02), material=_material(spec, dark), **look)
     for x, y in parameters.rotor_positions:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(0, 0, 0, x, y, 0.01), size=(0.01, 0, 0),

@@ -62,7 +62,7 @@ def _loads(library: str) -> bool:
 
 _choose_gl_backend()
 
-from dm_control import mujoco  # noqa: E402
+from dm_control import _render, mujoco  # noqa: E402
 from dm_control.mujoco import wrapper  # noqa: E402
 from dm_control.rl import control  # noqa: E402
 from dm_control.suite import base  # noqa: E402
@@ -230,8 +230,8 @@ class NoseCamera:
             self._camera = mujoco.Camera(physics, camera.height, camera.width, CAMERA_NAME)
         except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
             raise RendererUnavailableError(
-                f"dm_control cannot draw with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} "
-                f"({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install libegl1 "
+                f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
+                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install libegl1 "
                 "libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before dreamer_racing, "
                 "MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. DroneRacingEnv and the Gymnasium environments "
                 "can draw without OpenGL."

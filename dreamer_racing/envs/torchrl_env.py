@@ -80,9 +80,7 @@ class DroneRacingEnv(EnvBase):
             shape=n,
             device=self.device,
         )
-        observation = Composite(
-            reward_base=number(1), body_rate_norm=number(1), race=race, shape=n, device=self.device
-        )
+        observation = Composite(reward_base=number(1), body_rate_norm=number(1), race=race, shape=n, device=self.device)
         self._before_the_race = observation.zero()
         if self.from_pixels:
             camera = self.worlds.camera

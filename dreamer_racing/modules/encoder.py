@@ -54,6 +54,7 @@ class ImageEncoder(nn.Module):
         patch: Side of the pixel blocks that are folded into channels before the first stage; 1 folds nothing.
 
     Example:
+        >>> import torch
         >>> encoder = ImageEncoder(depth=4)
         >>> encoder(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
         torch.Size([2, 256])

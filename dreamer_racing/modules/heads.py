@@ -64,6 +64,7 @@ class TwoHot(nn.Module):
         bins: K, odd, so that the middle bin is 0.
 
     Example:
+        >>> import torch
         >>> two_hot = TwoHot(255)
         >>> two_hot.decode(torch.zeros(1, 255))
         tensor([[0.]])

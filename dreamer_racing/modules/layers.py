@@ -81,7 +81,8 @@ class RMSNorm(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``(..., features)`` over its last dimension."""
-        return F.rms_norm(inputs, self.weight.shape, self.weight, NORM_EPS)
+        # The cast does nothing but under autocast, where mixed types would leave the fused kernel.
+        return F.rms_norm(inputs, self.weight.shape, self.weight.to(inputs.dtype), NORM_EPS)
 
 
 class LayerNorm(nn.LayerNorm):

@@ -62,7 +62,7 @@ def sample_one_hot(probabilities: Tensor, noise: Tensor | None) -> Tensor:
 
 
 def _gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
-    """Return the next belief ``(N, D)`` from the gates before activation and the belief, each ``(N, D)``."""
+    """Return the next belief from the gates before activation and the belief, each float32 ``(N, D)``."""
     candidate = torch.tanh(torch.sigmoid(reset) * candidate)
     # The shift of -1 makes a fresh cell remember rather than overwrite.
     return torch.lerp(belief, candidate, torch.sigmoid(update - 1.0))
@@ -103,7 +103,8 @@ class DenseGRUCell(nn.Module):
             ``(N, D)``.
         """
         inputs = self.inputs(state, projected_action)
-        reset, candidate, update = self.gates_norm(self.gates(torch.cat((inputs, belief), -1))).chunk(3, -1)
+        gates = self.gates_norm(self.gates(torch.cat((inputs, belief), -1))).float()
+        reset, candidate, update = gates.chunk(3, -1)
         return _gated_update(reset, candidate, update, belief)
 
 
@@ -146,7 +147,7 @@ class BlockGRUCell(nn.Module):
         inputs = torch.cat((self.from_belief(belief), self.from_state(state), projected_action), -1)
         hidden = F.silu(self.hidden_norm(self.hidden_shared(inputs) + self.hidden_blocks(belief)))
         # Each block holds its reset, candidate and update gates: (N, 3D) -> three of (N, D)
-        gates = self.gates(hidden).unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
+        gates = self.gates(hidden).float().unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
         reset, candidate, update = (gate.flatten(1) for gate in gates)
         return _gated_update(reset, candidate, update, belief)
 
@@ -176,6 +177,7 @@ class RSSM(nn.Module):
         unimix: Share of the uniform distribution in every categorical.
 
     Example:
+        >>> import torch
         >>> rssm = RSSM(embedding=8, action=4, belief=16, latents=2, classes=4, hidden=8)
         >>> posterior = rssm.observe(torch.zeros(2, 5, 8), torch.zeros(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
         >>> posterior.state.shape

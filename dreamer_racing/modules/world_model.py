@@ -28,6 +28,7 @@ class WorldModel(nn.Module):
         action_dim: A.
 
     Example:
+        >>> import torch
         >>> world_model = WorldModel("debug", action_dim=4)
         >>> pixels = torch.zeros(2, 3, 64, 64, 3, dtype=torch.uint8)
         >>> posterior = world_model.observe(pixels, torch.zeros(2, 3, 4), torch.zeros(2, 3, dtype=torch.bool))

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import unittest
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -242,35 +243,14 @@ def test_rotors_start_at_hover_in_every_episode() -> None:
     assert time_step.observation["position"][2] == pytest.approx(height, abs=1e-3)
 
 
-class TestSuiteManners(test_utils.EnvironmentTestMixin):
+class TestSuiteManners(test_utils.EnvironmentTestMixin, unittest.TestCase):
     """dm_env's own conformance tests."""
-
-    @pytest.fixture(autouse=True)
-    def _set_up(self):
-        self.setUp()
-        yield
-        self.tearDown()
 
     def make_object_under_test(self):
         return load("kidney", random=0, time_limit=1.0)
 
     def make_action_sequence(self):
         return [HOVER] * 120
-
-    def setUp(self) -> None:
-        self.object_under_test = self.environment = self.make_object_under_test()
-
-    def tearDown(self) -> None:
-        self.environment.close()
-
-    def assertIn(self, member, container) -> None:
-        assert member in container
-
-    def assertIs(self, one, other, *args) -> None:
-        assert one is other
-
-    def assertIsInstance(self, value, kind) -> None:
-        assert isinstance(value, kind)
 
 
 def test_observations_match_their_specs() -> None:

@@ -49,7 +49,7 @@ def test_keys_and_shapes():
     assert imagination.batch_size == (5, 6)
     assert imagination["features"].shape == (5, 6, 48)
     assert imagination["lambda_return"].shape == imagination["weight"].shape == (5, 6, 1)
-    assert all(losses[key].shape == () for key in losses if key != "imagination")
+    assert all(value.shape == () for key, value in losses.items() if key != "imagination")
 
 
 def test_only_the_actor_gets_a_gradient():

@@ -143,9 +143,7 @@ class OpenGLWorker:
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = model.camera(CAMERA_NAME).id
-        mujoco.mjv_updateScene(
-            model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
-        )
+        mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
         self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
         self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
 
@@ -180,7 +178,7 @@ class RayCasterWorker:
     def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int) -> None:
         import warp
 
-        warp.config.quiet = True  # must be set before mujoco_warp initialises warp
+        warp.config.log_level = warp.LOG_ERROR  # before mujoco_warp initialises warp: no CUDA is no news here
         import mujoco_warp
 
         self._render, self._device = mujoco_warp.render, warp.get_device("cpu")
