@@ -280,7 +280,9 @@ def _check(env: EnvBase, episodes: int) -> float:
             "Make it with DroneRacingEnv(..., evaluation=True)."
         )
     if ("privileged", "linear_velocity") not in env.observation_spec.keys(include_nested=True):
-        raise ValueError("env has no ('privileged', ...) entries, from which speed and paths are read: privileged=True.")
+        raise ValueError(
+            "env has no ('privileged', ...) entries, from which speed and paths are read: privileged=True."
+        )
     return float(env.worlds.parameters.control_dt)
 
 

@@ -133,7 +133,8 @@ def side_by_side(
     phase[:context] = CONTEXT_COLOR
     colors = [np.full_like(phase, 255), phase, np.full_like(phase, 255)]
     framed = [
-        _frame(_enlarge(panel, scale), color, border) for panel, color in zip(panels, colors[: len(panels)], strict=True)
+        _frame(_enlarge(panel, scale), color, border)
+        for panel, color in zip(panels, colors[: len(panels)], strict=True)
     ]
     return np.concatenate(framed, axis=2)
 
@@ -186,7 +187,9 @@ def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, ga
         raise ValueError("the trajectory has no images: record it in an environment with from_pixels=True.")
     height, width = trajectory.pixels.shape[1:3]
     if height != width or size % height:
-        raise ValueError(f"images of {height} × {width} pixels cannot be enlarged to {size} × {size} by a whole factor.")
+        raise ValueError(
+            f"images of {height} × {width} pixels cannot be enlarged to {size} × {size} by a whole factor."
+        )
     view = _enlarge(trajectory.pixels.numpy(), size // height)
     between = np.full((len(view), size, gap, 3), 255, dtype=np.uint8)
     return np.concatenate((view, between, top_down_frames(track, trajectory, size)), axis=2)
@@ -225,7 +228,9 @@ def _draw_drone(draw: ImageDraw.ImageDraw, place: np.ndarray, view: np.ndarray, 
 def _as_frames(frames: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
     array = frames.detach().cpu().numpy() if isinstance(frames, torch.Tensor) else frames
     if array.ndim != 4 or array.shape[-1] != 3 or not array.size or array.dtype != np.uint8:
-        raise ValueError(f"{name} is {array.dtype} of shape {array.shape}; wanted: uint8 (T, H, W, 3), at least 1 frame.")
+        raise ValueError(
+            f"{name} is {array.dtype} of shape {array.shape}; wanted: uint8 (T, H, W, 3), at least 1 frame."
+        )
     return array
 
 

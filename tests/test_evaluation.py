@@ -118,7 +118,9 @@ def race(num_envs: int, **arguments) -> DroneRacingEnv:
 def test_flies_the_episodes_dealt_to_each_environment_however_long_they_last(episodes, lengths):
     result = evaluate(ScriptedRace(SCRIPT), idle(), episodes)
     assert [episode.length for episode in result.episodes] == lengths
-    assert [episode.reward_sum for episode in result.episodes] == lengths  # 1 a step: no step of a neighbour is mixed in
+    assert [
+        episode.reward_sum for episode in result.episodes
+    ] == lengths  # 1 a step: no step of a neighbour is mixed in
     assert [episode.speed_mean for episode in result.episodes if episode.outcome not in CRASHES] == [
         length for length in lengths if length in (30, 9, 6)
     ]
@@ -233,5 +235,3 @@ def test_gradients_are_off_and_policies_keep_their_own_randomness():
 
     evaluate(ScriptedRace(SCRIPT), TensorDictModule(act, [("privileged", "position")], ["action"]), 1)
     assert seen == [False, False]
-
-

@@ -137,8 +137,18 @@ def make_physics(
     camera: Camera | None = None,
     generator: torch.Generator | None = None,
 ) -> "Physics":
-    """Compile the scene of a track for one drone, whose physics randomisation is drawn from the generator."""
+    """Compile the scene of a track for one drone, whose physics randomisation is drawn from the generator.
+
+    A second camera, `spectator`, stands in a corner of the hall and follows the drone with its gaze.
+    """
     spec = build_scene(track, parameters, camera)
+    spec.worldbody.add_camera(
+        name="spectator",
+        pos=(track.bounds_low[0] + 0.3, track.bounds_low[1] + 0.3, track.bounds_high[2] - 0.3),
+        mode=mujoco_bindings.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM,
+        targetbody="drone",
+        fovy=60.0,
+    )
     view = spec.visual.global_
     view.offwidth, view.offheight = max(FRAMEBUFFER[0], view.offwidth), max(FRAMEBUFFER[1], view.offheight)
     model = spec.compile()

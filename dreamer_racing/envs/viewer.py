@@ -1,7 +1,8 @@
 """dm_control's interactive viewer on the race: `view("kidney")`.
 
 It needs a display. Where there is none, `launch_viewer` says what is missing instead of failing inside GLFW; record a
-video or call `env.physics.render(480, 640, camera_id=...)` there. Keys are listed by F1 in the window.
+video or call `env.physics.render(480, 640, camera_id="spectator")` there. In the window, F1 lists the keys, and `[` and
+`]` switch between the free camera, the drone's `nose` and the `spectator`.
 """
 
 import ctypes
@@ -80,7 +81,7 @@ def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
     if missing:
         raise ViewerUnavailableError(
             f"The viewer cannot open a window here: {'; '.join(missing)}. Without a window, images come from "
-            "env.physics.render(480, 640) (EGL or OSMesa) and from the environments' pixels."
+            "env.physics.render(480, 640, camera_id='spectator') (EGL or OSMesa) and from the environments' pixels."
         )
 
 

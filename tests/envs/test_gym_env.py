@@ -1,0 +1,258 @@
+"""The Gymnasium environments: the checker's verdict, autoreset, seeds, and the same race as everywhere else."""
+
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import dreamer_racing
+from dreamer_racing.envs.gym_env import DroneRaceGymEnv, DroneRaceVectorEnv
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.rewards import RewardWeights
+from dreamer_racing.envs.worlds import RaceWorlds
+
+IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
+HOVER = np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
+INFO = {"gates_passed", "gate_offset", "lap_time", "crash", "finished", "reward_base", "body_rate_norm"}
+
+
+def make_vec(num_envs: int = 3, **arguments) -> DroneRaceVectorEnv:
+    return gymnasium.make_vec("dreamer_racing/Circle-v0", num_envs=num_envs, **arguments)
+
+
+@pytest.mark.parametrize("identifier", IDS)
+def test_checker_finds_nothing(identifier: str) -> None:
+    env = gymnasium.make(identifier, render_mode="rgb_array").unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize("observation", ["state", "both"])
+def test_checker_finds_only_that_states_are_unbounded(observation: str) -> None:
+    env = gymnasium.make(IDS[0], observation=observation, privileged=True).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*A Box observation space m(in|ax)imum value is -?infinity.*")
+        check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_each_track_is_the_one_of_its_name() -> None:
+    assert [identifier.split("/")[1] for identifier in IDS] == ["Circle-v0", "Kidney-v0", "Figure8-v0", "SplitS-v0"]
+    for identifier, track in zip(IDS, ("circle", "kidney", "figure8", "split_s"), strict=True):
+        env = gymnasium.make(identifier, observation="state")
+        assert env.unwrapped.race.worlds.track.name == track
+        vector = gymnasium.make_vec(identifier, num_envs=2, observation="state")
+        assert vector.race.worlds.track.name == track
+
+
+def test_importing_the_package_registers_and_is_cheap() -> None:
+    code = (
+        "import sys, gymnasium; assert not any(i.startswith('dreamer') for i in gymnasium.registry); "
+        "import dreamer_racing; print(sorted(m for m in ('torch', 'mujoco', 'torchrl') if m in sys.modules), "
+        "sum(i.startswith('dreamer_racing/') for i in gymnasium.registry))"
+    )
+    ran = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["[]", "4"]
+
+
+def test_module_form_of_the_name() -> None:
+    env = gymnasium.make("dreamer_racing:dreamer_racing/Kidney-v0", observation="state")
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+
+
+def test_pixels_by_default_and_frames_of_the_same_view() -> None:
+    env = gymnasium.make(IDS[1], render_mode="rgb_array")
+    observation, info = env.reset(seed=0)
+    assert (observation.shape, observation.dtype) == ((64, 64, 3), np.uint8)
+    assert set(info) == INFO
+    frame = env.render()
+    assert (frame.shape, frame.dtype) == ((256, 256, 3), np.uint8)
+    small = frame.reshape(64, 4, 64, 4, 3).mean((1, 3))
+    assert np.abs(small - observation).mean() < 4.0
+    env.close()
+    env.close()
+
+
+def test_single_environment_is_one_of_the_worlds() -> None:
+    env = DroneRaceGymEnv("kidney", observation="state", privileged=True, body_rate_weight=0.01)
+    worlds = RaceWorlds("kidney", 1, from_pixels=False)
+    observation, _ = env.reset(seed=4)
+    worlds.seed(4)
+    worlds.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        np.testing.assert_array_equal(observation["position"], worlds.privileged()["position"][0].numpy())
+        action = rng.uniform(-0.5, 0.5, 4).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        outcome = worlds.step(torch.from_numpy(action).unsqueeze(0))
+        assert reward == (outcome.reward_base - 0.01 * outcome.body_rate_norm).item()
+        assert info["reward_base"] - 0.01 * info["body_rate_norm"] == pytest.approx(reward, abs=1e-12)
+        np.testing.assert_array_equal(info["privileged"]["attitude"], observation["attitude"])
+        assert (terminated, truncated, info["crash"]) == (False, False, "none")
+
+
+def test_body_rate_weight_follows_the_reward_weights_unless_given() -> None:
+    weights = RewardWeights(body_rate=0.5)
+    assert DroneRaceGymEnv(observation="state").race.body_rate_weight == RewardWeights().body_rate
+    assert DroneRaceGymEnv(observation="state", weights=weights).race.body_rate_weight == 0.5
+    assert DroneRaceGymEnv(observation="state", weights=weights, body_rate_weight=0.0).race.body_rate_weight == 0.0
+
+
+def test_time_limit_truncates() -> None:
+    env = gymnasium.make(IDS[0], observation="state", evaluation=True, episode_steps=5)
+    env.reset()
+    ends = [env.step(HOVER)[2:4] for _ in range(5)]
+    assert ends == [(False, False)] * 4 + [(False, True)]
+    shorter = gymnasium.make(IDS[0], observation="state", evaluation=True, max_episode_steps=3)
+    shorter.reset()
+    assert [shorter.step(HOVER)[3] for _ in range(3)] == [False, False, True]
+
+
+def test_crash_terminates_and_names_its_cause() -> None:
+    env = DroneRaceGymEnv("circle", observation="state", evaluation=True)
+    env.reset()
+    for _ in range(60):
+        _, reward, terminated, truncated, info = env.step(np.array([-1.0, 0.0, 0.0, 0.0]))
+        if terminated:
+            break
+    assert (terminated, truncated, reward, info["crash"]) == (True, False, -4.0, "ground")
+
+
+def test_action_that_is_not_finite_ends_the_single_environment() -> None:
+    env = DroneRaceGymEnv("circle")
+    env.reset(seed=0)
+    observation, reward, terminated, _, info = env.step(np.array([0, np.nan, 0, 0], np.float32))
+    assert (terminated, reward, info["crash"]) == (True, -4.0, "invalid_action")
+    assert env.observation_space.contains(observation)
+    env.close()
+
+
+def test_wrong_arguments_are_explained() -> None:
+    env = DroneRaceGymEnv("circle", observation="state")
+    env.reset()
+    with pytest.raises(ValueError, match=r"shape \(2, 4\): this environment takes one of shape \(4,\): collective"):
+        env.step(np.zeros((2, 4)))
+    envs = make_vec(observation="state")
+    envs.reset()
+    with pytest.raises(ValueError, match=r"shape \(2, 4\): 3 environment\(s\) take one of shape \(3, 4\)"):
+        envs.step(np.zeros((2, 4)))
+    with pytest.raises(ValueError, match="seed=\\[1, 2, 3\\]: one number"):
+        envs.reset(seed=[1, 2, 3])
+    with pytest.raises(ValueError, match="observation='image': choose one of pixels, state, both"):
+        DroneRaceGymEnv(observation="image")
+    with pytest.raises(ValueError, match="render_mode='human'"):
+        DroneRaceVectorEnv(2, render_mode="human")
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_seeds_reproduce(vector: bool) -> None:
+    def fly(seed: int | None) -> np.ndarray:
+        arguments = {"observation": "state", "preset": "faithful"}
+        env = make_vec(2, **arguments) if vector else gymnasium.make(IDS[0], **arguments)
+        observation, _ = env.reset(seed=seed)
+        rows = [observation["position"]]
+        action = np.tile(HOVER, (2, 1)) if vector else HOVER
+        for _ in range(2):
+            rows += [env.step(action)[0]["linear_velocity"] for _ in range(2)]
+            rows.append(env.reset()[0]["position"])  # the second episode follows from the seed too
+        return np.stack(rows)
+
+    first = fly(0)
+    np.testing.assert_array_equal(first, fly(0))
+    assert not np.allclose(first, fly(1))
+    assert not np.allclose(fly(None), fly(None))
+    assert not np.allclose(first[0], first[3])
+
+
+def test_vector_spaces_infos_and_frames() -> None:
+    envs = make_vec(observation="both", privileged=True, render_mode="rgb_array")
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert envs.spec.id == "dreamer_racing/Circle-v0"
+    observation, info = envs.reset(seed=0)
+    assert envs.observation_space.contains(observation)
+    assert observation["pixels"].shape == (3, 64, 64, 3)
+    for name in INFO:
+        assert info[name].shape == info["_" + name].shape == (3,)
+    observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+    assert envs.observation_space.contains(observation)
+    assert reward.shape == terminated.shape == truncated.shape == (3,)
+    assert list(info["crash"]) == ["none"] * 3
+    np.testing.assert_array_equal(info["privileged"]["target_gate"], observation["target_gate"])
+    assert [frame.shape for frame in envs.render()] == [(256, 256, 3)] * 3
+    envs.close()
+    envs.close()
+
+
+def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
+    envs = make_vec(observation="both", evaluation=True, max_episode_steps=4)
+    start, _ = envs.reset(seed=0)
+    hover = np.tile(HOVER, (3, 1))
+    poisoned = hover.copy()
+    poisoned[1] = np.nan
+    _, reward, terminated, truncated, info = envs.step(poisoned)
+    assert list(terminated) == [False, True, False]
+    assert list(info["crash"]) == ["none", "invalid_action", "none"]
+    assert reward[1] == -4.0
+
+    observation, reward, terminated, truncated, info = envs.step(poisoned)  # its action does not matter now
+    assert not terminated.any()
+    assert reward[1] == 0.0
+    assert info["crash"][1] == "none"
+    np.testing.assert_array_equal(observation["position"][1], start["position"][1])
+    np.testing.assert_array_equal(observation["pixels"][1], start["pixels"][1])
+
+    ends = [envs.step(hover)[2:5] for _ in range(4)]
+    # two steps more end the undisturbed ones; the other has had an episode's first observation in between
+    assert [list(end[1]) for end in ends] == [
+        [False, False, False],
+        [True, False, True],
+        [False, False, False],
+        [False, True, False],
+    ]
+    assert not any(end[0].any() for end in ends)
+    envs.close()
+
+
+def test_invalid_action_leaves_the_others_alone() -> None:
+    flown = []
+    for poison in (False, True):
+        envs = make_vec(observation="state")
+        envs.reset(seed=0)
+        actions = np.tile(HOVER, (3, 1))
+        if poison:
+            actions[0, 2] = np.inf
+        rows = []
+        for _ in range(2):
+            observation, reward, *_ = envs.step(actions)
+            rows.append((observation["position"][1:], reward[1:]))
+        flown.append(rows)
+    for clean, poisoned in zip(*flown, strict=True):
+        np.testing.assert_array_equal(clean[0], poisoned[0])
+        np.testing.assert_array_equal(clean[1], poisoned[1])
+
+
+def test_reset_forgets_pending_autoresets() -> None:
+    envs = make_vec(observation="state", evaluation=True)
+    envs.reset()
+    envs.step(np.full((3, 4), np.nan))
+    envs.reset()
+    _, reward, *_ = envs.step(np.tile(np.array([0.5, 0, 0, 0]), (3, 1)))
+    assert (reward != 0.0).all()
+
+
+def test_gymnasiums_own_vectorisation_works_too() -> None:
+    envs = gymnasium.make_vec(IDS[0], num_envs=2, vectorization_mode="sync", observation="state")
+    envs.reset(seed=0)
+    _, _, _, _, info = envs.step(envs.action_space.sample())
+    assert list(info["crash"]) == ["none", "none"]
+    envs.close()
