@@ -375,8 +375,9 @@ class _Recorder:
     def _observe(self, tensordict: TensorDictBase) -> None:
         entries = {name: tensordict["privileged", name] for name in ("position", "attitude", "linear_velocity")}
         entries["target_gate"] = tensordict["privileged", "target_gate"].squeeze(-1)
-        if "pixels" in tensordict.keys():
-            entries["pixels"] = tensordict["pixels"]
+        pixels = tensordict.get("pixels", None)
+        if pixels is not None:
+            entries["pixels"] = pixels
         for name, value in entries.items():
             self._rows[name].append(value[self.index].cpu().clone())
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -160,8 +161,19 @@ def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torc
     return rotate(attitude, axis.expand(*attitude.shape[:-1], 3))
 
 
-_BADGE = {"boxstyle": "circle,pad=0.22", "facecolor": "white", "edgecolor": GATE_COLOR, "linewidth": 1.0}
-_BOX = {"facecolor": "#f8f9fa", "edgecolor": MUTED, "linewidth": 1.0, "linestyle": (0, (5, 3)), "zorder": 0}
+_BADGE: dict[str, Any] = {
+    "boxstyle": "circle,pad=0.22",
+    "facecolor": "white",
+    "edgecolor": GATE_COLOR,
+    "linewidth": 1.0,
+}
+_BOX: dict[str, Any] = {
+    "facecolor": "#f8f9fa",
+    "edgecolor": MUTED,
+    "linewidth": 1.0,
+    "linestyle": (0, (5, 3)),
+    "zorder": 0,
+}
 
 
 def _layout(track: Track, side_view: bool) -> tuple[Figure, Axes, Axes | None]:
@@ -200,7 +212,7 @@ def _draw_gate(axes: Axes, gate: Gate, width: float, color: str) -> None:
         arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}
         for side in (-0.42, 0.42):
             foot = centre + side * width * left
-            axes.annotate("", xy=foot + 0.6 * forward, xytext=foot, arrowprops=arrow, zorder=4)
+            axes.annotate("", xy=tuple(foot + 0.6 * forward), xytext=tuple(foot), arrowprops=arrow, zorder=4)
 
 
 def _number_gate(axes: Axes, track: Track, number: int) -> None:
@@ -212,7 +224,7 @@ def _number_gate(axes: Axes, track: Track, number: int) -> None:
     above = [other for other in track.gates[: number - 1] if math.dist(other.position[:2], gate.position[:2]) < 0.5]
     side = -outwards if above else outwards  # one above the other: a number at either end
     place = centre + side * left * (track.shape.outer / 2 + 0.45)
-    axes.text(*place, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
+    axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
 
 
 def _draw_track_side(axes: Axes, track: Track) -> None:
@@ -271,8 +283,20 @@ def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> No
         axes.plot(*end, **_CRASH, zorder=9)
 
 
-_START = {"marker": "o", "markersize": 8, "color": "white", "markeredgecolor": INK, "markeredgewidth": 1.8}
-_CRASH = {"marker": "X", "markersize": 12, "color": CRASH_COLOR, "markeredgecolor": "white", "markeredgewidth": 1.2}
+_START: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 8,
+    "color": "white",
+    "markeredgecolor": INK,
+    "markeredgewidth": 1.8,
+}
+_CRASH: dict[str, Any] = {
+    "marker": "X",
+    "markersize": 12,
+    "color": CRASH_COLOR,
+    "markeredgecolor": "white",
+    "markeredgewidth": 1.2,
+}
 
 
 def _title(track: Track, trajectory: Trajectory) -> str:
@@ -283,7 +307,7 @@ def _title(track: Track, trajectory: Trajectory) -> str:
 
 
 def _add_legend(figure: Figure, track: Track, trajectory: Trajectory) -> None:
-    bar = {"linewidth": 4.5, "solid_capstyle": "butt"}
+    bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
     handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
     if track.decoys:
         handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))

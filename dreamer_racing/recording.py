@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,9 +47,10 @@ def write_video(
     array = _as_frames(frames, "frames")
     scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with imageio.get_writer(
+    writer: Any = imageio.get_writer(
         path, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=quality, macro_block_size=1
-    ) as writer:
+    )
+    with writer:
         for frame in array:
             writer.append_data(_make_even(_enlarge(frame, scale)))
 

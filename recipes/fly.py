@@ -89,12 +89,12 @@ def check(config: FlyConfig) -> None:
         raise ValueError(f"pilot={config.pilot}: there are {', '.join(PILOTS)}.")
     if config.image_size < 1 or GIF_SIZE % config.image_size:
         raise ValueError(f"image_size={config.image_size}: must divide {GIF_SIZE}, for instance 64, 128 or 256.")
-    Path(config.run_dir).mkdir(parents=True, exist_ok=True)
 
 
 def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
     with plain_errors():
+        Path(config.run_dir).mkdir(parents=True, exist_ok=True)
         camera = Camera(width=config.image_size, height=config.image_size)
         worlds: dict[str, Any] = {"evaluation": True, "camera": camera, "renderer": config.renderer}
         env = DroneRacingEnv(config.track, 1, preset=config.preset, seed=config.seed, **worlds)

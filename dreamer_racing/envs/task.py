@@ -147,7 +147,7 @@ def make_physics(
         pos=(track.bounds_low[0] + 0.3, track.bounds_low[1] + 0.3, track.bounds_high[2] - 0.3),
         mode=mujoco_bindings.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM,
         targetbody="drone",
-        fovy=60.0,
+        fovy=45.0,
     )
     view = spec.visual.global_
     view.offwidth, view.offheight = max(FRAMEBUFFER[0], view.offwidth), max(FRAMEBUFFER[1], view.offheight)
@@ -241,10 +241,10 @@ class NoseCamera:
         except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
             raise RendererUnavailableError(
                 f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
-                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install libegl1 "
-                "libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before dreamer_racing, "
-                "MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. DroneRacingEnv and the Gymnasium environments "
-                "can draw without OpenGL."
+                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "
+                "libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before "
+                "dreamer_racing, MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. DroneRacingEnv and the "
+                "Gymnasium environments can draw without OpenGL."
             ) from error
         self._camera.option.geomgroup[:] = 0
         self._camera.option.geomgroup[HALL_GROUP] = 1

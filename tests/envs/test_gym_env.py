@@ -199,12 +199,12 @@ def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
     hover = np.tile(HOVER, (3, 1))
     poisoned = hover.copy()
     poisoned[1] = np.nan
-    _, reward, terminated, truncated, info = envs.step(poisoned)
+    _, reward, terminated, _, info = envs.step(poisoned)
     assert list(terminated) == [False, True, False]
     assert list(info["crash"]) == ["none", "invalid_action", "none"]
     assert reward[1] == -4.0
 
-    observation, reward, terminated, truncated, info = envs.step(poisoned)  # its action does not matter now
+    observation, reward, terminated, _, info = envs.step(poisoned)  # its action does not matter now
     assert not terminated.any()
     assert reward[1] == 0.0
     assert info["crash"][1] == "none"

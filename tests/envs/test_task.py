@@ -311,7 +311,7 @@ def test_viewer_style_loop_renders_any_size_and_the_drone_from_outside() -> None
     segments = env.physics.render(480, 640, camera_id="spectator", segmentation=True)[..., 0]
     drone = np.flatnonzero(env.physics.model.geom_bodyid == env.physics.model.name2id("drone", "body"))
     rows, columns = np.isin(segments, drone).nonzero()
-    assert len(rows) > 3
+    assert len(rows) >= 3
     assert abs(rows.mean() - 240) < 10  # the spectator looks at the drone
     assert abs(columns.mean() - 320) < 10
     np.testing.assert_array_equal(env.task._view.image(), nose)  # whose own view other cameras leave alone

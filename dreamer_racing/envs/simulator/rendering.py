@@ -90,7 +90,7 @@ class Renderer:
         axes = rotate(attitude.unsqueeze(1).expand(-1, 3, -1), self._axes.expand(frames, -1, -1)).numpy()  # (M, 3, 3)
         images = torch.empty((frames, camera.height, camera.width, 3), dtype=torch.uint8)
         out = images.numpy()
-        size = -(-frames // len(self._executors))
+        size = max(1, -(-frames // len(self._executors)))
         slices = [slice(start, start + size) for start in range(0, frames, size)]
         jobs = [
             executor.submit(worker.draw, eye[part], axes[part], out[part])

@@ -1,0 +1,295 @@
+"""`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/architecture.md` promises."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import check_env_specs
+
+from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.rewards import RewardWeights
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, TrackError, make_track
+
+HOVER = (QuadrotorParameters().hover_action, 0.0, 0.0, 0.0)
+STRAIGHT = make_track("straight", [Gate((0.0, 0.0, 1.35), 0.0), Gate((2.0, 0.0, 1.35), 0.0)], laps=1)
+
+
+def blind(num_envs: int = 3, track="circle", **arguments) -> DroneRacingEnv:
+    """An environment without pixels."""
+    return DroneRacingEnv(track, num_envs, from_pixels=False, **{"seed": 0, **arguments})
+
+
+def hover(data: TensorDict) -> TensorDict:
+    return data.set("action", torch.tensor(HOVER).expand(*data.batch_size, 4).clone())
+
+
+def wild(seed: int):
+    """A policy of random actions near hover."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def act(data: TensorDict) -> TensorDict:
+        noise = torch.rand(*data.batch_size, 4, generator=generator) - 0.5
+        return data.set("action", torch.tensor(HOVER) + noise)
+
+    return act
+
+
+@pytest.mark.parametrize("track", BUILTIN_TRACKS)
+def test_specs_on_every_track(track: str) -> None:
+    env = DroneRacingEnv(track, num_envs=2, seed=0)
+    check_env_specs(env)
+    env.close()
+
+
+@pytest.mark.parametrize(("from_pixels", "privileged"), [(False, False), (False, True), (True, False), (True, True)])
+def test_specs_with_and_without_pixels_and_state(from_pixels: bool, privileged: bool) -> None:
+    env = DroneRacingEnv("kidney", num_envs=2, from_pixels=from_pixels, privileged=privileged, seed=0)
+    check_env_specs(env)
+    data = env.rollout(3)
+    keys = data["next"].keys()
+    assert ("pixels" in keys, "privileged" in keys) == (from_pixels, privileged)
+    for key, dtype, shape in (
+        ("action", torch.float32, (4,)),
+        (("next", "reward"), torch.float32, (1,)),
+        (("next", "terminated"), torch.bool, (1,)),
+        (("next", "reward_base"), torch.float32, (1,)),
+        (("next", "race", "gates_passed"), torch.int64, (1,)),
+        (("next", "race", "finished"), torch.bool, (1,)),
+    ):
+        assert (data[key].dtype, data[key].shape[2:]) == (dtype, shape), key
+    if from_pixels:
+        assert (data["pixels"].dtype, data["pixels"].shape[2:]) == (torch.uint8, (64, 64, 3))
+    if privileged:
+        assert data["privileged", "target_gate"].dtype == torch.int64
+        assert data["privileged", "attitude"].shape[2:] == (4,)
+    env.close()
+
+
+def test_single_environment_and_faithful_preset() -> None:
+    check_env_specs(blind(1, preset="faithful"))
+
+
+def test_seeds_reproduce_and_differ() -> None:
+    def fly(seed: int) -> torch.Tensor:
+        env = blind(preset="faithful", seed=seed)
+        data = torch.cat([env.rollout(5, wild(0)), env.rollout(5, wild(1))], dim=1)
+        return data["next", "privileged", "position"]
+
+    first = fly(0)
+    assert torch.equal(first, fly(0))
+    assert not torch.allclose(first, fly(1))
+    assert not torch.allclose(first[:, 0], first[:, 5])
+
+
+def test_set_seed_starts_over() -> None:
+    env = blind()
+    starts = []
+    for _ in range(2):
+        env.set_seed(11)
+        starts.append(env.reset()["privileged", "position"])
+    assert torch.equal(*starts)
+    assert not torch.equal(starts[0], env.reset()["privileged", "position"])
+
+
+def test_time_limit_truncates_and_nothing_else() -> None:
+    env = blind(evaluation=True, episode_steps=4)
+    data = env.rollout(4, hover, break_when_any_done=False)
+    for key, expected in (("truncated", [0, 0, 0, 1]), ("done", [0, 0, 0, 1]), ("terminated", [0, 0, 0, 0])):
+        assert data["next", key][..., 0].tolist() == [[bool(value) for value in expected]] * 3
+    assert (data["next", "race", "crash"] == CrashCause.NONE).all()
+
+
+def test_crash_terminates_and_is_not_truncated() -> None:
+    env = blind(evaluation=True)
+    data = env.rollout(100, lambda *observation: torch.tensor([-1.0, 0, 0, 0]).repeat(3, 1))
+    last = data[:, -1]["next"]
+    assert last["terminated"].all()
+    assert last["done"].all()
+    assert not data["next", "truncated"].any()
+    assert not data["next", "terminated"][:, :-1].any()
+    assert (last["race", "crash"] == CrashCause.GROUND).all()
+    assert (last["reward"] == -4.0).all()
+
+
+def test_crash_in_the_last_step_is_only_a_crash() -> None:
+    env = blind(1, evaluation=True, episode_steps=1)
+    env.reset()
+    after = env.step(TensorDict({"action": torch.full((1, 4), torch.nan)}, [1]))["next"]
+    assert (after["terminated"].item(), after["truncated"].item()) == (True, False)
+
+
+def test_evaluation_finishes_after_the_laps() -> None:
+    env = blind(1, STRAIGHT, evaluation=True)
+
+    def forward(data: TensorDict) -> TensorDict:
+        velocity, attitude = data["privileged", "linear_velocity"][0], data["privileged", "attitude"][0]
+        pitch = 2.0 * attitude[2]  # small angles, nose down is positive
+        height = data["privileged", "position"][0, 2]
+        rate = 6.0 * (0.3 * (2.0 - velocity[0]).clamp(-1, 1) - pitch)
+        thrust = 9.81 + 4.0 * (1.35 - height) - 3.0 * velocity[2]
+        return data.set("action", torch.stack((thrust / 13.33 - 1, rate * 0, rate / 10, rate * 0)).unsqueeze(0))
+
+    data = env.rollout(400, forward)
+    last = data[0, -1]["next"]
+    assert last["race", "finished"].item()
+    assert last["race", "gates_passed"].item() == 2
+    assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
+    assert last["race", "lap_time"].item() == pytest.approx(0.02 * data.shape[1])
+    assert last["reward"].item() == 10.0
+    passed = data["next", "race", "gates_passed"][0, :, 0].diff().nonzero()
+    assert (data["next", "race", "gate_offset"][0, passed + 1] > 0).all()
+    assert data["next", "privileged", "target_gate"][0, -1].item() == 0
+
+
+def test_reward_is_split_and_follows_todays_weight() -> None:
+    env = blind(weights=RewardWeights(body_rate=0.25))
+    assert env.body_rate_weight == 0.25
+    for weight in (0.25, 0.01):
+        env.body_rate_weight = weight
+        after = env.rollout(4, wild(0))["next"]
+        assert (after["body_rate_norm"] > 0).any()
+        torch.testing.assert_close(after["reward"], after["reward_base"] - weight * after["body_rate_norm"])
+
+
+def test_first_observation_of_an_episode() -> None:
+    env = DroneRacingEnv("circle", 2, seed=0)
+    data = env.reset()
+    assert not data["done"].any()
+    assert not data["reward_base"].any()
+    assert all(not value.any() for value in data["race"].values())
+    assert data["pixels"].float().std() > 10
+    env.close()
+
+
+def test_partial_reset_leaves_the_others_untouched() -> None:
+    env = DroneRacingEnv("circle", 3, seed=0)
+    before = env.rollout(3, wild(0), break_when_any_done=False)[:, -1]["next"]
+    mask = torch.tensor([[False], [True], [False]])
+    rows = mask[:, 0]
+    after = env.reset(before.clone().set("_reset", mask))
+    for name in ("position", "attitude", "linear_velocity", "body_rates", "target_gate"):
+        same = (after["privileged", name] == before["privileged", name]).all(-1)
+        assert same[~rows].all(), name
+    assert (after["privileged", "position"][rows] != before["privileged", "position"][rows]).any()
+    assert not after["privileged", "body_rates"][rows].any()
+
+    flown = env.step(hover(after.clone()))["next"]
+    undisturbed = DroneRacingEnv("circle", 3, seed=0)
+    data = undisturbed.rollout(3, wild(0), break_when_any_done=False)[:, -1]["next"]
+    expected = undisturbed.step(hover(data.select("privileged")))["next"]
+    for key in ("reward", "pixels", ("privileged", "position"), ("race", "gates_passed")):
+        assert torch.equal(flown[key][~rows], expected[key][~rows]), key
+    env.close()
+    undisturbed.close()
+
+
+def test_rollout_through_resets_keeps_the_pixels_of_those_who_fly_on() -> None:
+    """After a partial reset only the rows that were reset are drawn; the others' must not be lost."""
+    env = DroneRacingEnv("circle", 2, seed=0, evaluation=True)
+
+    def act(data: TensorDict) -> TensorDict:
+        action = torch.tensor(HOVER).repeat(2, 1)
+        action[0] = torch.nan  # the first drone crashes in every step
+        return data.set("action", action)
+
+    data = env.rollout(4, act, break_when_any_done=False, auto_reset=True)
+    assert data["next", "terminated"][0].all()
+    assert not data["next", "done"][1].any()
+    for step in range(3):
+        for key in ("pixels", ("privileged", "position")):
+            assert torch.equal(data["next", *([key] if isinstance(key, str) else key)][1, step], data[key][1, step + 1])
+    assert torch.equal(data["pixels"][0, 1], data["pixels"][0, 0])  # the same start pose again
+    env.close()
+
+
+def test_invalid_action_ends_only_its_own_environment() -> None:
+    runs = []
+    for poison in (False, True):
+        env = DroneRacingEnv("circle", 3, seed=0)
+        data, rows = env.reset(), []
+        for step in range(4):
+            data = wild(step)(data)
+            if poison and step == 1:
+                data["action"][1, 2] = torch.nan
+            data = env.step(data)["next"]
+            rows.append(data.clone())
+        runs.append(torch.stack(rows, dim=1))
+        env.close()
+    clean, poisoned = runs
+    others = torch.tensor([True, False, True])
+    for key in clean.keys(include_nested=True, leaves_only=True):
+        assert torch.equal(clean[key][others], poisoned[key][others]), key
+    hit = poisoned[1, 1]
+    assert (hit["terminated"].item(), hit["reward"].item()) == (True, -4.0)
+    assert hit["race", "crash"].item() == CrashCause.INVALID_ACTION
+    assert hit["privileged", "position"].isfinite().all()
+
+
+def test_wrong_action_shape_is_explained() -> None:
+    env = blind()
+    data = env.reset()
+    with pytest.raises(ValueError, match=r"Action of shape \(3, 3\): 3 environment\(s\) take one of shape \(3, 4\)"):
+        env.step(data.set("action", torch.zeros(3, 3)))
+
+
+def test_actions_beyond_the_bounds_are_clipped() -> None:
+    ends = []
+    for scale in (1.0, 7.0):
+        env = blind(evaluation=True)
+        data = env.reset().set("action", scale * torch.tensor([[1.0, -1.0, 1.0, 1.0]]).repeat(3, 1))
+        ends.append(env.step(data)["next", "privileged", "attitude"])
+    assert torch.equal(*ends)
+
+
+@pytest.mark.parametrize("track", ["circle"])
+def test_collector_resets_by_itself(track: str) -> None:
+    env = DroneRacingEnv(track, 4, seed=0, episode_steps=5)
+    collector = Collector(env, hover, frames_per_batch=48, total_frames=96)
+    batches = list(collector)
+    collector.shutdown()
+    assert [batch.shape for batch in batches] == [(4, 12)] * 2
+    data = torch.cat(batches, dim=1)
+    done = data["next", "done"][..., 0]
+    assert done.sum() >= 4 * 4
+    # after an end the next record is a first observation; else it is the one that was arrived at
+    position, arrived = data["privileged", "position"], data["next", "privileged", "position"]
+    continued = (position[:, 1:] == arrived[:, :-1]).all(-1)
+    assert torch.equal(continued, ~done[:, :-1])
+    pixels = (data["pixels"][:, 1:] == data["next", "pixels"][:, :-1]).flatten(2).all(-1)
+    assert pixels[~done[:, :-1]].all()
+    assert not data["reward_base"][:, 1:][done[:, :-1]].any()
+
+
+def test_drones_together_fly_as_each_alone() -> None:
+    env = blind(3, evaluation=True)
+    actions = torch.rand(10, 3, 4, generator=torch.Generator().manual_seed(0)) - 0.5
+    together = env.reset()
+    for action in actions:
+        together = env.step(together.set("action", action))["next"]
+    for index in range(3):
+        one = blind(1, evaluation=True)
+        alone = one.reset()
+        for action in actions:
+            alone = one.step(alone.set("action", action[index : index + 1]))["next"]
+        for key in ("reward", ("privileged", "position"), ("privileged", "body_rates")):
+            torch.testing.assert_close(alone[key][0], together[key][index], rtol=0, atol=1e-6)
+
+
+def test_closing_twice_is_safe() -> None:
+    env = DroneRacingEnv("circle", 2)
+    env.close()
+    env.close(raise_if_closed=False)
+    assert env.is_closed
+
+
+def test_bad_arguments_are_explained() -> None:
+    with pytest.raises(ValueError, match="num_envs=0: at least one world"):
+        DroneRacingEnv(num_envs=0)
+    with pytest.raises(ValueError, match="Unknown physics preset 'hard': the presets are easy, faithful"):
+        blind(preset="hard")
+    with pytest.raises(TrackError, match="kidny"):
+        blind(track="kidny")
+    with pytest.raises(ValueError, match="Unknown renderer 'vulkan'"):
+        DroneRacingEnv(num_envs=1, renderer="vulkan")
