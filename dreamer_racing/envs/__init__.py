@@ -1,1 +1,23 @@
-"""The race: tracks, quadrotor physics, batched simulation, and the environments built on them."""
+"""The race: tracks, quadrotor physics, batched simulation, and the environments built on them.
+
+Names are imported on first use: TorchRL and dm_control take seconds to import, and few programs need both.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dreamer_racing.envs.task import load as load
+    from dreamer_racing.envs.torchrl_env import DroneRacingEnv as DroneRacingEnv
+    from dreamer_racing.envs.tracks import load_track as load_track
+    from dreamer_racing.envs.worlds import RaceWorlds as RaceWorlds
+
+_HOMES = {"DroneRacingEnv": "torchrl_env", "RaceWorlds": "worlds", "load": "task", "load_track": "tracks"}
+
+__all__ = ["DroneRacingEnv", "RaceWorlds", "load", "load_track"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
