@@ -37,6 +37,7 @@ class RandomState(GlobalRNGState):
     """State of the Python, NumPy and torch generators; that of devices absent here is skipped with a warning."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
         state = dict(state_dict)
         saved, present = len(state.get("torch_cuda", ())), torch.cuda.device_count()
         if saved and saved != present:

@@ -162,6 +162,7 @@ class RunningMean:
         self._floats: dict[str, tuple[float, int]] = {}
 
     def push(self, metrics: Mapping[str, Tensor | float]) -> None:
+        """Add values to the averages; tensors stay on their device."""
         by_device: dict[torch.device, dict[str, Tensor]] = defaultdict(dict)
         for name, value in metrics.items():
             if isinstance(value, Tensor):
@@ -172,8 +173,8 @@ class RunningMean:
         for device, values in by_device.items():
             key = (device, tuple(values))
             stacked = torch.stack(list(values.values()))
-            total, count = self._tensors.get(key, (torch.zeros_like(stacked), 0))
-            self._tensors[key] = (total + stacked, count + 1)
+            sums, pushes = self._tensors.get(key, (torch.zeros_like(stacked), 0))
+            self._tensors[key] = (sums + stacked, pushes + 1)
 
     def pop(self) -> dict[str, float]:
         """Returns the means by name, in order of first appearance, and starts anew. Copies once from each device."""
@@ -260,9 +261,11 @@ class EpisodeTracker:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
         return {"return": self._return.clone(), "length": self._length.clone()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
         self._return = state_dict["return"].clone()
         self._length = state_dict["length"].clone()
 

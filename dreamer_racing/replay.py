@@ -159,7 +159,10 @@ class StreamWriter(Writer):
         filled: int64 ``(N,)``, records each stream holds.
     """
 
+    cursor: Tensor
+    filled: Tensor
     _storage: _RecordAccess
+    _write_count: int
 
     def __init__(self, num_streams: int, stream_length: int) -> None:
         super().__init__()
@@ -168,6 +171,7 @@ class StreamWriter(Writer):
         self._empty()
 
     def add(self, data: Any) -> int:
+        """Refuse single records."""
         raise NotImplementedError("Streams grow by whole rollouts: use extend().")
 
     def extend(self, data: TensorDictBase) -> Tensor:
@@ -211,6 +215,7 @@ class StreamWriter(Writer):
             self._write_count = 0
 
     def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
         return {
             "num_streams": self.num_streams,
             "stream_length": self.stream_length,
@@ -237,9 +242,11 @@ class StreamWriter(Writer):
         self._storage.set_length(int(self.filled.sum()))
 
     def dumps(self, path: str | Path) -> None:
+        """Refuse: the replay saves its writer with `state_dict`."""
         Path(path).write_text(json.dumps(self.state_dict()), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
+        """Refuse: the replay restores its writer with `load_state_dict`."""
         self.load_state_dict(json.loads(Path(path).read_text(encoding="utf-8")))
 
 

@@ -1,7 +1,7 @@
 """Curriculum of the body-rate penalty: the schedule of b₂ and today's b₂ on the rewards of old steps.
 
-Reference: the paper's Eq. 1 and its appendix (b₁ = 1, b₂ → 0.01). When b₂ grows is this project's choice, see
-`BodyRateCurriculum`.
+Reference: paper, Eq. 1 (b₁ = 1, b₂ → 0.01) and Section IV-A: b₂ starts at 0 and grows once the total reward exceeds
+50. How fast it grows is this project's choice, see `BodyRateCurriculum`.
 """
 
 from __future__ import annotations
@@ -84,9 +84,11 @@ class BodyRateCurriculum:
         return window_is_full and self._since_growth >= self.cooldown and self.body_rate_weight < self.maximum
 
     def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
         return {"returns": list(self._returns), "growths": self._growths, "since_growth": self._since_growth}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
         self._returns.clear()
         self._returns.extend(state_dict["returns"])
         self._growths = state_dict["growths"]
@@ -111,5 +113,6 @@ class RelabelReward(Transform):
         self.curriculum = curriculum
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Recompute the rewards of a sample, in place."""
         penalty = self.curriculum.body_rate_weight * tensordict["body_rate_norm"]
         return tensordict.set("reward", tensordict["reward_base"] - penalty)

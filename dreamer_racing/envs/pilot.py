@@ -19,7 +19,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
 from dreamer_racing.envs.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.tracks import Track, load_track
