@@ -242,11 +242,11 @@ class StreamWriter(Writer):
         self._storage.set_length(int(self.filled.sum()))
 
     def dumps(self, path: str | Path) -> None:
-        """Refuse: the replay saves its writer with `state_dict`."""
+        """Save the bookkeeping as JSON."""
         Path(path).write_text(json.dumps(self.state_dict()), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
-        """Refuse: the replay restores its writer with `load_state_dict`."""
+        """Restore the bookkeeping from JSON."""
         self.load_state_dict(json.loads(Path(path).read_text(encoding="utf-8")))
 
 

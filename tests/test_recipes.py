@@ -116,7 +116,8 @@ def test_checkpoint_of_another_size_is_refused(run_dir: Path) -> None:
 def test_a_signal_saves_and_exits_cleanly(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, str(ROOT / "recipes" / "dreamer_v3.py"), *SMALL, "total_env_steps=1000000",
                "evaluation.every=0", "checkpoint.every=1000000", "run_dir=run"]  # fmt: skip
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, **pipes) as process:
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline:
             if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):

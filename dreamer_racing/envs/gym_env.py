@@ -235,7 +235,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
             self._first(self.race.info(outcome)),
         )
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The on-board view, uint8 (256, 256, 3); None without a render mode."""
         return self.race.frames()[0] if self.render_mode == "rgb_array" else None
 
@@ -346,7 +346,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         info = self._masked(self.race.info(outcome, begun))
         return self.race.observe(), np.where(begun, 0.0, reward), terminated, truncated, info
 
-    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[np.ndarray, ...] | None:
         """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
         return tuple(self.race.frames()) if self.render_mode == "rgb_array" else None
 

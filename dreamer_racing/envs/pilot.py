@@ -11,6 +11,7 @@ world z up, attitude wxyz, body frame FLU. All numbers are this project's choice
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -26,6 +27,7 @@ from dreamer_racing.envs.worlds import RaceWorlds
 
 DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous
 LINE_DT = 0.005  # s between samples of the finished line
+ADAM_STEPS, LBFGS_STEPS = 200, 800
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,6 @@ class LineLimits:
         gate_cosine: least cosine of the angle between the flight and a gate's normal.
         clearance: distance from the bounding box, m.
         height_min: least height, m.
-        iterations: steps of gradient descent.
     """
 
     speed: float = 0.9
@@ -52,7 +53,6 @@ class LineLimits:
     gate_cosine: float = 0.75
     clearance: float = 0.5
     height_min: float = 0.6
-    iterations: int = 1500
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class _LineNodes:
 
     SPACING = 4.0  # m between nodes, about
     START_SPEED = 5.0  # m/s
-    SCALES = (1.0, 3.0, 10.0, 60.0)  # of a node's position, velocity, acceleration and jerk in the search
+    SCALES = (0.5, 2.0, 10.0, 100.0)  # of a node's position, velocity, acceleration and jerk in the search
 
     def __init__(self, track: Track, gate_offset: float) -> None:
         dtype = torch.float64
@@ -130,7 +130,8 @@ class _LineNodes:
         for here in range(len(self.gates)):
             there = (here + 1) % len(self.gates)
             gap = self.gates[there] - self.gates[here]
-            length = 1.1 * float(gap.norm()) + 0.5
+            turn = 1.0 - float(self.normals[here] @ self.normals[there])  # 2 for a reversal
+            length = 1.1 * float(gap.norm()) + 0.5 + 2.0 * turn
             count = max(2, round(float(gap.norm()) / self.SPACING))
             first.append(sum(counts))
             duration.append(length / self.START_SPEED)
@@ -203,8 +204,9 @@ def _axis_rate(force: Tensor, force_rate: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _excess(value: Tensor, limit: float) -> Tensor:
-    """Squared relative excess of values over a limit."""
-    return (value / limit - 1.0).clamp(min=0.0).square()
+    """Relative excess of values over a limit: squared where it is small, linear where it is large."""
+    excess = (value / limit - 1.0).clamp(min=0.0)
+    return torch.nn.functional.huber_loss(excess, torch.zeros_like(excess), reduction="none", delta=0.5) * 2.0
 
 
 def _lap_cost(
@@ -246,16 +248,34 @@ def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: Line
     low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
     high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
     low[2] = low[2].clamp(min=limits.height_min)
-    optimiser = torch.optim.Adam([nodes.change, nodes.log_duration], betas=(0.9, 0.99))
-    for iteration in range(limits.iterations):
-        left = 1.0 - iteration / limits.iterations
-        optimiser.param_groups[0]["lr"] = 0.06 * min(1.0, left / 0.6)
-        optimiser.zero_grad()
-        with torch.enable_grad():
-            _lap_cost(nodes, basis, dynamics, limits, low, high).backward()
-        optimiser.step()
+    _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
     with torch.no_grad():
         return _finish_line(nodes, dynamics)
+
+
+def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
+    """Minimise the cost: Adam brings the line near the limits, L-BFGS makes it fast."""
+    variables = [nodes.change, nodes.log_duration]
+
+    def evaluate() -> Tensor:
+        with torch.enable_grad():
+            value = cost()
+            for variable, gradient in zip(variables, torch.autograd.grad(value, variables), strict=True):
+                variable.grad = gradient
+        return value
+
+    adam = torch.optim.Adam(variables, lr=0.06)
+    for _ in range(ADAM_STEPS):
+        evaluate()
+        adam.step()
+    torch.optim.LBFGS(
+        variables,
+        max_iter=LBFGS_STEPS,
+        history_size=60,
+        tolerance_grad=1e-9,
+        tolerance_change=1e-7,
+        line_search_fn="strong_wolfe",
+    ).step(evaluate)
 
 
 def _finish_line(nodes: _LineNodes, dynamics: _Dynamics) -> RacingLine:

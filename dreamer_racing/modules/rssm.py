@@ -328,7 +328,7 @@ class RSSM(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Step belief ``(N, D)`` and state ``(N, S)``, and return them with the posterior's logits ``(N, L, K)``."""
         belief = torch.where(reset, start[0], belief)
-        state = state
+        state = torch.where(reset, start[1], state)
         belief = self.cell(belief, state, projected_action)
         logits = (
             self.posterior_output(self.posterior_hidden(belief, embedded))

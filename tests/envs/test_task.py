@@ -344,14 +344,14 @@ def test_headless_backend_choice(
             raise OSError(name)
 
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # remembers what was there, or that nothing was
+        monkeypatch.delenv(name)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(task_module.sys, "platform", "linux")
     monkeypatch.setattr(task_module.ctypes, "CDLL", open_library)
     task_module._choose_gl_backend()
     assert os.environ.get("MUJOCO_GL") == chosen
-    monkeypatch.delenv("MUJOCO_GL", raising=False)  # so that the test's own end restores what was there
 
 
 @pytest.mark.parametrize("from_pixels", [False, True])

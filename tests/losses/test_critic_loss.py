@@ -135,3 +135,14 @@ def test_critic_learns_the_mean_of_a_random_return():
         loss(inputs)["loss_critic"].backward()
         optimizer.step()
     assert critic.value(features).mean().item() == pytest.approx(5.0, abs=0.7)
+
+
+def test_regularised_towards_the_slow_copy_not_the_critic_itself():
+    critic, inputs = Critic(4, layers=1, units=8), make_input()
+    inputs["imagination", "lambda_return"] *= 0
+    with torch.no_grad():
+        critic.slow_head.mlp.output.bias[200] = 60.0  # the slow copy is sure of bin 200
+        critic.head.mlp.output.bias[127] = 5.0  # and the critic of bin 127, which is zero
+    log_probabilities = critic.head.mlp.output.bias.detach().log_softmax(-1)
+    expected = -(log_probabilities[127] + log_probabilities[200]).item()
+    assert CriticLoss(critic)(inputs)["loss_critic"].item() == pytest.approx(expected, rel=1e-4)
