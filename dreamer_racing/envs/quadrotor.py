@@ -9,7 +9,7 @@ of the same laboratory; [choice] this project's, because nobody published it.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -113,6 +113,9 @@ def without_randomisation(parameters: QuadrotorParameters) -> QuadrotorParameter
     return replace(parameters, randomisation=None)
 
 
+RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # what is randomised as a factor of the nominal value
+
+
 @dataclass
 class _Drones:
     """Per-drone parameters relative to nominal (N, ·); only kept when they are randomised."""
@@ -123,8 +126,6 @@ class _Drones:
     thrust: Tensor  # (N, 1)
     torque: Tensor  # (N, 1)
     delay_steps: Tensor  # (N,) int64, physics steps
-
-    tensors: tuple[str, ...] = field(default=("mass", "inertia", "drag", "thrust", "torque"), repr=False)
 
 
 class Quadrotor:
@@ -204,7 +205,7 @@ class Quadrotor:
     def _randomise(self, rows: Tensor, widths: Randomisation) -> None:
         drones = self._drones
         assert drones is not None
-        for name in drones.tensors:
+        for name in RELATIVE:
             current = getattr(drones, name)
             noise = 2.0 * self._uniform(*current.shape) - 1.0
             setattr(drones, name, torch.where(rows, 1.0 + getattr(widths, name) * noise, current))

@@ -29,7 +29,7 @@ import torch
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
@@ -90,7 +90,7 @@ def load(
         preset: physics preset (`easy`, `faithful`) or parameters.
         random: seed or state of start poses and physics randomisation; None for a random seed.
         time_limit: duration after which an episode is truncated, s.
-        evaluation: start at the start pose, at rest, with nominal parameters, and finish after the track's laps.
+        evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
         from_pixels: whether there is an observation `pixels`; needs OpenGL (EGL, OSMesa or a display).
         camera: the nose camera.
         weights: of the reward, paper Eq. 1.
@@ -107,8 +107,6 @@ def load(
         1.0
     """
     track, parameters = load_track(track), load_preset(preset)
-    if evaluation:
-        parameters = without_randomisation(parameters)
     episode_steps = round(time_limit / parameters.control_dt)
     if episode_steps < 1:
         raise ValueError(

@@ -221,14 +221,13 @@ def test_seeds_reproduce_and_differ() -> None:
     assert not np.allclose(first[0], first[1])
 
 
-def test_episodes_of_the_faithful_preset_have_drones_of_their_own_but_not_in_evaluation() -> None:
+def test_episodes_of_the_faithful_preset_have_drones_of_their_own() -> None:
     env = load("circle", "faithful", random=0)
     masses = set()
     for _ in range(3):
         env.reset()
         masses.add(env.physics.quadrotor._drones.mass.item())
     assert len(masses) == 3
-    assert load("circle", "faithful", evaluation=True).physics.quadrotor.parameters.randomisation is None
 
 
 def test_rotors_start_at_hover_in_every_episode() -> None:
