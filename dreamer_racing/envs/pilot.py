@@ -165,12 +165,11 @@ class _LineNodes:
         rows = torch.cat((at_gates.unsqueeze(1), nodes[self.gate_nodes, 1:]), dim=1)
         return nodes.index_copy(0, self.gate_nodes, rows)
 
-    def sample(self, basis: Tensor, nodes: Tensor, durations: Tensor) -> Tensor:
-        """Position, velocity, acceleration, jerk at the times of a basis (4, S, 8) in each segment: (4, M, S, 3)."""
-        powers = durations.unsqueeze(-1) ** torch.arange(4)  # (M, 4)
-        scaled = nodes * powers.unsqueeze(-1)
-        ends = torch.cat((scaled, scaled.roll(-1, 0)), dim=1)  # (M, 8, 3)
-        return torch.einsum("ksc,mcd->kmsd", basis, ends) / powers.T[:, :, None, None]
+    def segments(self) -> tuple[Tensor, Tensor]:
+        """Durations of the segments (M,), and the nodes at both of their ends per segment time (M, 8, 3)."""
+        durations, nodes = self.durations(), self.nodes()
+        powers = (durations.unsqueeze(-1) ** torch.arange(4)).unsqueeze(-1)  # (M, 4, 1)
+        return durations, torch.cat((powers * nodes, powers * nodes.roll(-1, 0)), dim=1)
 
 
 class _Dynamics:
@@ -213,8 +212,10 @@ def _lap_cost(
     nodes: _LineNodes, basis: Tensor, dynamics: _Dynamics, limits: LineLimits, low: Tensor, high: Tensor
 ) -> Tensor:
     """Lap time in s plus penalties where the line breaks the limits or leaves the box (low, high), both (3,)."""
-    values, durations = nodes.nodes(), nodes.durations()
-    position, velocity, acceleration, jerk = nodes.sample(basis, values, durations)  # (M, S, 3)
+    durations, ends = nodes.segments()
+    per_second = 1.0 / durations.view(-1, 1, 1)
+    derivatives = torch.einsum("ksc,mcd->kmsd", basis, ends)  # (4, M, S, 3)
+    position, velocity, acceleration, jerk = (values * per_second**order for order, values in enumerate(derivatives))
     force = dynamics.force(velocity, acceleration)
     axis, body_rate = _axis_rate(force, jerk + dynamics.drag_sideways * acceleration)
     thrust = dynamics.collective_thrust(force, axis, velocity)  # (M, S)
@@ -225,7 +226,7 @@ def _lap_cost(
     turn = body_rate.flatten(0, 1)
     turn = (turn.roll(-1, 0) - turn).view_as(body_rate).norm(dim=-1) * basis.shape[1] / durations.unsqueeze(-1)
     penalty = penalty + 10.0 * _excess(turn, limits.angular_acceleration_max)
-    at_gates = torch.nn.functional.normalize(values[nodes.gate_nodes, 1], dim=-1)
+    at_gates = torch.nn.functional.normalize(velocity[nodes.gate_nodes, 0], dim=-1)
     slant = (limits.gate_cosine - (at_gates * nodes.normals).sum(-1)).clamp(min=0.0)
     return durations.sum() + (durations * penalty.mean(-1)).sum() + 10.0 * slant.square().sum()
 
@@ -280,24 +281,22 @@ def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
 
 def _finish_line(nodes: _LineNodes, dynamics: _Dynamics) -> RacingLine:
     """Sample the line evenly in time."""
-    values, durations = nodes.nodes(), nodes.durations()
-    ends = durations.cumsum(0)
-    starts = ends - durations
-    lap_time = float(ends[-1])
+    durations, ends = nodes.segments()
+    end_times = durations.cumsum(0)
+    start_times = end_times - durations
+    lap_time = float(end_times[-1])
     count = round(lap_time / LINE_DT)
     time = torch.arange(count, dtype=durations.dtype) * (lap_time / count)
-    segment = torch.searchsorted(ends, time, right=True).clamp(max=len(ends) - 1)
-    basis = _hermite_basis((time - starts[segment]) / durations[segment])  # (4, K, 8)
-    powers = durations.unsqueeze(-1) ** torch.arange(4)  # (M, 4)
-    scaled = values * powers.unsqueeze(-1)
-    ends_of = torch.cat((scaled, scaled.roll(-1, 0)), dim=1)[segment]  # (K, 8, 3)
-    derivatives = torch.einsum("okc,kcd->okd", basis, ends_of) / powers[segment].T.unsqueeze(-1)
-    position, velocity, acceleration, jerk = derivatives
+    segment = torch.searchsorted(end_times, time, right=True).clamp(max=len(durations) - 1)
+    basis = _hermite_basis((time - start_times[segment]) / durations[segment])  # (4, K, 8)
+    derivatives = torch.einsum("okc,kcd->okd", basis, ends[segment])
+    per_second = 1.0 / durations[segment].unsqueeze(-1)
+    position, velocity, acceleration, jerk = (values * per_second**order for order, values in enumerate(derivatives))
     force_rate = jerk + dynamics.drag_sideways * acceleration
     _, body_rate = _axis_rate(dynamics.force(velocity, acceleration), force_rate)
     angular_acceleration = (body_rate.roll(-1, 0) - body_rate.roll(1, 0)) / (2 * lap_time / count)
     columns = (position, velocity, acceleration, force_rate, body_rate, angular_acceleration)
-    return RacingLine(torch.cat(columns, dim=-1), starts[nodes.gate_nodes], lap_time)
+    return RacingLine(torch.cat(columns, dim=-1), start_times[nodes.gate_nodes], lap_time)
 
 
 @dataclass(frozen=True)

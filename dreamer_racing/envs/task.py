@@ -289,7 +289,7 @@ class DroneRace(base.Task):
         self.track = track
         self.evaluation = evaluation
         laps = track.laps if evaluation else None
-        self.race = Race(track, 1, weights, episode_steps, laps, parameters.control_dt, dtype=torch.float64)
+        self.race = Race(track, 1, weights, episode_steps, laps, parameters.control_dt)
         self.body_rate_weight = self.race.weights.body_rate
         self.outcome: RaceStep | None = None
         self._generator = generator or torch.Generator()
