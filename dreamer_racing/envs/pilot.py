@@ -49,7 +49,7 @@ class LineLimits:
     gate_offset: float = 0.25
     body_rate_max: float = 6.0
     angular_acceleration_max: float = 40.0
-    thrust_min: float = 3.0
+    thrust_min: float = 4.0
     gate_cosine: float = 0.75
     clearance: float = 0.5
     height_min: float = 0.6
@@ -208,6 +208,12 @@ def _excess(value: Tensor, limit: float) -> Tensor:
     return torch.nn.functional.huber_loss(excess, torch.zeros_like(excess), reduction="none", delta=0.5) * 2.0
 
 
+def _steps(values: Tensor) -> Tensor:
+    """Differences from each sample of a closed line (M, S, 3) to the next."""
+    flat = values.flatten(0, 1)
+    return (flat.roll(-1, 0) - flat).view_as(values)
+
+
 def _lap_cost(
     nodes: _LineNodes, basis: Tensor, dynamics: _Dynamics, limits: LineLimits, low: Tensor, high: Tensor
 ) -> Tensor:
@@ -221,11 +227,12 @@ def _lap_cost(
     thrust = dynamics.collective_thrust(force, axis, velocity)  # (M, S)
     outside = (low - position).clamp(min=0.0).square() + (position - high).clamp(min=0.0).square()
     penalty = 300.0 * (_excess(thrust, limits.speed * dynamics.thrust_max) + outside.sum(-1))
-    penalty = penalty + 30.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
-    penalty = penalty + 50.0 * _excess(body_rate.norm(dim=-1), limits.body_rate_max)
-    turn = body_rate.flatten(0, 1)
-    turn = (turn.roll(-1, 0) - turn).view_as(body_rate).norm(dim=-1) * basis.shape[1] / durations.unsqueeze(-1)
-    penalty = penalty + 10.0 * _excess(turn, limits.angular_acceleration_max)
+    penalty = penalty + 300.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
+    # between samples, so that the thrust axis cannot flip unseen where the force passes through zero
+    per_second = basis.shape[1] / durations.unsqueeze(-1)
+    turn, bend = _steps(axis).norm(dim=-1) * per_second, _steps(body_rate).norm(dim=-1) * per_second
+    penalty = penalty + 50.0 * _excess(turn, limits.body_rate_max)
+    penalty = penalty + 10.0 * _excess(bend, limits.angular_acceleration_max)
     at_gates = torch.nn.functional.normalize(velocity[nodes.gate_nodes, 0], dim=-1)
     slant = (limits.gate_cosine - (at_gates * nodes.normals).sum(-1)).clamp(min=0.0)
     return durations.sum() + (durations * penalty.mean(-1)).sum() + 10.0 * slant.square().sum()
@@ -325,7 +332,7 @@ class PilotGains:
     correction_max: float = 10.0
     progress_max: float = 8.0
     look_ahead: float = 0.5
-    adaptation: float = 0.0
+    adaptation: float = 1.0
 
 
 class ScriptedPilot:
@@ -443,7 +450,9 @@ class ScriptedPilot:
         blend = min(1.0, dt / lag)
         self._last_thrust = torch.lerp(self._last_thrust, self._last_command[:, :1], blend)
         ratio = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3)
-        scale = torch.lerp(self._thrust_scale, ratio * self._thrust_scale, self.gains.adaptation * dt).clamp(0.8, 1.2)
+        known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * self._dynamics.thrust_max)
+        share = self.gains.adaptation * dt * known
+        scale = (self._thrust_scale * (1.0 + share * (ratio - 1.0))).clamp(0.8, 1.2)
         self._thrust_scale = torch.where(new, 1.0, scale)
         self._last_position, self._last_velocity = position.clone(), velocity.clone()
 
@@ -595,13 +604,21 @@ def fly_laps(
     random_starts: bool = False,
     pilot: ScriptedPilot | None = None,
     seed: int = 0,
+    episode_steps: int = 1500,
 ) -> Flight:
     """Fly N episodes from the start pose until all are over."""
+    parameters = load_preset(preset)
     worlds = RaceWorlds(
-        track, num_envs, preset, evaluation=not (randomise or random_starts), from_pixels=False, seed=seed
+        track,
+        num_envs,
+        parameters if randomise else without_randomisation(parameters),
+        evaluation=not random_starts,
+        from_pixels=False,
+        episode_steps=episode_steps,
+        seed=seed,
     )
-    worlds.evaluation, worlds.race.laps = not random_starts, laps
-    pilot = pilot or ScriptedPilot(worlds.track, worlds.parameters, dtype=worlds.dtype)
+    worlds.race.laps = laps
+    pilot = pilot or ScriptedPilot(worlds.track, parameters, dtype=worlds.dtype)
     worlds.reset()
     n = num_envs
     flying = torch.ones(n, dtype=torch.bool)

@@ -246,9 +246,8 @@ def test_reset_forgets_pending_autoresets() -> None:
     envs.reset()
     envs.step(np.full((3, 4), np.nan))
     envs.reset()
-    for _ in range(10):  # far enough for float32 to see the progress
-        _, reward, *_ = envs.step(np.tile(np.array([0.5, 0, 0, 0]), (3, 1)))
-    assert (reward != 0.0).all()
+    observation, *_ = envs.step(np.tile(np.array([0.5, 0, 0, 0]), (3, 1)))
+    assert (observation["linear_velocity"][:, 2] > 0.0).all()
 
 
 def test_gymnasiums_own_vectorisation_works_too() -> None:
