@@ -202,7 +202,9 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         batch_size=model.batch_size,
         batch_length=model.batch_length,
         imagination_horizon=model.imagination_horizon,
+        imagination_starts=model.imagination_starts,
         lr=model.learning_rate,
+        warmup_updates=model.warmup_updates,
         **{f"{part}_loss": name for part, name in names.items()},
         **loss,
     )
