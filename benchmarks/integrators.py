@@ -36,33 +36,30 @@ TRACKS = ("circle", "kidney", "figure8", "split_s")
 SECONDS, WARM_UP = 2.0, 3.0  # s of racing replayed, and flown before, so that it is at racing speed
 HOLD = 0.002  # s
 EASY = PRESETS["easy"]
+CORRECTIONS = {"plain": "", "+position": "position", "+pose": "pose", "midpoint": "midpoint"}
 
 
 class MidpointQuadrotor(Quadrotor):
     """A `Quadrotor` whose wrench is that of the middle of the step."""
 
-    def __init__(self, parameters: QuadrotorParameters, num_drones: int, turn_force: bool) -> None:
-        super().__init__(parameters, num_drones)
-        self._half_decay = self._motor_decay**0.5
-        self._turn_force = turn_force
-
     def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
         """Advance controller and motors by one physics step and return the wrench of its middle."""
-        setpoint = self._setpoint(physics_step)
-        gyroscopic = torch.linalg.cross(body_rates, self._inertia * body_rates)
-        torque_now = self.rotor_speed.square() @ self._effectiveness[:, 3:]
         half = 0.5 * self.parameters.physics_dt
-        rates = body_rates + half * (torque_now - gyroscopic) / self._inertia
+        setpoint = self._setpoint(physics_step)
+        torque_now = self.rotor_speed.square() @ self._effectiveness[:, 3:]
+        rates = middle_rates(body_rates, torque_now, self._inertia, half)
+        gyroscopic = torch.linalg.cross(rates, self._inertia * rates)
         torque = torch.addcmul(gyroscopic, self._rate_gain, setpoint[:, 1:] - rates)
         target = self.mix(setpoint[:, :1], torque).sqrt()
-        middle = torch.lerp(target, self.rotor_speed, self._half_decay)
+        middle = torch.lerp(target, self.rotor_speed, self._motor_decay**0.5)
         self.rotor_speed = torch.lerp(target, self.rotor_speed, self._motor_decay)
-        wrench = middle.square() @ self._effectiveness
-        if self._turn_force:  # an explicit Euler step would push along the attitude at its beginning
-            thrust = half * wrench[:, 2]
-            wrench[:, 0] += thrust * rates[:, 1]
-            wrench[:, 1] -= thrust * rates[:, 0]
-        return wrench
+        return middle.square() @ self._effectiveness
+
+
+def middle_rates(body_rates: Tensor, torque: Tensor, inertia: Tensor, half: float) -> Tensor:
+    """Body rates (N, 3) in rad/s half a step of `half` s later, under a torque (N, 3) in N m."""
+    gyroscopic = torch.linalg.cross(body_rates, inertia * body_rates)
+    return body_rates + half * (torque - gyroscopic) / inertia
 
 
 @dataclass
@@ -70,26 +67,39 @@ class Body:
     """N rigid bodies in MuJoCo."""
 
     parameters: QuadrotorParameters
-    correction: str  # "", "position" or "pose"
+    correction: str  # "", "position", "pose" or "midpoint"
     num: int
 
     def __post_init__(self) -> None:
         self._batch = Batch(build_scene(load_track("circle"), self.parameters).compile(), self.num, min(2, self.num))
         self.qpos = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel = torch.from_numpy(self._batch.bind("qvel"))
+        self._inertia = torch.tensor(self.parameters.inertia, dtype=torch.float64)
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
 
     def step(self, wrench: Tensor) -> None:
         """Move by one physics step."""
-        self._ctrl.copy_(wrench)
+        self._ctrl.copy_(self._midpoint(wrench) if self.correction == "midpoint" else wrench)
         before = self.qvel.clone() if self.correction else None
         self._batch.step()
         if before is None:
             return
         overshoot = (-0.5 * self.parameters.physics_dt) * (self.qvel - before)
         self.qpos[:, :3] += overshoot[:, :3]
-        if self.correction == "pose":
+        if self.correction != "position":
             self.qpos[:, 3:] = turn(self.qpos[:, 3:], overshoot[:, 3:])
+
+    def _midpoint(self, wrench: Tensor) -> Tensor:
+        """The wrench that does in an Euler step, which takes attitude and rates at its beginning, what this one would
+        do with those in the middle.
+        """
+        half = 0.5 * self.parameters.physics_dt
+        force, torque = wrench[:, :3], wrench[:, 3:]
+        rates = middle_rates(self.qvel[:, 3:], torque, self._inertia, half)
+        force = force + half * torch.linalg.cross(rates, force)
+        momentum = torch.linalg.cross(self.qvel[:, 3:], self._inertia * self.qvel[:, 3:])
+        torque = torque + momentum - torch.linalg.cross(rates, self._inertia * rates)
+        return torch.cat((force, torque), dim=1)
 
 
 @dataclass(frozen=True)
@@ -131,10 +141,9 @@ def _record_one(track: str) -> Iterator[Any]:
 def make(variant: str, integrator: str, step: float, num: int) -> tuple[Body, Quadrotor]:
     """Body and drone of a variant; `step` in s."""
     parameters = replace(EASY, physics_dt=step, integrator=integrator)
-    correction = {"plain": "", "+position": "position"}.get(variant, "pose") if integrator != "RK4" else ""
-    if variant != "midpoint":
-        return Body(parameters, correction, num), Quadrotor(parameters, num)
-    return Body(parameters, correction, num), MidpointQuadrotor(parameters, num, integrator != "RK4")
+    correction = CORRECTIONS[variant] if integrator != "RK4" else ""
+    drone = MidpointQuadrotor if variant == "midpoint" else Quadrotor
+    return Body(parameters, correction, num), drone(parameters, num)
 
 
 def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -> tuple[Tensor, Tensor]:

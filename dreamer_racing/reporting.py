@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
@@ -50,7 +50,7 @@ class EvaluationReport:
         self._learner = learner
         self._policy = learner.policy()
         self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
-        self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer().cpu()))
+        self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -72,7 +72,11 @@ class EvaluationReport:
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
         self._policy.deterministic = deterministic
-        return evaluate(self._env, self._policy, self.episodes, max_recorded_steps=1000)
+        return evaluate(self._env, self._act, self.episodes, max_recorded_steps=1000)
+
+    def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act on the learner's device, with the environment on the CPU."""
+        return self._policy(tensordict.to(self._learner.device)).to("cpu")
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and `videos/<name>.mp4`."""

@@ -39,6 +39,7 @@ def start_logging() -> None:
     """Show what the package chose and why, one line each."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 def choose_device(device: str) -> torch.device:

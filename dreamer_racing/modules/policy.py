@@ -71,8 +71,12 @@ class DreamerPolicy(TensorDictModuleBase):
             tensordict.set(key, value.reshape(*batch, -1))
         return tensordict
 
-    def make_primer(self) -> TensorDictPrimer:
-        """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size."""
+    def make_primer(self, device: torch.device | str = "cpu") -> TensorDictPrimer:
+        """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size.
+
+        Args:
+            device: The environment's.
+        """
         size = {
             "belief": self.rssm.initial_belief.shape[-1],
             "state": self.rssm.latents * self.rssm.classes,
