@@ -176,7 +176,10 @@ class Quadrotor:
         self._effectiveness = tensor([[0, 0, 1, y, -x, s * p.torque_constant] for (x, y), s in rows])  # (4, 6)
         allocation = torch.linalg.inv(self._effectiveness[:, 2:])  # (thrust tx ty tz) (N, 4) @ (4, 4) = rotor thrusts
         self._roll_pitch_to_rotors, self._yaw_to_rotors = allocation[1:3].contiguous(), allocation[3:].contiguous()
+        self._torque_effectiveness = self._effectiveness[:, 3:].contiguous()  # (4, 3)
         self._motor_decay = math.exp(-p.physics_dt / p.motor_time_constant)
+        self._motor_decay_half = math.sqrt(self._motor_decay)
+        self._half_step_per_inertia = 0.5 * p.physics_dt / self._inertia  # (3,)
 
         hover_speed = math.sqrt(p.mass * GRAVITY / 4.0)
         self._hover_speed = hover_speed
@@ -230,7 +233,10 @@ class Quadrotor:
         return self._setpoints[age.clamp(0, len(self._setpoints) - 1), self._everyone]
 
     def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
-        """Advance controller and motors by one physics step and return the wrench on the body.
+        """Advance controller and motors by one physics step and return the wrench on the body in its middle.
+
+        The controller acts on the body rates half a step ahead, and the motors' speed is that of the middle of the
+        step: like this the step's length has an effect of second order only.
 
         Args:
             physics_step: index within the control step, 0 … physics_steps − 1.
@@ -243,16 +249,25 @@ class Quadrotor:
             acceleration of this drone's own, so that all worlds can share one MuJoCo model.
         """
         setpoint = self._setpoint(physics_step)
-        angular_momentum = self._inertia * body_rates
-        gyroscopic = torch.linalg.cross(body_rates, angular_momentum)
-        torque = torch.addcmul(gyroscopic, self._rate_gain, setpoint[:, 1:] - body_rates)
+        gyroscopic = self.gyroscopic_torque(body_rates)
+        present_torque = self.rotor_speed.square() @ self._torque_effectiveness
+        rates = self.rates_half_a_step_later(body_rates, present_torque, gyroscopic)
+        torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
         target_speed = self.mix(setpoint[:, :1], torque).sqrt()
+        middle_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay_half)
         self.rotor_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay)
-        rotor_thrust = self.rotor_speed.square()
-        wrench = rotor_thrust @ self._effectiveness
+        wrench = middle_speed.square() @ self._effectiveness
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
         return wrench
+
+    def gyroscopic_torque(self, body_rates: Tensor) -> Tensor:
+        """ω × Jω of the nominal body (N, 3), N m, at body rates (N, 3), rad/s."""
+        return torch.linalg.cross(body_rates, self._inertia * body_rates)
+
+    def rates_half_a_step_later(self, body_rates: Tensor, torque: Tensor, gyroscopic: Tensor) -> Tensor:
+        """Body rates (N, 3) in rad/s after half a physics step under a torque (N, 3), given ω × Jω (N, 3), N m."""
+        return torch.addcmul(body_rates, torque - gyroscopic, self._half_step_per_inertia)
 
     def mix(self, thrust: Tensor, torque: Tensor) -> Tensor:
         """Distribute total thrust (N, 1) in N and torque (N, 3) in N m to rotor thrusts (N, 4) within their limits.

@@ -21,6 +21,13 @@ def rotate_inverse(attitude: Tensor, vector: Tensor) -> Tensor:
     return vector - w * cross + torch.linalg.cross(xyz, cross)
 
 
+def turn(attitude: Tensor, rotation: Tensor) -> Tensor:
+    """Turn attitudes (..., 4), wxyz, by small body-frame rotation vectors (..., 3) in rad."""
+    half, w, xyz = rotation / 2.0, attitude[..., :1], attitude[..., 1:]
+    change = torch.cat((-(xyz * half).sum(-1, keepdim=True), w * half + torch.linalg.cross(xyz, half)), dim=-1)
+    return torch.nn.functional.normalize(attitude + change, dim=-1)
+
+
 def from_roll_pitch_yaw(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     """Attitude (..., 4), wxyz, of intrinsic z-y'-x'' (yaw, pitch, roll) angles in radians, each (...)."""
     cr, sr = torch.cos(roll / 2), torch.sin(roll / 2)

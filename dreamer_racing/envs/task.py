@@ -29,6 +29,7 @@ import torch
 from dm_env import specs
 from torch import Tensor
 
+from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
@@ -170,6 +171,8 @@ class Physics(mujoco.Physics):
     def __init__(self, data: wrapper.MjData, quadrotor: Quadrotor) -> None:
         super().__init__(data)
         self.quadrotor = quadrotor
+        views = (torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl))
+        self._flight = Flight(quadrotor, *views, lambda: mujoco_bindings.mj_step(self.model.ptr, self.data.ptr))
         self._start_path()
 
     def position(self) -> np.ndarray:
@@ -207,10 +210,7 @@ class Physics(mujoco.Physics):
     def step(self, nstep: int = 1) -> None:
         """Fly this many physics steps of the present command; a state that breaks is for the race to see."""
         for _ in range(nstep):
-            state = (self.attitude(), self.linear_velocity(), self.body_rates())
-            wrench = self.quadrotor.wrench(self._physics_step, *(torch.from_numpy(part).unsqueeze(0) for part in state))
-            self.data.ctrl[:] = wrench[0].numpy()
-            mujoco_bindings.mj_step(self.model.ptr, self.data.ptr)
+            self._flight.step(self._physics_step)
             self._physics_step += 1
             self._path.append(self.position())
         # cameras and sensors of the new state: mj_step leaves those of the old one

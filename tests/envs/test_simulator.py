@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import PRESETS, Quadrotor
 from dreamer_racing.envs.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.scene import DRONE_GROUP, Camera, build_scene
@@ -103,13 +104,13 @@ def test_batch_equals_mujocos_own_step(preset: str) -> None:
     data.qpos[:3], data.qpos[3:], data.qvel[:3] = position[0], attitude[0], velocity[0]
     quadrotor = Quadrotor(parameters, 1, generator=torch.Generator().manual_seed(0))
     quadrotor.reset(everyone(1))
+    views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl)]
+    flight = Flight(quadrotor, *views, lambda: mujoco.mj_step(model, data))
     for action in actions(10, 1):
         path = made.step(action)
         quadrotor.command(action)
         for index in range(parameters.physics_steps):
-            parts = (data.qpos[3:], data.qvel[:3], data.qvel[3:])
-            data.ctrl[:] = quadrotor.wrench(index, *(torch.tensor(part).unsqueeze(0) for part in parts))[0]
-            mujoco.mj_step(model, data)
+            flight.step(index)
         np.testing.assert_allclose(path[-1, 0].numpy(), data.qpos[:3], rtol=0, atol=1e-12)
 
 

@@ -7,6 +7,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
+from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters
 from dreamer_racing.envs.scene import Camera, build_scene
 from dreamer_racing.envs.simulator.base import DroneState
@@ -57,8 +58,9 @@ class MujocoSimulator:
         self._batch = Batch(self.model, num_envs, num_threads)
         self._qpos = torch.from_numpy(self._batch.bind("qpos"))  # (N, 7) view of MuJoCo's state
         self._qvel = torch.from_numpy(self._batch.bind("qvel"))  # (N, 6)
-        self._wrench = torch.from_numpy(self._batch.bind("ctrl"))  # (N, 6)
+        ctrl = torch.from_numpy(self._batch.bind("ctrl"))  # (N, 6)
         self.state = DroneState(self._qpos[:, :3], self._qpos[:, 3:], self._qvel[:, :3], self._qvel[:, 3:])
+        self._flight = Flight(self.quadrotor, self._qpos, self._qvel, ctrl, self._batch.step)
         self.renderer: Renderer | None = None
         if renderer is not None:
             scene = build_scene(track, parameters, camera).compile()
@@ -75,15 +77,12 @@ class MujocoSimulator:
 
     def step(self, action: Tensor) -> Tensor:
         """Fly one control step with finite actions (N, 4); return the path (P + 1, N, 3) of all physics steps."""
-        state = self.state
         path = torch.empty(self.parameters.physics_steps + 1, self.num_envs, 3, dtype=self.dtype)
-        path[0] = state.position
+        path[0] = self.state.position
         self.quadrotor.command(action)
         for index in range(self.parameters.physics_steps):
-            wrench = self.quadrotor.wrench(index, state.attitude, state.linear_velocity, state.body_rates)
-            self._wrench.copy_(wrench)
-            self._batch.step()
-            path[index + 1] = state.position
+            self._flight.step(index)
+            path[index + 1] = self.state.position
         return path
 
     def render(self, mask: Tensor | None = None) -> Tensor:
