@@ -171,8 +171,8 @@ class Physics(mujoco.Physics):
     def __init__(self, data: wrapper.MjData, quadrotor: Quadrotor) -> None:
         super().__init__(data)
         self.quadrotor = quadrotor
-        views = (torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl))
-        self._flight = Flight(quadrotor, *views, lambda: mujoco_bindings.mj_step(self.model.ptr, self.data.ptr))
+        qpos, qvel, ctrl = (torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl))
+        self._flight = Flight(quadrotor, qpos, qvel, ctrl, self._integrate)
         self._start_path()
 
     def position(self) -> np.ndarray:
@@ -215,6 +215,9 @@ class Physics(mujoco.Physics):
             self._path.append(self.position())
         # cameras and sensors of the new state: mj_step leaves those of the old one
         mujoco_bindings.mj_step1(self.model.ptr, self.data.ptr)
+
+    def _integrate(self) -> None:
+        mujoco_bindings.mj_step(self.model.ptr, self.data.ptr)
 
     def _start_path(self) -> None:
         self._physics_step = 0  # within the control step
