@@ -6,17 +6,18 @@ The scripted pilot's actions of 2 s at racing speed on every track are replayed 
 
 * `wrench`: a given sequence of body wrenches, each held for 2 ms, moves the rigid body. The reference is RK4 with
   0.5 ms steps under the same wrenches, so the difference is the integrator's alone.
-* `loop`: rate loop and motors run with the physics step too. Errors are against RK4 at 1 ms (`loop_vs_1ms`), and
-  against `midpoint` RK4 at 0.1 ms (`loop_vs_limit`), which is the continuous-time drone to a few µm.
+* `loop`: rate loop and motors run with the physics step too. Errors are against `midpoint` RK4 at 1 ms (`loop_vs_1ms`)
+  and at 0.1 ms (`loop_vs_limit`), which is the continuous-time drone to a few µm.
 
-Variants: `plain` is the code as it is. `+position` and `+pose` correct MuJoCo's x' = x + dt v' to the trapezoidal rule
-after each step (position only; attitude too). `midpoint` also evaluates the motors, the rates in the loop and the
-direction of the force at the middle of the step. Columns in mm are the greatest position error over all tracks.
+Variants: `plain` is an explicit step: the loop takes the rates at its beginning, the thrust is that of the motors'
+speed at its end. `+position` and `+pose` bring MuJoCo's x' = x + dt v' to the trapezoidal rule after each step
+(position only; attitude too). `midpoint` is what the package does: `Quadrotor.wrench` is of the middle of the step, and
+unless the integrator is RK4, `Flight` corrects wrench and pose. Columns in mm are the greatest position error over all
+tracks.
 """
 
 import argparse
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,9 +26,10 @@ from measuring import print_table, write_json
 from mujoco.batch import Batch
 from torch import Tensor
 
+from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.pilot import ScriptedPilot
-from dreamer_racing.envs.quadrotor import PRESETS, Quadrotor, QuadrotorParameters
-from dreamer_racing.envs.pilot import _turn as turn
+from dreamer_racing.envs.quadrotor import PRESETS, Quadrotor
+from dreamer_racing.envs.rotation import turn
 from dreamer_racing.envs.scene import build_scene
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
@@ -36,70 +38,55 @@ TRACKS = ("circle", "kidney", "figure8", "split_s")
 SECONDS, WARM_UP = 2.0, 3.0  # s of racing replayed, and flown before, so that it is at racing speed
 HOLD = 0.002  # s
 EASY = PRESETS["easy"]
-CORRECTIONS = {"plain": "", "+position": "position", "+pose": "pose", "midpoint": "midpoint"}
 
 
-class MidpointQuadrotor(Quadrotor):
-    """A `Quadrotor` whose wrench is that of the middle of the step."""
+class PlainQuadrotor(Quadrotor):
+    """A `Quadrotor` whose loop sees the rates of the step's beginning, and whose thrust is that of its end."""
 
     def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
-        """Advance controller and motors by one physics step and return the wrench of its middle."""
-        half = 0.5 * self.parameters.physics_dt
+        """Advance controller and motors by one physics step and return the wrench at its end."""
         setpoint = self._setpoint(physics_step)
-        torque_now = self.rotor_speed.square() @ self._effectiveness[:, 3:]
-        rates = middle_rates(body_rates, torque_now, self._inertia, half)
-        gyroscopic = torch.linalg.cross(rates, self._inertia * rates)
-        torque = torch.addcmul(gyroscopic, self._rate_gain, setpoint[:, 1:] - rates)
+        gyroscopic = self.gyroscopic_torque(body_rates)
+        torque = torch.addcmul(gyroscopic, self._rate_gain, setpoint[:, 1:] - body_rates)
         target = self.mix(setpoint[:, :1], torque).sqrt()
-        middle = torch.lerp(target, self.rotor_speed, self._motor_decay**0.5)
         self.rotor_speed = torch.lerp(target, self.rotor_speed, self._motor_decay)
-        return middle.square() @ self._effectiveness
+        return self.rotor_speed.square() @ self._effectiveness
 
 
-def middle_rates(body_rates: Tensor, torque: Tensor, inertia: Tensor, half: float) -> Tensor:
-    """Body rates (N, 3) in rad/s half a step of `half` s later, under a torque (N, 3) in N m."""
-    gyroscopic = torch.linalg.cross(body_rates, inertia * body_rates)
-    return body_rates + half * (torque - gyroscopic) / inertia
+class Drones:
+    """N drones of a variant, and their bodies in MuJoCo.
 
+    Args:
+        variant: see the head of this file.
+        integrator: MuJoCo's name of it.
+        step: s.
+        num: N.
+    """
 
-@dataclass
-class Body:
-    """N rigid bodies in MuJoCo."""
+    def __init__(self, variant: str, integrator: str, step: float, num: int) -> None:
+        self.parameters = replace(EASY, physics_dt=step, integrator=integrator)
+        midpoint = variant == "midpoint"
+        self.quadrotor = (Quadrotor if midpoint else PlainQuadrotor)(self.parameters, num)
+        batch = Batch(build_scene(load_track("circle"), self.parameters).compile(), num, min(2, num))
+        self.qpos, self.qvel, ctrl = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "ctrl"))
+        corrected = None if midpoint else False
+        self._flight = Flight(self.quadrotor, self.qpos, self.qvel, ctrl, batch.step, corrected)
+        self._variant = variant
 
-    parameters: QuadrotorParameters
-    correction: str  # "", "position", "pose" or "midpoint"
-    num: int
+    def wrench(self, index: int) -> Tensor:
+        """The drones' own wrench (N, 6) in a physics step of the control step."""
+        return self.quadrotor.wrench(index, self.qpos[:, 3:], self.qvel[:, :3], self.qvel[:, 3:])
 
-    def __post_init__(self) -> None:
-        self._batch = Batch(build_scene(load_track("circle"), self.parameters).compile(), self.num, min(2, self.num))
-        self.qpos = torch.from_numpy(self._batch.bind("qpos"))
-        self.qvel = torch.from_numpy(self._batch.bind("qvel"))
-        self._inertia = torch.tensor(self.parameters.inertia, dtype=torch.float64)
-        self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
-
-    def step(self, wrench: Tensor) -> None:
-        """Move by one physics step."""
-        self._ctrl.copy_(self._midpoint(wrench) if self.correction == "midpoint" else wrench)
-        before = self.qvel.clone() if self.correction else None
-        self._batch.step()
+    def apply(self, wrench: Tensor) -> None:
+        """Move the bodies for one physics step."""
+        before = self.qvel.clone() if self._variant.startswith("+") else None
+        self._flight.apply(wrench)
         if before is None:
             return
-        overshoot = (-0.5 * self.parameters.physics_dt) * (self.qvel - before)
+        overshoot = 0.5 * self.parameters.physics_dt * (before - self.qvel)
         self.qpos[:, :3] += overshoot[:, :3]
-        if self.correction != "position":
+        if self._variant == "+pose":
             self.qpos[:, 3:] = turn(self.qpos[:, 3:], overshoot[:, 3:])
-
-    def _midpoint(self, wrench: Tensor) -> Tensor:
-        """The wrench that does in an Euler step, which takes attitude and rates at its beginning, what this one would
-        do with those in the middle.
-        """
-        half = 0.5 * self.parameters.physics_dt
-        force, torque = wrench[:, :3], wrench[:, 3:]
-        rates = middle_rates(self.qvel[:, 3:], torque, self._inertia, half)
-        force = force + half * torch.linalg.cross(rates, force)
-        momentum = torch.linalg.cross(self.qvel[:, 3:], self._inertia * self.qvel[:, 3:])
-        torque = torque + momentum - torch.linalg.cross(rates, self._inertia * rates)
-        return torch.cat((force, torque), dim=1)
 
 
 @dataclass(frozen=True)
@@ -114,65 +101,60 @@ class Recording:
 
 def record() -> Recording:
     """Fly each track for a while and record the last two seconds."""
-    rows = [list(_record_one(track)) for track in TRACKS]
-    start = [torch.cat([row[0][i] for row in rows]) for i in range(3)]
-    return Recording(*start, torch.stack([torch.cat(row[1:]) for row in rows], dim=1))
+    rows = [_record_one(track) for track in TRACKS]
+    qpos, qvel, rotor_speed, actions = zip(*rows, strict=True)
+    return Recording(torch.cat(qpos), torch.cat(qvel), torch.cat(rotor_speed), torch.cat(actions, dim=1))
 
 
-def _record_one(track: str) -> Iterator[Any]:
-    """Yield the state at the beginning, then the actions (1, 4)."""
+def _record_one(track: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """State at the beginning (position and attitude, velocities, rotor speeds), and the actions (T, 1, 4)."""
     worlds = RaceWorlds(track, 1, EASY, evaluation=True, from_pixels=False)
     pilot = ScriptedPilot(track, EASY, dtype=worlds.dtype)
     worlds.reset()
     simulator: Any = worlds.simulator
+    actions = []
     warm_up, steps = (round(seconds / EASY.control_dt) for seconds in (WARM_UP, SECONDS))
     for step in range(warm_up + steps):
-        if step == warm_up:
-            yield simulator._qpos.clone(), simulator._qvel.clone(), simulator.quadrotor.rotor_speed.clone()
         state = simulator.state
-        action = pilot.act(
-            state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate
+        if step == warm_up:
+            position, attitude = state.position.clone(), state.attitude.clone()
+            velocity, rates = state.linear_velocity.clone(), state.body_rates.clone()
+            rotor_speed = simulator.quadrotor.rotor_speed.clone()
+        actions.append(
+            pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate)
         )
-        if step >= warm_up:
-            yield action
-        worlds.step(action)
-
-
-def make(variant: str, integrator: str, step: float, num: int) -> tuple[Body, Quadrotor]:
-    """Body and drone of a variant; `step` in s."""
-    parameters = replace(EASY, physics_dt=step, integrator=integrator)
-    correction = CORRECTIONS[variant] if integrator != "RK4" else ""
-    drone = MidpointQuadrotor if variant == "midpoint" else Quadrotor
-    return Body(parameters, correction, num), drone(parameters, num)
+        worlds.step(actions[-1])
+    pose, velocities = torch.cat((position, attitude), dim=1), torch.cat((velocity, rates), dim=1)
+    return pose, velocities, rotor_speed, torch.stack(actions[warm_up:])
 
 
 def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -> tuple[Tensor, Tensor]:
-    """Replay the actions; return positions (T·10, N, 3) every `HOLD`, and the wrenches applied then."""
-    body, drone = make(variant, integrator, step, len(TRACKS))
-    body.qpos[:], body.qvel[:] = recording.qpos, recording.qvel
-    drone.rotor_speed = recording.rotor_speed
+    """Replay the actions; return positions (T·10, N, 3) every `HOLD`, and the wrenches (T·10, N, 6) applied then."""
+    drones = Drones(variant, integrator, step, len(TRACKS))
+    drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
+    drones.quadrotor.rotor_speed = recording.rotor_speed
     every = round(HOLD / step)
     positions, wrenches = [], []
     for action in recording.actions:
-        drone.command(action)
-        for index in range(body.parameters.physics_steps):
-            wrench = drone.wrench(index, body.qpos[:, 3:], body.qvel[:, :3], body.qvel[:, 3:])
-            body.step(wrench)
+        drones.quadrotor.command(action)
+        for index in range(drones.parameters.physics_steps):
+            wrench = drones.wrench(index)
+            drones.apply(wrench)
             if (index + 1) % every == 0:
-                positions.append(body.qpos[:, :3].clone())
+                positions.append(drones.qpos[:, :3].clone())
                 wrenches.append(wrench.clone())
     return torch.stack(positions), torch.stack(wrenches)
 
 
 def fly_wrenches(recording: Recording, wrenches: Tensor, variant: str, integrator: str, step: float) -> Tensor:
     """Apply wrenches (T·10, N, 6), each for `HOLD`; return the positions (T·10, N, 3)."""
-    body, _ = make(variant, integrator, step, len(TRACKS))
-    body.qpos[:], body.qvel[:] = recording.qpos, recording.qvel
+    drones = Drones(variant, integrator, step, len(TRACKS))
+    drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
     positions = []
     for wrench in wrenches:
         for _ in range(round(HOLD / step)):
-            body.step(wrench)
-        positions.append(body.qpos[:, :3].clone())
+            drones.apply(wrench)
+        positions.append(drones.qpos[:, :3].clone())
     return torch.stack(positions)
 
 
@@ -183,14 +165,14 @@ def error_mm(positions: Tensor, reference: Tensor) -> list[float]:
 
 def cost(variant: str, integrator: str, step: float, num: int = 1024) -> tuple[float, float]:
     """µs per world and physics step, of the body (with its correction) and of controller and motors."""
-    body, drone = make(variant, integrator, step, num)
-    drone.command(torch.zeros(num, 4))
+    drones = Drones(variant, integrator, step, num)
+    drones.quadrotor.command(torch.zeros(num, 4))
     spent = []
     for _ in range(300):
         start = time.perf_counter()
-        wrench = drone.wrench(0, body.qpos[:, 3:], body.qvel[:, :3], body.qvel[:, 3:])
+        wrench = drones.wrench(0)
         middle = time.perf_counter()
-        body.step(wrench)
+        drones.apply(wrench)
         spent.append((time.perf_counter() - middle, middle - start))
     # the median, because other processes disturb
     body_seconds, drone_seconds = torch.tensor(spent).median(0).values.tolist()
@@ -221,9 +203,9 @@ def main() -> None:
     parser.add_argument("--json")
     arguments = parser.parse_args()
     recording = record()
-    reference, _ = fly_loop(recording, "plain", "RK4", 0.001)
+    reference, _ = fly_loop(recording, "midpoint", "RK4", 0.001)
     limit, _ = fly_loop(recording, "midpoint", "RK4", 0.0001)
-    _, wrenches = fly_loop(recording, "plain", "RK4", HOLD)
+    _, wrenches = fly_loop(recording, "midpoint", "RK4", HOLD)
     exact = fly_wrenches(recording, wrenches, "plain", "RK4", 0.0005)
     records = []
     for variant, integrator, step in CASES:

@@ -12,7 +12,7 @@ world z up, attitude wxyz, body frame FLU. All numbers are this project's choice
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -21,12 +21,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
-from dreamer_racing.envs.rotation import rotate, rotate_inverse
+from dreamer_racing.envs.race import RaceStep
+from dreamer_racing.envs.rotation import rotate, rotate_inverse, turn
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
 DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous
 LINE_DT = 0.005  # s between samples of the finished line
+SAMPLES = 12  # S, at which a segment must keep the limits
 ADAM_STEPS, LBFGS_STEPS = 200, 800
 
 
@@ -36,7 +38,9 @@ class LineLimits:
 
     Args:
         speed: the fraction of the greatest collective thrust that the line may use; the one knob of aggressiveness.
-        gate_offset: greatest distance from a gate's centre, to the left and up, m.
+            0.9 leaves room for corrections and for a drone of the randomisation with 14 % less thrust; above 0.95 the
+            laps get no faster.
+        gate_offset: greatest distance from a gate's centre to the left and up, m; never above 40 % of the opening's.
         body_rate_max: greatest roll and pitch rate, rad/s.
         angular_acceleration_max: greatest roll and pitch acceleration, rad/s².
         thrust_min: least collective thrust, m/s²; below it the drone's attitude has no direction.
@@ -82,8 +86,7 @@ class RacingLine:
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "RacingLine":
         """The same line elsewhere."""
-        factory = {"device": device, "dtype": dtype}
-        return RacingLine(self.samples.to(**factory), self.gate_times.to(**factory), self.lap_time)
+        return RacingLine(self.samples.to(device, dtype), self.gate_times.to(device, dtype), self.lap_time)
 
     def at(self, time: Tensor) -> Reference:
         """Interpolate the line at times (N,) in s; it repeats every lap."""
@@ -125,33 +128,27 @@ class _LineNodes:
         dtype = torch.float64
         self.gates, self.normals = track.gate_positions(dtype=dtype), track.gate_normals(dtype=dtype)
         self.left = track.gate_rotations(dtype=dtype)[:, :, 1]
-        self.gate_offset = gate_offset
-        position, velocity, duration, counts, first = [], [], [], [], []
-        for here in range(len(self.gates)):
-            there = (here + 1) % len(self.gates)
-            gap = self.gates[there] - self.gates[here]
-            turn = 1.0 - float(self.normals[here] @ self.normals[there])  # 2 for a reversal
-            length = 1.1 * float(gap.norm()) + 0.5 + 2.0 * turn
-            count = max(2, round(float(gap.norm()) / self.SPACING))
-            first.append(sum(counts))
-            duration.append(length / self.START_SPEED)
-            counts.append(count)
-            t = (torch.arange(count, dtype=dtype) / count).unsqueeze(-1)
-            bend, out, into = 3 * t**2 - 2 * t**3, t**3 - 2 * t**2 + t, t**3 - t**2
-            tangents = length * (out * self.normals[here] + into * self.normals[there])
-            position.append(self.gates[here] + bend * gap + tangents)
-            slope_out, slope_into = 3 * t**2 - 4 * t + 1, 3 * t**2 - 2 * t
-            tangents = length * (slope_out * self.normals[here] + slope_into * self.normals[there])
-            slope = 6 * (t - t**2) * gap + tangents
-            velocity.append(self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1))
-        self.gate_nodes = torch.tensor(first)
-        self._start = torch.stack((torch.cat(position), torch.cat(velocity)), dim=1)  # (M, 2, 3)
-        self._start = torch.nn.functional.pad(self._start, (0, 0, 0, 2))  # (M, 4, 3)
-        self._counts = torch.tensor(counts)
-        self._start_duration = torch.tensor(duration, dtype=dtype) / self._counts
+        self.gate_offset = min(gate_offset, 0.4 * track.shape.pass_half_width)
+        gaps = self.gates.roll(-1, 0) - self.gates
+        turns = 1.0 - (self.normals * self.normals.roll(-1, 0)).sum(-1)  # 0 straight on, 2 for a reversal
+        lengths = 1.1 * gaps.norm(dim=-1) + 0.5 + 2.0 * turns  # of a generous arc, m
+        self._counts = (gaps.norm(dim=-1) / self.SPACING).round().long().clamp(min=2)  # (G,) nodes from gate to gate
+        self.gate_nodes = self._counts.cumsum(0) - self._counts  # (G,)
+        arcs = [self._arc(gate, float(lengths[gate]), int(self._counts[gate])) for gate in range(len(self.gates))]
+        self._start = torch.nn.functional.pad(torch.cat(arcs), (0, 0, 0, 2))  # (M, 4, 3)
+        self._start_duration = lengths / self.START_SPEED / self._counts  # (G,) of each of the equal segments
         self._scales = torch.tensor(self.SCALES, dtype=dtype).view(4, 1)
         self.change = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
         self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (G,)
+
+    def _arc(self, gate: int, length: float, count: int) -> Tensor:
+        """Positions and velocities (count, 2, 3) on the cubic arc from a gate to the next."""
+        here, there = gate, (gate + 1) % len(self.gates)
+        gap, out, into = self.gates[there] - self.gates[here], length * self.normals[here], length * self.normals[there]
+        t = (torch.arange(count, dtype=gap.dtype) / count).unsqueeze(-1)
+        position = self.gates[here] + (3 * t**2 - 2 * t**3) * gap + (t**3 - 2 * t**2 + t) * out + (t**3 - t**2) * into
+        slope = 6 * (t - t**2) * gap + (3 * t**2 - 4 * t + 1) * out + (3 * t**2 - 2 * t) * into
+        return torch.stack((position, self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1)), dim=1)
 
     def durations(self) -> Tensor:
         """Seconds from each node to the next (M,); between two gates they are equal."""
@@ -230,9 +227,9 @@ def _lap_cost(
     penalty = penalty + 300.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
     # between samples, so that the thrust axis cannot flip unseen where the force passes through zero
     per_second = basis.shape[1] / durations.unsqueeze(-1)
-    turn, bend = _steps(axis).norm(dim=-1) * per_second, _steps(body_rate).norm(dim=-1) * per_second
-    penalty = penalty + 50.0 * _excess(turn, limits.body_rate_max)
-    penalty = penalty + 10.0 * _excess(bend, limits.angular_acceleration_max)
+    axis_speed, rate_change = _steps(axis).norm(dim=-1) * per_second, _steps(body_rate).norm(dim=-1) * per_second
+    penalty = penalty + 50.0 * _excess(axis_speed, limits.body_rate_max)
+    penalty = penalty + 10.0 * _excess(rate_change, limits.angular_acceleration_max)
     at_gates = torch.nn.functional.normalize(velocity[nodes.gate_nodes, 0], dim=-1)
     slant = (limits.gate_cosine - (at_gates * nodes.normals).sum(-1)).clamp(min=0.0)
     return durations.sum() + (durations * penalty.mean(-1)).sum() + 10.0 * slant.square().sum()
@@ -250,15 +247,15 @@ def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: Line
     Returns:
         The line, float64 on CPU.
     """
-    dynamics, nodes = _Dynamics(parameters), _LineNodes(track, limits.gate_offset)
-    samples = 12
-    basis = _hermite_basis(torch.arange(samples, dtype=torch.float64) / samples)
-    low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
-    high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
-    low[2] = low[2].clamp(min=limits.height_min)
-    _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
-    with torch.no_grad():
-        return _finish_line(nodes, dynamics)
+    with torch.inference_mode(False):
+        dynamics, nodes = _Dynamics(parameters), _LineNodes(track, limits.gate_offset)
+        basis = _hermite_basis(torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES)
+        low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
+        high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
+        low[2] = low[2].clamp(min=limits.height_min)
+        _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
+        with torch.no_grad():
+            return _finish_line(nodes, dynamics)
 
 
 def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
@@ -344,7 +341,7 @@ class ScriptedPilot:
     Args:
         track: name, path or `Track`.
         parameters: preset or parameters of the drone; the pilot knows the nominal ones only.
-        limits: what the line may ask for; its `speed` is the knob of aggressiveness. None for `default_limits`.
+        limits: what the line may ask for; its `speed` is the knob of aggressiveness. None for the defaults.
         gains: how errors are corrected.
         device: where the states will be.
         dtype: floating-point type of the states and actions.
@@ -370,26 +367,29 @@ class ScriptedPilot:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         self.track, self.parameters = load_track(track), load_preset(parameters)
-        self.limits = limits or default_limits(self.parameters)
+        self.limits = limits or LineLimits()
         self.gains = gains or PilotGains()
-        self._factory = {"device": torch.device(device), "dtype": dtype}
+        self._device, self._dtype = torch.device(device), dtype
         nominal = without_randomisation(self.parameters)
         self.line = plan_racing_line(self.track, nominal, self.limits).to(device, dtype)
         self._dynamics = _Dynamics(nominal)
-        self._rate_max = torch.tensor(nominal.body_rate_max, **self._factory)
+        self._rate_max = torch.tensor(nominal.body_rate_max, device=device, dtype=dtype)
         self._latency = nominal.command_delay + nominal.control_dt / 2.0  # s, to the middle of the action's effect
         self._make_search()
-        self._last_position: Tensor | None = None
+        self._last_position: Tensor | None = None  # (N, 3)
+        self._last_velocity: Tensor  # (N, 3)
+        self._last_command: Tensor  # (N, 4) m/s² and rad/s
+        self._last_thrust: Tensor  # (N, 1) m/s², what the motors were asked for, with their lag
+        self._thrust_scale: Tensor  # (N, 1) real thrust over nominal
 
     def _make_search(self) -> None:
         """Tabulate where on the line the drones of each target gate may be: times and positions (G, W, ·)."""
         line = self.line
         end = line.gate_times + self.WINDOW
         start = line.gate_times.roll(1) - self.WINDOW
-        start = torch.where(start > line.gate_times, start - line.lap_time, start)
-        start[0] = line.gate_times[-1] - line.lap_time - self.WINDOW
+        start[0] -= line.lap_time
         count = math.ceil(float((end - start).max()) / self.SEARCH_DT)
-        share = torch.linspace(0.0, 1.0, count, **self._factory)
+        share = torch.linspace(0.0, 1.0, count, device=self._device, dtype=self._dtype)
         self._search_times = torch.lerp(start.unsqueeze(-1), end.unsqueeze(-1), share)  # (G, W)
         points = [line.at(times).position for times in self._search_times]
         self._search_positions = torch.stack(points)  # (G, W, 3)
@@ -401,6 +401,7 @@ class ScriptedPilot:
         elif self._last_position is not None:
             self._last_position = torch.where(mask.unsqueeze(-1), math.nan, self._last_position)
 
+    @torch.no_grad()
     def act(
         self, position: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, target_gate: Tensor
     ) -> Tensor:
@@ -416,43 +417,41 @@ class ScriptedPilot:
         Returns:
             (N, 4) in [-1, 1]: collective thrust, body rates x, y, z.
         """
-        state = [value.to(**self._factory) for value in (position, attitude, linear_velocity, body_rates)]
+        inputs = (position, attitude, linear_velocity, body_rates)
+        state = [value.to(self._device, self._dtype) for value in inputs]
         self._remember(*state)
         position, attitude, velocity, body_rates = self._predict(*state)
-        time = self._find(position, target_gate.to(self._factory["device"]))
+        time = self._find(position, target_gate.to(self._device))
         reference = self.line.at(time)
         force, progress = self._desired_force(position, velocity, reference)
         thrust = self._thrust(force, attitude, velocity, time)
-        rates = self._rates(force, attitude, body_rates, reference, progress)
-        rates[:, 2:] = self._yaw_rate(position, attitude, time)
+        roll_pitch = self._roll_pitch_rates(force, attitude, body_rates, reference, progress)
+        rates = torch.cat((roll_pitch, self._yaw_rate(position, attitude, time)), dim=1)
         self._last_command = torch.cat((thrust, rates), dim=1)
         thrust = thrust / self._thrust_scale / self.parameters.collective_thrust_scale - 1.0
         return torch.cat((thrust, rates / self._rate_max), dim=1).clamp(-1.0, 1.0)
 
     def _remember(self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor) -> None:
-        """Find out who is new, and learn from the velocities how strong the thrust of the others is."""
-        dt = self.parameters.control_dt
+        """Forget the drones that are suddenly elsewhere; learn how strong the thrust of the others is."""
+        dt, dynamics = self.parameters.control_dt, self._dynamics
         if self._last_position is None or len(self._last_position) != len(position):
-            self._last_position = torch.full_like(position, math.nan)
-            self._last_velocity, self._last_thrust = velocity, torch.zeros_like(position[:, :1])
+            self._last_position, self._last_velocity = torch.full_like(position, math.nan), velocity
             self._last_command = torch.zeros_like(attitude)
-            self._thrust_scale = torch.ones_like(position[:, :1])
-        moved = position - self._last_position - dt * (velocity + self._last_velocity) / 2.0
-        new = ~(moved.norm(dim=-1, keepdim=True) < self.JUMP)
-        hover = torch.zeros_like(self._last_command)
-        hover[:, 0] = GRAVITY
+            self._last_thrust, self._thrust_scale = torch.zeros_like(position[:, :1]), torch.ones_like(position[:, :1])
+        velocity_mean = (velocity + self._last_velocity) / 2.0
+        surprise = (position - self._last_position - dt * velocity_mean).norm(dim=-1, keepdim=True)
+        new = ~(surprise < self.JUMP)  # NaN is new too
+        hover = torch.nn.functional.pad(torch.full_like(surprise, GRAVITY), (0, 3))
         self._last_command = torch.where(new, hover, self._last_command)
-        self._last_thrust = torch.where(new, GRAVITY, self._last_thrust)
-        axis = rotate(attitude, _unit_z(position))
-        force = self._dynamics.force((velocity + self._last_velocity) / 2.0, (velocity - self._last_velocity) / dt)
-        measured = self._dynamics.collective_thrust(force, axis, velocity).unsqueeze(-1)
         lag = self.parameters.motor_time_constant + self.parameters.command_delay
-        blend = min(1.0, dt / lag)
-        self._last_thrust = torch.lerp(self._last_thrust, self._last_command[:, :1], blend)
-        ratio = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3)
-        known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * self._dynamics.thrust_max)
-        share = self.gains.adaptation * dt * known
-        scale = (self._thrust_scale * (1.0 + share * (ratio - 1.0))).clamp(0.8, 1.2)
+        thrust = torch.lerp(self._last_thrust, self._last_command[:, :1], min(1.0, dt / lag))
+        self._last_thrust = torch.where(new, GRAVITY, thrust)
+        force = dynamics.force(velocity_mean, (velocity - self._last_velocity) / dt)
+        measured = dynamics.collective_thrust(force, rotate(attitude, _unit_z(position)), velocity).unsqueeze(-1)
+        surplus = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3) - 1.0
+        # near the limit the mixer may give up thrust for roll and pitch, which is no property of the drone
+        known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * dynamics.thrust_max)
+        scale = (self._thrust_scale * (1.0 + self.gains.adaptation * dt * known * surplus)).clamp(0.8, 1.2)
         self._thrust_scale = torch.where(new, 1.0, scale)
         self._last_position, self._last_velocity = position.clone(), velocity.clone()
 
@@ -463,7 +462,7 @@ class ScriptedPilot:
         lag = self._latency
         settled = 1.0 - math.exp(-lag * self.parameters.rate_gain)
         later = torch.lerp(body_rates, self._last_command[:, 1:], settled * 0.5)
-        attitude = _turn(attitude, (body_rates + later) * (lag / 2.0))
+        attitude = turn(attitude, (body_rates + later) * (lag / 2.0))
         axis = rotate(attitude, _unit_z(position))
         force = axis * self._last_thrust - self._dynamics.drag_sideways * velocity
         acceleration = force - GRAVITY * _unit_z(position)
@@ -510,10 +509,10 @@ class ScriptedPilot:
         size_soon = self._dynamics.force(soon.velocity, soon.acceleration).norm(dim=-1, keepdim=True)
         return (thrust + size_soon - size_now).clamp(1.0, self._dynamics.thrust_max)
 
-    def _rates(
+    def _roll_pitch_rates(
         self, force: Tensor, attitude: Tensor, body_rates: Tensor, reference: Reference, progress: Tensor
     ) -> Tensor:
-        """Body rates (N, 3) in rad/s that turn the thrust axis to the force; yaw is zero."""
+        """Roll and pitch rates (N, 2) in rad/s that turn the thrust axis to the force."""
         gains, loop = self.gains, self.parameters.rate_gain
         wanted = torch.nn.functional.normalize(rotate_inverse(attitude, force), dim=-1)
         x, y, z = wanted.unbind(-1)
@@ -524,9 +523,8 @@ class ScriptedPilot:
         change = rotate_inverse(attitude, progress.square() * reference.angular_acceleration)
         damping = (gains.body_rate / loop - 1.0) * (feedforward - body_rates)
         rates = feedforward + damping + (change + gains.attitude * error) / loop
-        rates = rates * torch.tensor((1.0, 1.0, 0.0), **self._factory)
-        excess = (rates.abs() / self._rate_max).amax(dim=-1, keepdim=True).clamp(min=1.0)
-        return rates / excess
+        excess = (rates[:, :2].abs() / self._rate_max[:2]).amax(dim=-1, keepdim=True).clamp(min=1.0)
+        return rates[:, :2] / excess
 
     def _yaw_rate(self, position: Tensor, attitude: Tensor, time: Tensor) -> Tensor:
         """Yaw rate (N, 1) in rad/s that points the nose to where the line goes."""
@@ -537,48 +535,23 @@ class ScriptedPilot:
         return rate.clamp(-self._rate_max[2], self._rate_max[2]).unsqueeze(-1)
 
 
-def default_limits(parameters: QuadrotorParameters) -> LineLimits:
-    """Limits that leave the pilot room for corrections, and for the weakest drone of the randomisation."""
-    limits = LineLimits()
-    widths = parameters.randomisation
-    if widths is None:
-        return limits
-    weakest = (1.0 - widths.thrust) / (1.0 + widths.mass)
-    return replace(limits, speed=limits.speed * weakest)
-
-
 def _unit_z(like: Tensor) -> Tensor:
     """World or body z for each row of a (N, 3) tensor."""
     return like.new_tensor((0.0, 0.0, 1.0)).expand_as(like)
 
 
-def _turn(attitude: Tensor, rotation: Tensor) -> Tensor:
-    """Attitudes (N, 4) turned by small body-frame rotation vectors (N, 3) in rad."""
-    half = torch.nn.functional.pad(rotation / 2.0, (1, 0))
-    w, x, y, z = attitude.unbind(-1)
-    columns = torch.stack((torch.stack((-x, -y, -z)), torch.stack((w, -z, y)), torch.stack((z, w, -x)), torch.stack((-y, x, w))))
-    product = torch.einsum("acn,nc->na", columns, half[:, 1:])
-    return torch.nn.functional.normalize(attitude + product, dim=-1)
-
-
-@dataclass(frozen=True)
-class Flight:
-    """What N episodes of the pilot came to; every tensor starts with N."""
-
-    gates: Tensor  # (N,) int64 gates passed
-    finished: Tensor  # (N,) bool: all laps, no crash
-    crash: Tensor  # (N,) int64 `CrashCause`
-    lap_times: Tensor  # (N, L) s, NaN where not flown
-    speed_mean: Tensor  # (N,) m/s
-    speed_max: Tensor  # (N,) m/s
-    gate_offset_max: Tensor  # (N,) m
-
-
 class PilotPolicy(TensorDictModuleBase):
     """The pilot as a policy of `DroneRacingEnv`: reads `("privileged", ...)`, writes `action`.
 
+    It needs no `is_init`: the pilot notices by itself that a drone has been put elsewhere.
+
     Args:
         pilot: who flies.
+
+    Example:
+        >>> env = DroneRacingEnv("circle", num_envs=2, from_pixels=False)
+        >>> env.rollout(100, PilotPolicy(ScriptedPilot(env.track)))["next", "race", "gates_passed"].max() > 0
+        tensor(True)
     """
 
     def __init__(self, pilot: ScriptedPilot) -> None:
@@ -589,9 +562,24 @@ class PilotPolicy(TensorDictModuleBase):
         self.pilot = pilot
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action of the coming control step."""
-        *state, gate = (tensordict.get(key) for key in self.in_keys)
-        return tensordict.set("action", self.pilot.act(*state, gate.squeeze(-1)).to(state[0].dtype))
+        """Write the actions of the coming control step."""
+        position, attitude, velocity, rates, gate = (tensordict.get(key) for key in self.in_keys)
+        action = self.pilot.act(position, attitude, velocity, rates, gate.squeeze(-1))
+        return tensordict.set("action", action.to(position))
+
+
+@dataclass(frozen=True)
+class FlownLaps:
+    """What N episodes came to."""
+
+    gates: Tensor  # (N,) int64, passed
+    finished: Tensor  # (N,) bool: all laps, no crash
+    crash: Tensor  # (N,) int64 `CrashCause`
+    lap_times: Tensor  # (N, L) s; NaN where not flown; the first lap begins at rest
+    speed_mean: Tensor  # (N,) m/s
+    speed_max: Tensor  # (N,) m/s
+    gate_offset_max: Tensor  # (N,) m
+    gate_in_view: Tensor  # (N,) fraction of the time in which the nose camera sees the target gate's centre
 
 
 def fly_laps(
@@ -600,13 +588,25 @@ def fly_laps(
     num_envs: int = 1,
     *,
     laps: int = 3,
-    randomise: bool = False,
-    random_starts: bool = False,
     pilot: ScriptedPilot | None = None,
+    randomise: bool = True,
+    random_starts: bool = False,
     seed: int = 0,
     episode_steps: int = 1500,
-) -> Flight:
-    """Fly N episodes from the start pose until all are over."""
+) -> FlownLaps:
+    """Fly N episodes to their ends.
+
+    Args:
+        track: name, path or `Track`.
+        preset: physics preset or parameters.
+        num_envs: N.
+        laps: L.
+        pilot: who flies; a `ScriptedPilot` with default limits if None.
+        randomise: whether a preset's randomisation is on.
+        random_starts: start as training does, instead of at the start pose.
+        seed: of randomisation and starts.
+        episode_steps: control steps until an episode is given up; 1500 are 30 s.
+    """
     parameters = load_preset(preset)
     worlds = RaceWorlds(
         track,
@@ -619,27 +619,67 @@ def fly_laps(
     )
     worlds.race.laps = laps
     pilot = pilot or ScriptedPilot(worlds.track, parameters, dtype=worlds.dtype)
-    worlds.reset()
-    n = num_envs
-    flying = torch.ones(n, dtype=torch.bool)
-    gates, crash = torch.zeros(n, dtype=torch.int64), torch.zeros(n, dtype=torch.int64)
-    finished = torch.zeros(n, dtype=torch.bool)
-    lap_times = torch.full((n, laps), math.nan)
-    total, steps, top, offset = (torch.zeros(n, dtype=torch.float64) for _ in range(4))
-    while flying.any():
-        state = worlds.simulator.state
-        action = pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate)
-        outcome = worlds.step(action)
-        speed = worlds.simulator.state.linear_velocity.norm(dim=-1)
-        total, steps = total + flying * speed, steps + flying
-        top = torch.where(flying, torch.maximum(top, speed), top)
-        offset = torch.where(flying, torch.maximum(offset, outcome.gate_offset), offset)
-        gates = torch.where(flying, outcome.gates_passed, gates)
-        crash = torch.where(flying, outcome.crash, crash)
-        finished = finished | (flying & outcome.finished)
-        lap = (outcome.gates_passed // worlds.track.num_gates - 1).clamp(0, laps - 1)
-        rows = flying & (outcome.lap_time > 0)
-        lap_times[rows, lap[rows]] = outcome.lap_time[rows].float()
-        flying = flying & ~(outcome.terminated | outcome.truncated)
+    steps = _fly(worlds, pilot)
     worlds.close()
-    return Flight(gates, finished, crash, lap_times, total / steps, top, offset)
+    return _summarise(steps, worlds.track.num_gates, laps)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One control step of a flight; tensors (N,)."""
+
+    outcome: RaceStep
+    speed: Tensor  # m/s
+    seen: Tensor  # bool: the target gate
+    flew: Tensor  # bool: the episode was not over
+
+
+def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
+    """Fly one episode in every world to its end."""
+    pilot.reset()
+    worlds.reset()
+    flying = torch.ones(worlds.num_envs, dtype=torch.bool, device=worlds.device)
+    steps = []
+    while flying.any():
+        state, gate = worlds.simulator.state, worlds.race.target_gate
+        seen = _in_view(worlds, state.position, state.attitude)
+        outcome = worlds.step(pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, gate))
+        steps.append(_Step(outcome, worlds.simulator.state.linear_velocity.norm(dim=-1), seen, flying))
+        flying = flying & ~(outcome.terminated | outcome.truncated)
+    return steps
+
+
+def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
+    """Whether the centre of the target gate (N,) is inside the nose camera's image; gates in front are not minded."""
+    camera = worlds.camera
+    gates = worlds.track.gate_positions(position.device, position.dtype)
+    view = rotate_inverse(attitude, gates[worlds.race.target_gate] - position) - position.new_tensor(camera.position)
+    tilt = math.radians(camera.tilt)
+    depth = view[:, 0] * math.cos(tilt) + view[:, 2] * math.sin(tilt)
+    up = view[:, 2] * math.cos(tilt) - view[:, 0] * math.sin(tilt)
+    reach = depth * math.tan(math.radians(camera.field_of_view) / 2.0)
+    return (up.abs() < reach) & (view[:, 1].abs() < reach * camera.width / camera.height)
+
+
+def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
+    """Add up the control steps of a flight."""
+    flew = torch.stack([step.flew for step in steps])  # (T, N)
+    time = flew.sum(0)
+
+    def outcomes(name: str) -> Tensor:
+        return torch.stack([getattr(step.outcome, name) for step in steps]) * flew
+
+    speed = torch.stack([step.speed for step in steps]) * flew
+    gates, lap_time = outcomes("gates_passed"), outcomes("lap_time")
+    at_lap = (gates // num_gates).unsqueeze(-1)  # (T, N, 1)
+    lap_times = (lap_time.unsqueeze(-1) * (at_lap == torch.arange(1, laps + 1, device=speed.device))).amax(0)  # (N, L)
+    return FlownLaps(
+        gates=gates.amax(0),
+        finished=outcomes("finished").any(0),
+        crash=outcomes("crash").amax(0),
+        lap_times=torch.where(lap_times > 0.0, lap_times, math.nan),
+        speed_mean=speed.sum(0) / time,
+        speed_max=speed.amax(0),
+        gate_offset_max=outcomes("gate_offset").amax(0),
+        gate_in_view=(torch.stack([step.seen for step in steps]) & flew).sum(0) / time,
+    )

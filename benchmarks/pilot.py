@@ -1,0 +1,76 @@
+"""Lap times of the scripted pilot, the reference for what the tracks allow.
+
+    python benchmarks/pilot.py --json results/pilot.json
+    python benchmarks/pilot.py --speed 0.95 --num-envs 64
+
+Every run is three laps from the start pose, at rest; preset `faithful` with its randomisation, another draw in each
+run. Columns: `clean` runs without a crash and with all laps of N; `line` is the planned lap time; `lap_first`,
+`lap_mean` and `lap_best` in s, where mean and best are of the flying laps (the second and third); speeds in m/s;
+`offset` is the greatest distance from a gate's centre in m; `view` is the share of time in which the nose camera sees
+the centre of the target gate.
+"""
+
+import argparse
+from collections import Counter
+from typing import Any
+
+import torch
+from measuring import print_table, write_json
+
+from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.pilot import FlownLaps, LineLimits, ScriptedPilot, fly_laps
+
+TRACKS = ("circle", "kidney", "figure8", "split_s")
+COLUMNS = ("clean", "line", "lap_first", "lap_mean", "lap_best", "speed_mean", "speed_max", "offset", "view")
+
+
+def main() -> None:
+    """Fly every track in every preset."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tracks", nargs="*", default=TRACKS)
+    parser.add_argument("--presets", nargs="*", default=("easy", "faithful"))
+    parser.add_argument("--speed", type=float, default=LineLimits().speed, help="fraction of the thrust limit")
+    parser.add_argument("--num-envs", type=int, default=32, help="runs of a randomised preset")
+    parser.add_argument("--random-starts", action="store_true", help="start as training does")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    records = []
+    for track in arguments.tracks:
+        for preset in arguments.presets:
+            pilot = ScriptedPilot(track, preset, LineLimits(speed=arguments.speed), dtype=torch.float64)
+            randomised = arguments.random_starts or pilot.parameters.randomisation is not None
+            flight = fly_laps(
+                track,
+                preset,
+                arguments.num_envs if randomised else 1,
+                pilot=pilot,
+                random_starts=arguments.random_starts,
+            )
+            record = {"track": track, "preset": preset, "speed": arguments.speed, "line": pilot.line.lap_time}
+            records.append({**record, "random_starts": arguments.random_starts, **summary(flight)})
+    print_table(records, ("track", "preset", "speed", *COLUMNS))
+    write_json(records, arguments.json)
+
+
+def summary(flight: FlownLaps) -> dict[str, Any]:
+    """The numbers of some runs."""
+    flying_laps = flight.lap_times[:, 1:]
+    flying_laps = flying_laps[flying_laps.isfinite()]
+    crashes = Counter(CrashCause(int(cause)).name.lower() for cause in flight.crash if cause)
+    return {
+        "clean": f"{int(flight.finished.sum())} of {len(flight.finished)}",
+        "runs": len(flight.finished),
+        "runs_clean": int(flight.finished.sum()),
+        "lap_first": float(flight.lap_times[:, 0].nanmean()),
+        "lap_mean": float(flying_laps.mean()) if len(flying_laps) else None,
+        "lap_best": float(flying_laps.min()) if len(flying_laps) else None,
+        "speed_mean": float(flight.speed_mean.mean()),
+        "speed_max": float(flight.speed_max.max()),
+        "offset": float(flight.gate_offset_max.max()),
+        "view": float(flight.gate_in_view.mean()),
+        **{f"crashes_{cause}": count for cause, count in crashes.items()},
+    }
+
+
+if __name__ == "__main__":
+    main()
