@@ -18,7 +18,8 @@ import torch
 from measuring import print_table, write_json
 
 from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.pilot import FlownLaps, LineLimits, ScriptedPilot, fly_laps
+from dreamer_racing.envs.pilot import FlownLaps, ScriptedPilot, fly_laps
+from dreamer_racing.envs.racing_line import LineLimits
 
 TRACKS = ("circle", "kidney", "figure8", "split_s")
 COLUMNS = ("clean", "line", "lap_first", "lap_mean", "lap_best", "speed_mean", "speed_max", "offset", "view")

@@ -16,6 +16,12 @@ from dreamer_racing.envs.rotation import from_roll_pitch_yaw, rotate
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.tracks.validation import START_CLEARANCE, flyable_box
 
+EPISODE_STEPS = 1000
+"""Control steps after which a training episode is truncated: 20 s [choice]."""
+
+EVALUATION_STEPS = 1500
+"""The same in evaluation: 30 s, because three laps of split_s take a good pilot 22 s [choice]."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RaceStep:
@@ -76,7 +82,7 @@ class Race:
         track: Track,
         num_envs: int,
         weights: RewardWeights | None = None,
-        episode_steps: int = 1000,
+        episode_steps: int = EPISODE_STEPS,
         laps: int | None = None,
         control_dt: float = 0.02,
         device: torch.device | str = "cpu",

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
-from dreamer_racing.envs.race import Race, RaceStep, StartSampler
+from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.simulator.rendering import GL_LIBRARIES, RendererUnavailableError
@@ -68,7 +68,6 @@ from dm_control.mujoco import wrapper  # noqa: E402
 from dm_control.rl import control  # noqa: E402
 from dm_control.suite import base  # noqa: E402
 
-TIME_LIMIT = 20.0  # s
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
 
 
@@ -77,7 +76,7 @@ def load(
     preset: str | QuadrotorParameters = "easy",
     *,
     random: int | np.random.RandomState | None = None,
-    time_limit: float = TIME_LIMIT,
+    time_limit: float | None = None,
     evaluation: bool = False,
     from_pixels: bool = False,
     camera: Camera | None = None,
@@ -90,7 +89,7 @@ def load(
         track: name of a built-in track, path to a YAML file, or a `Track`.
         preset: physics preset (`easy`, `faithful`) or parameters.
         random: seed or state of start poses and physics randomisation; None for a random seed.
-        time_limit: duration after which an episode is truncated, s.
+        time_limit: duration after which an episode is truncated, s; if None 20, in evaluation 30.
         evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
         from_pixels: whether there is an observation `pixels`; needs OpenGL (EGL, OSMesa or a display).
         camera: the nose camera.
@@ -108,6 +107,8 @@ def load(
         1.0
     """
     track, parameters = load_track(track), load_preset(preset)
+    if time_limit is None:
+        time_limit = (EVALUATION_STEPS if evaluation else EPISODE_STEPS) * parameters.control_dt
     episode_steps = round(time_limit / parameters.control_dt)
     if episode_steps < 1:
         raise ValueError(
@@ -283,7 +284,7 @@ class DroneRace(base.Task):
         generator: torch.Generator | None = None,
         *,
         random: int | np.random.RandomState | None = None,
-        episode_steps: int = 1000,
+        episode_steps: int = EPISODE_STEPS,
         evaluation: bool = False,
         camera: Camera | None = None,
         weights: RewardWeights | None = None,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
-from dreamer_racing.envs.race import Race, RaceStep, StartSampler
+from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator import MujocoSimulator, Simulator
@@ -24,7 +24,7 @@ class RaceWorlds:
         num_envs: N.
         preset: physics preset (`easy`, `faithful`) or parameters.
         evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
-        episode_steps: control steps until an episode is truncated; 1000 are 20 s.
+        episode_steps: control steps until an episode is truncated; if None 1000 (20 s), in evaluation 1500 (30 s).
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
         renderer: `auto`, `egl`, `osmesa` or `warp`.
@@ -51,7 +51,7 @@ class RaceWorlds:
         preset: str | QuadrotorParameters = "easy",
         *,
         evaluation: bool = False,
-        episode_steps: int = 1000,
+        episode_steps: int | None = None,
         weights: RewardWeights | None = None,
         from_pixels: bool = True,
         renderer: str = "auto",
@@ -85,7 +85,7 @@ class RaceWorlds:
             self.track,
             num_envs,
             weights=weights or RewardWeights(),
-            episode_steps=episode_steps,
+            episode_steps=episode_steps or (EVALUATION_STEPS if evaluation else EPISODE_STEPS),
             laps=self.track.laps if evaluation else None,
             control_dt=self.parameters.control_dt,
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time

@@ -4,15 +4,9 @@ import pytest
 import torch
 
 from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.pilot import (
-    LineLimits,
-    PilotPolicy,
-    RacingLine,
-    ScriptedPilot,
-    fly_laps,
-    plan_racing_line,
-)
+from dreamer_racing.envs.pilot import PilotPolicy, ScriptedPilot, fly_laps
 from dreamer_racing.envs.quadrotor import PRESETS
+from dreamer_racing.envs.racing_line import LineLimits, RacingLine, plan_racing_line
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 
