@@ -3,6 +3,7 @@
 import ctypes
 import logging
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -205,7 +206,8 @@ def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
         "torch.save(renderer.render(*torch.load('poses.pt')), 'images.pt')\n"
         "renderer.close()\n"
     )
-    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True, timeout=120)
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYOPENGL_PLATFORM", "MUJOCO_GL")}
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, check=True, timeout=120)
     drawn, expected = torch.load(tmp_path / "images.pt"), images("warp", poses)
     assert (drawn.float() - expected.float()).abs().mean() < 3.0
 
