@@ -12,6 +12,8 @@ import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any
 
 import torch
@@ -19,6 +21,7 @@ from measuring import print_table, write_json
 from torchrl.collectors import Collector
 from torchrl.envs.utils import RandomPolicy
 
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
 PARTS = ("physics", "race", "render", "torchrl")
@@ -39,17 +42,21 @@ def main() -> None:
     records: list[dict[str, Any]] = []
     for renderer in arguments.renderers:
         for num_envs in arguments.num_envs or ([512, 1024, 2048] if renderer == "none" else [64, 128, 256]):
-            try:
-                records.append(measure(arguments.track, arguments.preset, renderer, num_envs, arguments.seconds))
-            except RuntimeError as error:
-                print(f"{renderer}: not here ({error})")
-                break
+            # a process of its own: PyOpenGL is bound to one platform for the life of a process
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+                job = process.submit(measure, arguments.track, arguments.preset, renderer, num_envs, arguments.seconds)
+                try:
+                    records.append(job.result())
+                except RendererUnavailableError as error:
+                    print(f"{renderer}: not here ({error})")
+                    break
     print_table(records, ("renderer", "num_envs", "steps/s", *PARTS))
     write_json(records, arguments.json)
 
 
 def measure(track: str, preset: str, renderer: str, num_envs: int, seconds: float) -> dict[str, Any]:
     """Collect for some seconds; return one record."""
+    torch.set_num_threads(1)
     env = DroneRacingEnv(
         track, num_envs, preset=preset, from_pixels=renderer != "none", renderer=renderer, privileged=False, seed=0
     )
@@ -98,5 +105,4 @@ def watch(env: DroneRacingEnv, spent: dict[str, float]) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     main()
