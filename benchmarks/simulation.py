@@ -3,9 +3,9 @@
     python benchmarks/simulation.py --json results/simulation.json
     python benchmarks/simulation.py --renderers warp --num-envs 32 64      # what a machine without OpenGL gets
 
-Columns: `steps/s` are control steps summed over the N environments. The others split the time of one batched step in
-ms: `physics` (controller, motors, MuJoCo), `race` (gates, rewards, start poses), `render`, `torchrl` (all the rest:
-specs, TensorDicts, resets, the collector).
+Columns: `steps/s` are control steps summed over the N environments. The others split the time of one batched step:
+`physics_ms` (controller, motors, MuJoCo), `race_ms` (gates, rewards, start poses), `render_ms`, and `torchrl_ms`, all
+the rest (specs, TensorDicts, resets, the collector).
 """
 
 import argparse
@@ -50,7 +50,7 @@ def main() -> None:
                 except RendererUnavailableError as error:
                     print(f"{renderer}: not here ({error})")
                     break
-    print_table(records, ("renderer", "num_envs", "steps/s", *PARTS))
+    print_table(records, ("renderer", "num_envs", "steps/s", *(f"{part}_ms" for part in PARTS)))
     write_json(records, arguments.json)
 
 
@@ -72,7 +72,7 @@ def measure(track: str, preset: str, renderer: str, num_envs: int, seconds: floa
         steps += 16
     collector.shutdown()
     spent["torchrl"] = elapsed - sum(spent.values())
-    per_step = {part: 1e3 * spent[part] / steps for part in PARTS}
+    per_step = {f"{part}_ms": 1e3 * spent[part] / steps for part in PARTS}
     return {
         "benchmark": "simulation", "track": track, "preset": preset, "renderer": renderer, "num_envs": num_envs,
         "steps/s": num_envs * steps / elapsed, **per_step,
