@@ -14,8 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, make_loss
-from dreamer_racing.modules import Actor, Critic, DreamerPolicy, ModelSize, WorldModel, get_size
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossClass, find_loss
+from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,10 @@ class LearnerConfig:
         dynamics_scale: Weight of the dynamics loss.
         representation_scale: Weight of the representation loss.
         free_nats: KL below which there is no gradient, nats.
+        kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
+        privileged_scale: Weight of decoding the privileged state, where the loss does.
+        barlow_scale: Weight of the redundancy reduction, where the loss has it.
+        continuation: Whether predicted ends of episodes cut imagined returns.
         slow_critic_scale: Weight of the regularisation towards the slow critic.
         slow_critic_rate: Fraction by which the slow critic moves at each update.
         replay_value_scale: Weight of the critic's loss on replayed returns.
@@ -58,6 +62,10 @@ class LearnerConfig:
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0
+    kl_mode: str = "separate"
+    privileged_scale: float = 1.0
+    barlow_scale: float = 0.05
+    continuation: bool = True
     slow_critic_scale: float = 1.0
     slow_critic_rate: float = 0.02
     replay_value_scale: float = 0.3
@@ -76,19 +84,22 @@ class Agent(nn.Module):
 
     Args:
         size: Their widths.
-        action_dim: A.
+        interface: What the agent sees and does.
+        decode: Whether the world model has decoders of what is seen.
 
     Attributes:
+        interface: As given.
         world_model: Predicts.
         actor: Acts.
         critic: Judges; holds its slow copy.
     """
 
-    def __init__(self, size: ModelSize, action_dim: int) -> None:
+    def __init__(self, size: ModelSize, interface: Interface, decode: bool = True) -> None:
         super().__init__()
         head = (size.actor_critic_layers, size.units, size.norm)
-        self.world_model = WorldModel(size, action_dim)
-        self.actor = Actor(size.features, action_dim, *head)
+        self.interface = interface
+        self.world_model = WorldModel(size, interface, decode)
+        self.actor = Actor(size.features, interface.action_dim, *head)
         self.critic = Critic(size.features, *head, size.bins)
 
 
@@ -137,7 +148,7 @@ class DreamerLearner:
 
     Args:
         size: A ``ModelSize`` or its name.
-        action_dim: A.
+        interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
         config: Numbers of the learner.
         device: Where the networks live and updates run.
         seed: Seed of the initial weights; None takes them from the global generator. Later sampling always uses the
@@ -153,7 +164,7 @@ class DreamerLearner:
     def __init__(
         self,
         size: ModelSize | str,
-        action_dim: int = 4,
+        interface: Interface | None = None,
         config: LearnerConfig | None = None,
         device: torch.device | str = "cpu",
         seed: int | None = None,
@@ -164,18 +175,17 @@ class DreamerLearner:
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
                 torch.manual_seed(seed)
-            self.agent = Agent(self.size, action_dim).to(self.device)
-        self.losses = nn.ModuleDict(
-            {
-                "world_model": make_loss(WORLD_MODEL_LOSSES, self.config.world_model_loss, self.agent, self.config),
-                "actor": make_loss(ACTOR_LOSSES, self.config.actor_loss, self.agent, self.config),
-                "critic": make_loss(CRITIC_LOSSES, self.config.critic_loss, self.agent, self.config),
+            world_model_loss = find_loss(WORLD_MODEL_LOSSES, self.config.world_model_loss)
+            losses: dict[str, LossClass] = {
+                "world_model": world_model_loss,
+                "actor": find_loss(ACTOR_LOSSES, self.config.actor_loss),
+                "critic": find_loss(CRITIC_LOSSES, self.config.critic_loss),
             }
-        ).to(self.device)
-        self._networks = {
-            name: [parameter for parameter in network.parameters() if parameter.requires_grad]
-            for name, network in self.agent.named_children()
-        }
+            self.agent = Agent(self.size, interface or Interface(), world_model_loss.decodes).to(self.device)
+            self.losses = nn.ModuleDict(
+                {name: loss.from_config(self.agent, self.config) for name, loss in losses.items()}
+            ).to(self.device)
+        self._networks = self._trained_parameters()
         self.optimizer = OPTIMIZERS[self.config.optimizer](
             [parameter for parameters in self._networks.values() for parameter in parameters], self.config
         )
@@ -226,9 +236,14 @@ class DreamerLearner:
 
         Returns:
             Images uint8 ``(B, T, 64, 64, 3)``.
+
+        Raises:
+            ValueError: If the world model has no image decoder.
         """
-        pixels, action, is_init = (batch.get(key).to(self.device) for key in ("pixels", "previous_action", "is_init"))
-        return self.agent.world_model.open_loop(pixels, action, is_init.squeeze(-1), context)
+        batch = batch.to(self.device)
+        return self.agent.world_model.open_loop(
+            batch, batch.get("previous_action"), batch.get("is_init").squeeze(-1), context
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, but for the global random generators."""
@@ -252,6 +267,16 @@ class DreamerLearner:
             loss.load_state_dict(state_dict["losses"][name], strict=False)
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.updates = state_dict["updates"]
+
+    def _trained_parameters(self) -> dict[str, list[nn.Parameter]]:
+        """Return the parameters of each network, with those that its loss has of its own."""
+        networks = dict(self.agent.named_children())
+        shared = set(self.agent.parameters())
+        own = {name: [p for p in loss.parameters() if p not in shared] for name, loss in self.losses.items()}
+        return {
+            name: [p for p in (*network.parameters(), *own[name]) if p.requires_grad]
+            for name, network in networks.items()
+        }
 
     def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
         """Return the latents ``[N]`` to imagine from, with their ``terminated``."""

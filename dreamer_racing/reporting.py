@@ -107,6 +107,8 @@ def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_ste
     """
     assert trajectory.pixels is not None
     pixels = trajectory.pixels[:max_steps]
+    if learner.agent.world_model.decoder is None:
+        return pixels
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))[:max_steps]  # (K, A) the action that led here
     is_init = torch.zeros(len(pixels), 1, dtype=torch.bool)
     is_init[0] = True

@@ -27,7 +27,9 @@ from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
+from dreamer_racing.modules import Interface
 from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.reporting import EvaluationReport
 from dreamer_racing.timing import RunClock
@@ -120,15 +122,17 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
         "renderer": config.env.renderer,
         "camera": Camera(tilt=config.env.camera_tilt),
     }
-    learner = DreamerLearner(config.model.size, config=learner_config(config), device=config.device, seed=config.seed)
-    torch.manual_seed(config.seed)
     env = DroneRacingEnv(
         num_envs=config.env.num_envs,
         episode_steps=config.env.episode_steps,
-        privileged=False,
+        from_pixels=config.env.from_pixels,
+        privileged=find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).reads_privileged,
         seed=config.seed,
         **worlds,
     )
+    interface = Interface.of(env)
+    learner = DreamerLearner(config.model.size, interface, learner_config(config), config.device, config.seed)
+    torch.manual_seed(config.seed)
     policy = learner.policy()
     collector = Collector(
         TransformedEnv(env, Compose(InitTracker(), policy.make_primer())),
@@ -153,6 +157,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
         storage_device="cpu",
         seed=config.seed,
         transform=RelabelReward(curriculum) if config.curriculum.relabel else None,
+        observation_keys=interface.replay_keys,
     )
     print(f"replay: {config.replay.capacity:,} records, {replay_bytes(config.replay.capacity) / 1e9:.1f} GB when full")
     tracker = EpisodeTracker(config.env.num_envs, CrashCause)

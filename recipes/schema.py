@@ -15,6 +15,7 @@ class EnvConfig:
     num_envs: int = 32  # worlds flown side by side
     episode_steps: int = 1000  # control steps of 20 ms
     renderer: str = "auto"  # auto | egl | osmesa | warp
+    from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
     camera_tilt: float = 25.0  # degrees upwards
 
 
@@ -45,7 +46,12 @@ class LossConfig:
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0
-    replay_value_scale: float = 0.3
+    kl_mode: str = "separate"  # separate | per_latent
+    privileged_scale: float = 1.0  # of decoding the privileged state: losses informed and privileged
+    barlow_scale: float = 0.05  # of the redundancy reduction: loss decoder_free
+    continuation: bool = True  # predicted ends of episodes cut imagined returns
+    replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off
+    replay_value_gradient: bool = True  # whether that loss also trains the world model
 
 
 @dataclass

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss
+from dreamer_racing.losses import ACTOR_LOSSES, ReinforceLoss
 from dreamer_racing.modules import SIZES
 
 CONFIG = LearnerConfig(imagination_horizon=4, lr=1e-3, warmup_updates=0)
@@ -177,14 +177,14 @@ def test_policy_shares_the_parameters():
 
 
 def test_losses_are_chosen_by_name(monkeypatch):
-    class BoldActorLoss(ActorLoss):
+    class BoldActorLoss(ReinforceLoss):
         """Has ten times the entropy."""
 
         def forward(self, tensordict):
             self.entropy_scale = 3e-3
             return super().forward(tensordict)
 
-    monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss.from_config)
+    monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss)
     learner = DreamerLearner("debug", config=replace(CONFIG, actor_loss="bold"), seed=0)
     assert isinstance(learner.losses["actor"], BoldActorLoss)
     learner.update(make_batch())

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.race import RaceStep
 from dreamer_racing.envs.tracks import Track
@@ -24,7 +25,7 @@ class DroneRacingEnv(EnvBase):
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N; the batch size is [N].
         device: where tensors live; the simulation itself runs on CPU.
-        from_pixels: whether there are `pixels`.
+        from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and physics randomisation.
@@ -87,6 +88,8 @@ class DroneRacingEnv(EnvBase):
             observation["pixels"] = Bounded(
                 0, 255, (*n, camera.height, camera.width, 3), dtype=torch.uint8, device=self.device
             )
+        else:
+            observation["vector"] = number(RACE_VECTOR_SIZE)
         if self.privileged:
             observation["privileged"] = Composite(
                 position=number(3),
@@ -94,6 +97,7 @@ class DroneRacingEnv(EnvBase):
                 linear_velocity=number(3),
                 body_rates=number(3),
                 target_gate=number(1, dtype=torch.int64),
+                vector=number(RACE_VECTOR_SIZE),
                 shape=n,
                 device=self.device,
             )
@@ -138,8 +142,12 @@ class DroneRacingEnv(EnvBase):
                 self.batch_size,
                 device=self.device,
             )
+        vector = self.worlds.vector().to(self.device)
+        if not self.from_pixels:
+            data.set("vector", vector)
         if self.privileged:
             privileged = {name: value.to(self.device) for name, value in self.worlds.privileged().items()}
+            privileged["vector"] = vector
             data.set("privileged", TensorDict(privileged, self.batch_size, device=self.device))
         if self.from_pixels:
             data.set("pixels", self._pixels(mask).to(self.device))

@@ -6,6 +6,7 @@ The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: 
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.privileged import RaceVector
 from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
@@ -90,6 +91,7 @@ class RaceWorlds:
             control_dt=self.parameters.control_dt,
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
         )
+        self._vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = StartSampler(self.track, self._generator, self.device, self.dtype)
 
     def seed(self, seed: int | None) -> None:
@@ -140,6 +142,10 @@ class RaceWorlds:
             "body_rates": state.body_rates.float(),
             "target_gate": self.race.target_gate.unsqueeze(-1).clone(),
         }
+
+    def vector(self) -> Tensor:
+        """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
+        return self._vector(self.simulator.state, self.race.target_gate)
 
     def close(self) -> None:
         """Free rendering contexts and threads."""

@@ -1,60 +1,89 @@
 """Losses of the DreamerV3 learner, each a TorchRL ``LossModule`` that also works alone.
 
-A loss is chosen by name in ``LearnerConfig``. To add one, put a factory ``(agent, config) -> LossModule`` under a new
-name; it must read and write the keys that the class it replaces documents.
+A loss is chosen by name in ``LearnerConfig``. To add one, put a class with ``from_config(agent, config)`` under a new
+name; it must read and write the keys that the class it replaces documents. See ``docs/losses.md``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from torchrl.objectives import LossModule
 
-from dreamer_racing.losses.actor import ActorLoss
+from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
-from dreamer_racing.losses.world_model import WorldModelLoss, kl_losses
+from dreamer_racing.losses.representation import (
+    DecoderFreeLoss,
+    InformedLoss,
+    PrivilegedLoss,
+    ReconstructionLoss,
+    redundancy_reduction,
+)
+from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
 
 if TYPE_CHECKING:
     from dreamer_racing.learner import Agent, LearnerConfig
 
-LossFactory = Callable[["Agent", "LearnerConfig"], LossModule]
 
-WORLD_MODEL_LOSSES: dict[str, LossFactory] = {"reconstruction": WorldModelLoss.from_config}
-ACTOR_LOSSES: dict[str, LossFactory] = {"reinforce": ActorLoss.from_config}
-CRITIC_LOSSES: dict[str, LossFactory] = {"two_hot": CriticLoss.from_config}
+T = TypeVar("T")
 
 
-def make_loss(registry: dict[str, LossFactory], name: str, agent: Agent, config: LearnerConfig) -> LossModule:
-    """Make a registered loss.
+class LossClass(Protocol):
+    """A loss that a learner can make."""
+
+    def from_config(self, agent: Agent, config: LearnerConfig) -> LossModule:
+        """Make the loss of an agent with a learner's numbers."""
+        ...
+
+
+WORLD_MODEL_LOSSES: dict[str, type[WorldModelLoss]] = {
+    "reconstruction": ReconstructionLoss,
+    "informed": InformedLoss,
+    "privileged": PrivilegedLoss,
+    "decoder_free": DecoderFreeLoss,
+    "reward_only": WorldModelLoss,
+}
+ACTOR_LOSSES: dict[str, LossClass] = {"reinforce": ReinforceLoss, "dynamics": DynamicsActorLoss}
+CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
+
+
+def find_loss(registry: Mapping[str, T], name: str) -> T:
+    """Return the class registered under a name.
 
     Args:
         registry: ``WORLD_MODEL_LOSSES``, ``ACTOR_LOSSES`` or ``CRITIC_LOSSES``.
         name: Key of the registry.
-        agent: Networks.
-        config: Numbers.
 
     Raises:
         ValueError: If no loss has that name; the message lists those that exist.
     """
     if name not in registry:
         raise ValueError(f"Unknown loss {name!r}. Known here: {', '.join(registry)}.")
-    return registry[name](agent, config)
+    return registry[name]
 
 
 __all__ = [
     "ACTOR_LOSSES",
     "CRITIC_LOSSES",
+    "KL_MODES",
     "WORLD_MODEL_LOSSES",
     "ActorLoss",
     "CriticLoss",
+    "DecoderFreeLoss",
+    "DynamicsActorLoss",
     "Imagination",
-    "LossFactory",
+    "InformedLoss",
+    "LossClass",
+    "PrivilegedLoss",
+    "ReconstructionLoss",
+    "ReinforceLoss",
     "WorldModelLoss",
+    "find_loss",
     "imagine",
     "kl_losses",
     "lambda_return",
-    "make_loss",
+    "redundancy_reduction",
     "replay_return",
 ]

@@ -1,15 +1,17 @@
-"""Actor loss: REINFORCE on imagined λ-returns.
+"""Actor losses on imagined λ-returns: REINFORCE, or backpropagation through the dynamics.
 
 Shape legend: N starts, H horizon, D belief, S state, F = D + S features.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
@@ -22,13 +24,31 @@ if TYPE_CHECKING:
     from dreamer_racing.learner import Agent, LearnerConfig
 
 
-class ActorLoss(LossModule):
-    """Imagine from given latents and reinforce the actions that did better than the critic expected.
+class Judgement(NamedTuple):
+    """What world model and critic think of an imagined rollout; each ``(H, N, 1)`` but the scale.
 
-    ``−weight · (log π(a) · advantage / scale + entropy_scale · H[π])``, where scale is the moving range from the 5th to
-    the 95th percentile of returns, but at least 1. The weight of a step is the probability that the episode got that
-    far, discounted: it begins with the *true* continuation of the start (0 at a terminal record) and goes on with the
-    predicted ones.
+    Attributes:
+        reward: Predicted on arriving after each action.
+        continuation: Predicted probability that the episode goes on there.
+        lambda_return: From each step on.
+        value: Expected by the critic at each step.
+        weight: Discounted probability of getting to each step.
+        scale: Moving range of returns, a scalar.
+    """
+
+    reward: Tensor
+    continuation: Tensor
+    lambda_return: Tensor
+    value: Tensor
+    weight: Tensor
+    scale: Tensor
+
+
+class ActorLoss(LossModule):
+    """Imagine from given latents and judge the actions by λ-returns; what is maximised is a subclass's.
+
+    The weight of a step is the probability that the episode got that far, discounted: it begins with the *true*
+    continuation of the start (0 at a terminal record) and goes on with the predicted ones.
 
     Args:
         world_model: Dynamics, reward and continue heads; receives no gradient.
@@ -39,6 +59,7 @@ class ActorLoss(LossModule):
         lambda_: λ of the returns.
         entropy_scale: Weight of the entropy.
         return_decay: Decay of the moving percentiles.
+        continuation: Whether predicted ends of episodes cut returns; if not, imagination goes on for ever.
 
     Reads ``belief``, ``state`` and ``terminated`` of the starts, batch ``[N]`` (or any, which is flattened). Writes the
     scalars ``loss_actor``, ``entropy``, ``return_mean``, ``return_scale``, ``imagined_reward``, ``continuation`` (mean
@@ -70,6 +91,7 @@ class ActorLoss(LossModule):
         lambda_: float = 0.95,
         entropy_scale: float = 3e-4,
         return_decay: float = 0.99,
+        continuation: bool = True,
     ) -> None:
         super().__init__()
         self.world_model = world_model
@@ -79,10 +101,11 @@ class ActorLoss(LossModule):
         self.discount = discount
         self.lambda_ = lambda_
         self.entropy_scale = entropy_scale
+        self.continuation = continuation
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> ActorLoss:
+    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
         """Make the loss of an agent with a learner's numbers."""
         return cls(
             agent.world_model,
@@ -93,63 +116,113 @@ class ActorLoss(LossModule):
             lambda_=config.lambda_,
             entropy_scale=config.entropy_scale,
             return_decay=config.return_decay,
+            continuation=config.continuation,
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of imagining from a batch of starts; keys in the class's docstring."""
         belief, state, terminated = (tensordict.get(key).detach().flatten(0, -2) for key in self.in_keys)
-        features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
-        judged = self._judge(features, terminated)
-        policy = self.actor(features[:-1])
-        entropy = policy.entropy()
-        objective = policy.log_prob(action) * judged["advantage"] + self.entropy_scale * entropy
+        loss, judged = self._objective(belief, state, terminated)
         imagination = TensorDict(
-            {
-                "features": features[:-1],
-                "lambda_return": judged["lambda_return"],
-                "weight": judged["weight"],
-            },
-            [self.horizon, len(belief)],
+            {key: judged.pop(key) for key in ("features", "lambda_return", "weight")}, [self.horizon, len(belief)]
         )
-        return TensorDict(
-            {
-                "loss_actor": -(judged["weight"] * objective).mean(),
-                "entropy": entropy.detach().mean(),
-                "return_mean": judged["lambda_return"].mean(),
-                "return_scale": judged["return_scale"],
-                "imagined_reward": judged["reward"].mean(),
-                "continuation": judged["continuation"].mean(),
-                "imagination": imagination,
-            },
-            [],
-        )
+        return TensorDict({"loss_actor": loss, **judged, "imagination": imagination}, [])
 
-    @torch.no_grad()
-    def _judge(self, features: Tensor, terminated: Tensor) -> dict[str, Tensor]:
-        """Compute returns, advantages and weights of a rollout.
+    def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Imagine from starts ``(N, ...)``; return the loss and everything else that ``forward`` writes."""
+        raise NotImplementedError(f"{type(self).__name__} must say what it maximises.")
+
+    def _judge(self, features: Tensor, terminated: Tensor) -> Judgement:
+        """Compute returns and weights of a rollout, with the gradient of its features.
 
         Args:
             features: ``(H + 1, N, F)``.
             terminated: Whether each start is a terminal record, bool ``(N, 1)``.
-
-        Returns:
-            ``reward``, ``continuation``, ``lambda_return``, ``advantage`` (over the return scale) and ``weight``, each
-            ``(H, N, 1)``, and ``return_scale``, a scalar.
         """
         value = self.critic.value(features)
         reward = self.world_model.reward_head.mean(features[1:])
-        continuation = self.world_model.continue_head.probability(features[1:])
+        continuation = self._continuation(features[1:])
         discount = self.discount * continuation
         returns = lambda_return(reward, value[1:], discount, self.lambda_)
         start = 1.0 - terminated.to(discount.dtype).unsqueeze(0)
         if self.training:
-            self.return_normalizer.update(returns)
-        scale = self.return_normalizer.scale()
+            self.return_normalizer.update(returns.detach())
+        return Judgement(
+            reward=reward.detach(),
+            continuation=continuation.detach(),
+            lambda_return=returns,
+            value=value[:-1],
+            weight=torch.cat((start, discount[:-1].detach())).cumprod(0),
+            scale=self.return_normalizer.scale(),
+        )
+
+    def _continuation(self, features: Tensor) -> Tensor:
+        """Return the probability ``(..., 1)`` that the episode goes on after features ``(..., F)``."""
+        if not self.continuation:
+            return features.new_ones((*features.shape[:-1], 1), dtype=torch.float32)
+        return self.world_model.continue_head.probability(features)
+
+    def _report(self, features: Tensor, entropy: Tensor, judged: Judgement) -> dict[str, Tensor]:
+        """Return all that ``forward`` writes beside the loss."""
         return {
-            "reward": reward,
-            "continuation": continuation,
-            "lambda_return": returns,
-            "advantage": (returns - value[:-1]) / scale,
-            "weight": torch.cat((start, discount[:-1])).cumprod(0),
-            "return_scale": scale.squeeze(-1),
+            "entropy": entropy.detach().mean(),
+            "return_mean": judged.lambda_return.detach().mean(),
+            "return_scale": judged.scale.squeeze(-1),
+            "imagined_reward": judged.reward.mean(),
+            "continuation": judged.continuation.mean(),
+            "features": features[:-1].detach(),
+            "lambda_return": judged.lambda_return.detach(),
+            "weight": judged.weight,
         }
+
+
+class ReinforceLoss(ActorLoss):
+    """Reinforce the imagined actions that did better than the critic expected.
+
+    ``−weight · (log π(a) · advantage / scale + entropy_scale · H[π])``, where scale is the moving range from the 5th to
+    the 95th percentile of returns, but at least 1. Arguments and keys: ``ActorLoss``.
+    """
+
+    def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        with torch.no_grad():
+            features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+            judged = self._judge(features, terminated)
+        policy = self.actor(features[:-1])
+        entropy = policy.entropy()
+        advantage = (judged.lambda_return - judged.value) / judged.scale
+        objective = policy.log_prob(action) * advantage + self.entropy_scale * entropy
+        return -(judged.weight * objective).mean(), self._report(features, entropy, judged)
+
+
+class DynamicsActorLoss(ActorLoss):
+    """Climb the gradient of the λ-returns through the imagined dynamics.
+
+    ``−weight · (λ-return / scale + entropy_scale · H[π])``: straight-through samples carry the gradient from rewards
+    and values back to the actions. Networks other than the actor are left without gradient. Arguments and keys:
+    ``ActorLoss``.
+
+    Reference: DreamerV2, Eq. 6 (``ρ = 0``), the default of danijar/dreamerv2 and of dreamerv3-torch for continuous
+    actions; scaled by DreamerV3's return range.
+    """
+
+    def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        with frozen(self.world_model, self.critic):
+            features, _ = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+            judged = self._judge(features, terminated)
+        # The policy once more on fixed features: the entropy shall not pull the dynamics towards indecision.
+        entropy = self.actor(features[:-1].detach()).entropy()
+        objective = judged.lambda_return / judged.scale + self.entropy_scale * entropy
+        return -(judged.weight * objective).mean(), self._report(features, entropy, judged)
+
+
+@contextmanager
+def frozen(*modules: nn.Module) -> Iterator[None]:
+    """Let gradient flow through modules but not into their parameters."""
+    parameters = [p for module in modules for p in module.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)

@@ -27,11 +27,10 @@ class Imagination(NamedTuple):
     action: Tensor
 
 
-@torch.no_grad()
 def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
     """Let the policy act in the world model.
 
-    No graph is built: REINFORCE needs none.
+    Call it under ``torch.no_grad()`` where nothing shall flow back through the rollout, as with REINFORCE.
 
     Args:
         rssm: Dynamics.

@@ -2,9 +2,10 @@
 
 from dreamer_racing.modules.actor import ActionDistribution, Actor
 from dreamer_racing.modules.critic import Critic
-from dreamer_racing.modules.decoder import ImageDecoder
-from dreamer_racing.modules.encoder import ImageEncoder
+from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
+from dreamer_racing.modules.encoder import ImageEncoder, ObservationEncoder, VectorEncoder
 from dreamer_racing.modules.heads import MLP, ContinueHead, TwoHot, TwoHotHead, symexp, symlog
+from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, DenseGRUCell, Posterior
 from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
@@ -23,10 +24,14 @@ __all__ = [
     "DreamerPolicy",
     "ImageDecoder",
     "ImageEncoder",
+    "Interface",
     "ModelSize",
+    "ObservationEncoder",
     "Posterior",
     "TwoHot",
     "TwoHotHead",
+    "VectorDecoder",
+    "VectorEncoder",
     "WorldModel",
     "get_size",
     "join_features",

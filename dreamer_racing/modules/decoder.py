@@ -1,6 +1,6 @@
-"""Image decoder: belief and state to the mean of a 64×64 RGB image.
+"""Decoders: belief and state to the mean of a 64×64 RGB image, or of numbers.
 
-Shape legend: N any batch, C channels, F features, G blocks.
+Shape legend: N any batch, C channels, V numbers, F features, G blocks.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dreamer_racing.modules.encoder import IMAGE_SIZE, fold_patches, make_convolution, unfold_patches
+from dreamer_racing.modules.heads import MLP, symexp, symlog
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize_convolution, linear
 
 
@@ -152,3 +153,29 @@ class ImageDecoder(nn.Module):
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
             maps = convolution(F.silu(norm(maps)).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         return torch.sigmoid(maps)
+
+
+class VectorDecoder(nn.Module):
+    """Hidden layers to the symlog of numbers.
+
+    Args:
+        features: F.
+        outputs: V.
+        layers: Number of hidden layers.
+        units: Their width.
+        norm: ``"rms"`` or ``"layer"``.
+
+    Reference: danijar/dreamerv3, ``rssm.Decoder``: symlog squared error.
+    """
+
+    def __init__(self, features: int, outputs: int, layers: int = 3, units: int = 256, norm: str = "rms") -> None:
+        super().__init__()
+        self.mlp = MLP(features, outputs, layers, units, norm)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map features ``(..., F)`` to the numbers expected ``(..., V)``."""
+        return symexp(self.mlp(features).float())
+
+    def squared_error(self, features: Tensor, vector: Tensor) -> Tensor:
+        """Compare with true numbers ``(..., V)``: squared error of symlogs, summed over V, mean over the rest."""
+        return (self.mlp(features).float() - symlog(vector)).square().sum(-1).mean()

@@ -1,16 +1,21 @@
-"""Image encoder: 64×64 RGB to a flat embedding.
+"""Encoders: what the agent sees, images or numbers, to one flat embedding.
 
-Shape legend: N any batch, C channels, E embedding.
+Shape legend: N any batch, C channels, V numbers, E embedding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.layers import NORMS, initialize_convolution
+from dreamer_racing.modules.heads import symlog
+from dreamer_racing.modules.interface import PIXELS, VECTOR, Interface
+from dreamer_racing.modules.layers import NORMS, NormedLinear, initialize_convolution
+from dreamer_racing.modules.sizes import ModelSize
 
 IMAGE_SIZE = 64
 """Height and width of the images, pixels."""
@@ -100,3 +105,64 @@ class ImageEncoder(nn.Module):
             maps = self.pool(convolution(images.permute(0, 3, 1, 2)))
             images = F.silu(norm(maps.permute(0, 2, 3, 1)))
         return images.reshape(*batch, self.embedding_size)
+
+
+class VectorEncoder(nn.Module):
+    """Hidden layers on the symlog of numbers.
+
+    Args:
+        inputs: V.
+        layers: Number of hidden layers.
+        units: Their width, E.
+        norm: ``"rms"`` or ``"layer"``.
+
+    Reference: danijar/dreamerv3, ``rssm.Encoder``: symlog inputs, 3 layers.
+    """
+
+    def __init__(self, inputs: int, layers: int = 3, units: int = 256, norm: str = "rms") -> None:
+        super().__init__()
+        self.embedding_size = units
+        widths = [inputs] + [units] * layers
+        self.hidden = nn.Sequential(*(NormedLinear(before, after, norm) for before, after in pairwise(widths)))
+
+    def forward(self, vector: Tensor) -> Tensor:
+        """Map float32 ``(..., V)`` to ``(..., E)``."""
+        return self.hidden(symlog(vector))
+
+
+class ObservationEncoder(nn.Module):
+    """Everything that the agent sees, each part by its own encoder, side by side.
+
+    Args:
+        size: Widths.
+        interface: What the agent sees.
+
+    Attributes:
+        keys: What ``forward`` reads, images first.
+        embedding_size: E.
+    """
+
+    def __init__(self, size: ModelSize, interface: Interface) -> None:
+        super().__init__()
+        self.keys = interface.observation_keys
+        encoders: dict[str, ImageEncoder | VectorEncoder] = {}
+        if interface.pixels:
+            encoders[PIXELS] = ImageEncoder(
+                size.cnn_depth, size.cnn_multipliers, size.cnn_kernel, size.strided, size.norm, size.cnn_patch
+            )
+        if interface.vector_dim:
+            encoders[VECTOR] = VectorEncoder(interface.vector_dim, size.vector_layers, size.units, size.norm)
+        self.embedding_size = sum(encoder.embedding_size for encoder in encoders.values())
+        self.encoders = nn.ModuleDict(encoders)
+
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """Embed observations.
+
+        Args:
+            observation: The tensors under ``keys``, ``(..., *)``.
+
+        Returns:
+            float32 ``(..., E)``.
+        """
+        embeddings = [encoder(observation[key]) for key, encoder in self.encoders.items()]
+        return embeddings[0] if len(embeddings) == 1 else torch.cat(embeddings, -1)

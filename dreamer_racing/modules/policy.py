@@ -29,7 +29,7 @@ class DreamerPolicy(TensorDictModuleBase):
 
     | key | read / written | shape |
     |---|---|---|
-    | ``pixels`` | read | uint8 (N, 64, 64, 3) |
+    | ``pixels``, ``vector`` | read, what of them the agent sees | uint8 (N, 64, 64, 3), float32 (N, V) |
     | ``is_init`` | read | bool (N, 1) |
     | ``belief``, ``state``, ``previous_action`` | read | (N, D), (N, S), (N, A) |
     | ``action`` | written | (N, A) in [−1, 1] |
@@ -38,7 +38,7 @@ class DreamerPolicy(TensorDictModuleBase):
 
     def __init__(self, world_model: WorldModel, actor: Actor, deterministic: bool = False) -> None:
         super().__init__()
-        self.in_keys = ["pixels", "is_init", "belief", "state", "previous_action"]
+        self.in_keys = [*world_model.encoder.keys, "is_init", "belief", "state", "previous_action"]
         self.out_keys = ["action", ("next", "belief"), ("next", "state"), ("next", "previous_action")]
         self.encoder = world_model.encoder
         self.rssm = world_model.rssm
@@ -58,7 +58,7 @@ class DreamerPolicy(TensorDictModuleBase):
         batch = tensordict.batch_size
         flat = {key: tensordict.get(key).reshape(-1, *tensordict.get(key).shape[len(batch) :]) for key in self.in_keys}
         belief, state = self.rssm.observe_step(
-            self.encoder(flat["pixels"]),
+            self.encoder(flat),
             flat["previous_action"],
             flat["is_init"].flatten(),
             flat["belief"],

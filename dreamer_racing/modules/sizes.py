@@ -21,6 +21,7 @@ class ModelSize:
         prior_layers: Hidden layers from h to the prior's logits.
         head_layers: Hidden layers of the reward and continue heads.
         actor_critic_layers: Hidden layers of actor and critic.
+        vector_layers: Hidden layers, ``units`` wide, of the encoder and decoder of numbers.
         norm: ``"rms"`` or ``"layer"``; layer norm is much the cheaper on CPU.
         learned_initial: Whether an episode's first h is learned (2023) or zero (2025).
         cnn_depth: Channels of a convolution are ``cnn_depth * multiplier``.
@@ -44,6 +45,7 @@ class ModelSize:
     prior_layers: int = 2
     head_layers: int = 1
     actor_critic_layers: int = 3
+    vector_layers: int = 3
     norm: str = "rms"
     learned_initial: bool = False
     cnn_multipliers: tuple[int, ...] = (2, 3, 4, 4)
@@ -80,6 +82,7 @@ _CPU = ModelSize(
     blocks=1,
     prior_layers=1,
     actor_critic_layers=2,
+    vector_layers=2,
     norm="layer",
     cnn_multipliers=(1, 2, 4),
     cnn_kernel=4,
@@ -94,7 +97,7 @@ SIZES: dict[str, ModelSize] = {
     size.name: size
     for size in (
         replace(_CPU, name="debug", belief=32, hidden=16, latents=4, classes=4, units=16, cnn_depth=2,
-                actor_critic_layers=1),
+                actor_critic_layers=1, vector_layers=1),
         _CPU,
         _reference("size1m", 512, 64, 4),
         _reference("size12m", 2048, 256, 16),

@@ -1,16 +1,19 @@
-"""World model: encoder, RSSM, decoder, reward and continue heads.
+"""World model: encoder, RSSM, decoders, reward and continue heads.
 
-Shape legend: B batch, T time, A action, D belief, S state, F = D + S features.
+Shape legend: B batch, T time, A action, V numbers seen, D belief, S state, F = D + S features.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
-from dreamer_racing.modules.decoder import ImageDecoder
-from dreamer_racing.modules.encoder import ImageEncoder
+from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
+from dreamer_racing.modules.encoder import ObservationEncoder
 from dreamer_racing.modules.heads import ContinueHead, TwoHotHead
+from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
 
@@ -21,31 +24,34 @@ def join_features(belief: Tensor, state: Tensor) -> Tensor:
 
 
 class WorldModel(nn.Module):
-    """Everything that predicts: images, rewards, ends of episodes and the next state.
+    """Everything that predicts: observations, rewards, ends of episodes and the next state.
 
     Args:
         size: A ``ModelSize`` or its name.
-        action_dim: A.
+        interface: What the agent sees and does.
+        decode: Whether to have the decoders of what is seen; losses that decode nothing do without.
+
+    Attributes:
+        decoder: ``ImageDecoder``, or None.
+        vector_decoder: ``VectorDecoder`` of what is seen under ``"vector"``, or None.
 
     Example:
         >>> import torch
-        >>> world_model = WorldModel("debug", action_dim=4)
-        >>> pixels = torch.zeros(2, 3, 64, 64, 3, dtype=torch.uint8)
-        >>> posterior = world_model.observe(pixels, torch.zeros(2, 3, 4), torch.zeros(2, 3, dtype=torch.bool))
+        >>> world_model = WorldModel("debug")
+        >>> seen = {"pixels": torch.zeros(2, 3, 64, 64, 3, dtype=torch.uint8)}
+        >>> posterior = world_model.observe(seen, torch.zeros(2, 3, 4), torch.zeros(2, 3, dtype=torch.bool))
         >>> world_model.decoder(posterior.belief, posterior.state).shape
         torch.Size([2, 3, 64, 64, 3])
     """
 
-    def __init__(self, size: ModelSize | str, action_dim: int = 4) -> None:
+    def __init__(self, size: ModelSize | str, interface: Interface | None = None, decode: bool = True) -> None:
         super().__init__()
-        size = get_size(size)
-        self.size = size
-        self.encoder = ImageEncoder(
-            size.cnn_depth, size.cnn_multipliers, size.cnn_kernel, size.strided, size.norm, size.cnn_patch
-        )
+        size, interface = get_size(size), interface or Interface()
+        self.size, self.interface = size, interface
+        self.encoder = ObservationEncoder(size, interface)
         self.rssm = RSSM(
             self.encoder.embedding_size,
-            action_dim,
+            interface.action_dim,
             size.belief,
             size.latents,
             size.classes,
@@ -56,7 +62,18 @@ class WorldModel(nn.Module):
             norm=size.norm,
             learned_initial=size.learned_initial,
         )
-        self.decoder = ImageDecoder(
+        self.decoder = self._image_decoder() if decode and interface.pixels else None
+        self.vector_decoder = (
+            VectorDecoder(size.features, interface.vector_dim, size.vector_layers, size.units, size.norm)
+            if decode and interface.vector_dim
+            else None
+        )
+        self.reward_head = TwoHotHead(size.features, size.head_layers, size.units, size.norm, size.bins)
+        self.continue_head = ContinueHead(size.features, size.head_layers, size.units, size.norm)
+
+    def _image_decoder(self) -> ImageDecoder:
+        size = self.size
+        return ImageDecoder(
             size.belief,
             size.state,
             size.units,
@@ -68,16 +85,18 @@ class WorldModel(nn.Module):
             size.norm,
             size.cnn_patch,
         )
-        self.reward_head = TwoHotHead(size.features, size.head_layers, size.units, size.norm, size.bins)
-        self.continue_head = ContinueHead(size.features, size.head_layers, size.units, size.norm)
 
     def observe(
-        self, pixels: Tensor, previous_action: Tensor, is_init: Tensor, deterministic: bool = False
+        self,
+        observation: Mapping[str, Tensor],
+        previous_action: Tensor,
+        is_init: Tensor,
+        deterministic: bool = False,
     ) -> Posterior:
         """Encode and unroll a sequence of records.
 
         Args:
-            pixels: uint8 ``(B, T, 64, 64, 3)``.
+            observation: What was seen, by key: ``pixels`` uint8 ``(B, T, 64, 64, 3)``, ``vector`` ``(B, T, V)``.
             previous_action: ``(B, T, A)``.
             is_init: bool ``(B, T)``.
             deterministic: Take the posterior's mode instead of a sample.
@@ -85,16 +104,18 @@ class WorldModel(nn.Module):
         Returns:
             Belief, state and logits of every record.
         """
-        return self.rssm.observe(self.encoder(pixels), previous_action, is_init, deterministic=deterministic)
+        return self.rssm.observe(self.encoder(observation), previous_action, is_init, deterministic=deterministic)
 
     @torch.no_grad()
-    def open_loop(self, pixels: Tensor, previous_action: Tensor, is_init: Tensor, context: int) -> Tensor:
-        """Reconstruct the first records, then predict the others from their actions alone.
+    def open_loop(
+        self, observation: Mapping[str, Tensor], previous_action: Tensor, is_init: Tensor, context: int
+    ) -> Tensor:
+        """Reconstruct the images of the first records, then predict the others from their actions alone.
 
         Beyond the context nothing is observed: a reset there is not followed.
 
         Args:
-            pixels: uint8 ``(B, T, 64, 64, 3)``; only the first ``context`` records are read.
+            observation: As for ``observe``; only the first ``context`` records are read.
             previous_action: ``(B, T, A)``.
             is_init: bool ``(B, T)``.
             context: Number of records that are observed, at least 1.
@@ -103,15 +124,19 @@ class WorldModel(nn.Module):
             Images uint8 ``(B, T, 64, 64, 3)``.
 
         Raises:
-            ValueError: If ``context`` is not between 1 and T.
+            ValueError: If ``context`` is not between 1 and T, or if there is no image decoder.
         """
         time = previous_action.shape[1]
+        if self.decoder is None:
+            raise ValueError("open_loop: this world model has no image decoder, so its predictions cannot be seen.")
         if not 1 <= context <= time:
             raise ValueError(
                 f"open_loop: context must lie between 1 and the {time} records of the batch, got {context}"
             )
         seen = slice(0, context)
-        posterior = self.observe(pixels[:, seen], previous_action[:, seen], is_init[:, seen])
+        posterior = self.observe(
+            {key: observation[key][:, seen] for key in self.encoder.keys}, previous_action[:, seen], is_init[:, seen]
+        )
         beliefs, states = list(posterior.belief.unbind(1)), list(posterior.state.unbind(1))
         for action in previous_action[:, context:].unbind(1):
             belief, state = self.rssm.imagine_step(beliefs[-1], states[-1], action)

@@ -5,21 +5,22 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.learner import Agent
-from dreamer_racing.losses import ActorLoss
+from dreamer_racing.losses import ReinforceLoss
 from dreamer_racing.modules import SIZES
+from dreamer_racing.modules.interface import Interface
 
 
 def make_agent() -> Agent:
     torch.manual_seed(0)
-    agent = Agent(SIZES["debug"], action_dim=4)
+    agent = Agent(SIZES["debug"], Interface())
     with torch.no_grad():
         agent.world_model.reward_head.mlp.output.weight.normal_(std=0.01)
         agent.critic.head.mlp.output.weight.normal_(std=0.01)
     return agent
 
 
-def make_loss(agent: Agent, **options) -> ActorLoss:
-    return ActorLoss(agent.world_model, agent.actor, agent.critic, horizon=5, **options)
+def make_loss(agent: Agent, **options) -> ReinforceLoss:
+    return ReinforceLoss(agent.world_model, agent.actor, agent.critic, horizon=5, **options)
 
 
 def make_starts(count: int = 6, terminated: tuple[int, ...] = ()) -> TensorDict:
@@ -92,7 +93,7 @@ def test_return_scale_moves_towards_the_percentiles_and_is_at_least_one():
 
 def test_loss_is_minus_the_entropy_bonus_where_nothing_is_to_be_gained():
     torch.manual_seed(0)
-    agent = Agent(SIZES["debug"], action_dim=4)  # reward and critic are exactly zero
+    agent = Agent(SIZES["debug"], Interface())  # reward and critic are exactly zero
     always_continue(agent)
     losses = make_loss(agent, entropy_scale=0.5, discount=1.0)(make_starts())
     torch.testing.assert_close(losses["loss_actor"], -0.5 * losses["entropy"])
@@ -101,7 +102,7 @@ def test_loss_is_minus_the_entropy_bonus_where_nothing_is_to_be_gained():
 def test_reinforcing_moves_the_policy_to_the_rewarded_action():
     """With a reward that grows with the first action's mean effect, that mean rises."""
     torch.manual_seed(0)
-    agent = Agent(SIZES["debug"], action_dim=4)
+    agent = Agent(SIZES["debug"], Interface())
     always_continue(agent)
     # The reward head reads the belief's first unit, which here is the action's first dimension.
     agent.world_model.rssm.cell.project_action = lambda action: action

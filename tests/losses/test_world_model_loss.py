@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.losses import WorldModelLoss, kl_losses
+from dreamer_racing.losses import ReconstructionLoss, kl_losses
 from dreamer_racing.modules import WorldModel
 
 
@@ -78,9 +78,9 @@ def test_free_nats_bound_the_sum_over_latents():
 
 
 def test_losses_of_a_new_model():
-    world_model = WorldModel("debug", action_dim=4)
+    world_model = WorldModel("debug")
     batch = make_batch()
-    loss = WorldModelLoss(world_model)
+    loss = ReconstructionLoss(world_model)
     losses = loss(batch)
     assert set(loss.out_keys) == set(losses.keys())
     # Uniform over 255 bins, whatever the reward.
@@ -92,23 +92,23 @@ def test_losses_of_a_new_model():
 
 
 def test_continue_target_is_one_minus_terminated():
-    world_model = WorldModel("debug", action_dim=4)
+    world_model = WorldModel("debug")
     output = world_model.continue_head.mlp.output
     with torch.no_grad():
         output.weight.zero_()
         output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
     batch = make_batch()
     batch["truncated"][1, 1] = True
-    loss = WorldModelLoss(world_model)(batch)["loss_continue"]
+    loss = ReconstructionLoss(world_model)(batch)["loss_continue"]
     expected = -(7 * math.log(0.75) + 1 * math.log(0.25)) / 8
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_every_parameter_of_the_world_model_gets_a_gradient():
-    world_model = WorldModel("debug", action_dim=4)
+    world_model = WorldModel("debug")
     with torch.no_grad():
         world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
-    losses = WorldModelLoss(world_model, free_nats=0.0)(make_batch())
+    losses = ReconstructionLoss(world_model, free_nats=0.0)(make_batch())
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in world_model.named_parameters():
         assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name

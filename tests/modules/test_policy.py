@@ -6,6 +6,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.learner import Agent
+from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.sizes import SIZES
 
@@ -54,7 +55,7 @@ class NoiseEnv(EnvBase):
 
 def make_policy(deterministic: bool = False) -> tuple[Agent, DreamerPolicy]:
     torch.manual_seed(0)
-    agent = Agent(SIZES["debug"], action_dim=4)
+    agent = Agent(SIZES["debug"], Interface())
     with torch.no_grad():
         agent.actor.mlp.output.weight.mul_(200.0)  # so that actions differ from one another
     return agent, DreamerPolicy(agent.world_model, agent.actor, deterministic)
@@ -75,7 +76,7 @@ def test_collected_latents_equal_those_of_training():
     is_init = data["is_init"].squeeze(-1)
     assert data.batch_size == (3, 12)
     assert is_init.sum(-1).tolist() == [6, 4, 3]
-    posterior = agent.world_model.observe(data["pixels"], data["previous_action"], is_init, deterministic=True)
+    posterior = agent.world_model.observe(data, data["previous_action"], is_init, deterministic=True)
     torch.testing.assert_close(posterior.belief, data["next", "belief"])
     torch.testing.assert_close(posterior.state, data["next", "state"])
     follows = ~is_init[:, 1:]

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from dreamer_racing.learner import Agent
+from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.sizes import SIZES, get_size
 
 # Parameters in millions, counted in other implementations of the same architectures.
@@ -19,7 +20,7 @@ PARAMETERS = {
 @pytest.mark.parametrize("name", SIZES)
 def test_sizes_have_their_number_of_parameters(name):
     with torch.device("meta"):
-        agent = Agent(SIZES[name], action_dim=4)
+        agent = Agent(SIZES[name], Interface())
     count = sum(parameter.numel() for parameter in agent.parameters() if parameter.requires_grad)
     assert count / 1e6 == pytest.approx(PARAMETERS.get(name, count / 1e6), rel=0.01)
     assert get_size(name) is SIZES[name]

@@ -4,21 +4,22 @@ import torch
 from dreamer_racing.modules.world_model import WorldModel
 
 
-def make_records(batch: int = 2, time: int = 5) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def make_records(batch: int = 2, time: int = 5) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8)
-    return pixels, torch.rand(batch, time, 4) * 2 - 1, torch.zeros(batch, time, dtype=torch.bool)
+    return {"pixels": pixels}, torch.rand(batch, time, 4) * 2 - 1, torch.zeros(batch, time, dtype=torch.bool)
 
 
 def test_open_loop_never_sees_what_lies_beyond_its_context():
-    world_model = WorldModel("debug", action_dim=4)
-    pixels, action, is_init = make_records()
+    world_model = WorldModel("debug")
+    seen, action, is_init = make_records()
+    pixels = seen["pixels"]
     changed = pixels.clone()
     changed[:, 2:] = 0
     images = []
     for version in (pixels, changed):
         torch.manual_seed(1)
-        images.append(world_model.open_loop(version, action, is_init, context=2))
+        images.append(world_model.open_loop({"pixels": version}, action, is_init, context=2))
     assert images[0].shape == pixels.shape
     assert images[0].dtype == torch.uint8
     assert torch.equal(*images)
@@ -27,8 +28,8 @@ def test_open_loop_never_sees_what_lies_beyond_its_context():
 @pytest.mark.parametrize("context", [0, 6])
 def test_open_loop_refuses_a_context_outside_the_window(context):
     with pytest.raises(ValueError, match="context"):
-        WorldModel("debug", action_dim=4).open_loop(*make_records(), context=context)
+        WorldModel("debug").open_loop(*make_records(), context=context)
 
 
 def test_whole_window_may_be_context():
-    assert WorldModel("debug", action_dim=4).open_loop(*make_records(), context=5).shape == (2, 5, 64, 64, 3)
+    assert WorldModel("debug").open_loop(*make_records(), context=5).shape == (2, 5, 64, 64, 3)

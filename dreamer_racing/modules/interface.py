@@ -1,0 +1,64 @@
+"""What an agent sees and does: the widths that an environment fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tensordict.utils import NestedKey
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+PIXELS = "pixels"
+"""Key of the images that the agent sees, uint8 ``(..., 64, 64, 3)``."""
+VECTOR = "vector"
+"""Key of the numbers that the agent sees, float32 ``(..., V)``."""
+PRIVILEGED = ("privileged", "vector")
+"""Key of the numbers that only a loss sees, float32 ``(..., P)``."""
+
+
+@dataclass(frozen=True)
+class Interface:
+    """Observations and actions of an agent.
+
+    Attributes:
+        action_dim: A.
+        pixels: Whether the agent sees images under ``"pixels"``.
+        vector_dim: V, size of what it sees under ``"vector"``; 0 if nothing.
+        privileged_dim: P, size of what losses may use of ``("privileged", "vector")``; 0 if nothing.
+
+    Raises:
+        ValueError: If the agent would see nothing.
+    """
+
+    action_dim: int = 4
+    pixels: bool = True
+    vector_dim: int = 0
+    privileged_dim: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.pixels and not self.vector_dim:
+            raise ValueError("The agent sees nothing: the environment has neither 'pixels' nor 'vector'.")
+
+    @classmethod
+    def of(cls, env: EnvBase) -> Interface:
+        """Read the interface off an environment's specs.
+
+        Raises:
+            ValueError: If the environment has neither ``"pixels"`` nor ``"vector"``.
+        """
+        specs = env.observation_spec
+        keys = set(specs.keys(include_nested=True))
+        vector, privileged = (specs[key].shape[-1] if key in keys else 0 for key in (VECTOR, PRIVILEGED))
+        return cls(env.action_spec.shape[-1], PIXELS in keys, vector, privileged)
+
+    @property
+    def observation_keys(self) -> list[str]:
+        """Keys that the encoder reads."""
+        return [PIXELS] * self.pixels + [VECTOR] * bool(self.vector_dim)
+
+    @property
+    def replay_keys(self) -> list[NestedKey]:
+        """Keys of an observation that a replay must keep."""
+        return [*self.observation_keys, *([PRIVILEGED] if self.privileged_dim else [])]
