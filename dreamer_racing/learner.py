@@ -5,7 +5,8 @@ Shape legend: B batch, T time, A action.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -14,8 +15,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from dreamer_racing.acceleration import GraphedStep, Step
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossClass, find_loss
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
+from dreamer_racing.timing import Timer, untimed
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,13 @@ class LearnerConfig:
         slow_critic_rate: Fraction by which the slow critic moves at each update.
         replay_value_scale: Weight of the critic's loss on replayed returns.
         replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
+        compile: Compile the losses with ``torch.compile``; minutes at the first update.
+        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph.
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32.
         optimizer: Key of ``OPTIMIZERS``.
         lr: Learning rate; the reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
+        behavior_lr: Learning rate of actor and critic; None for the same. A lower one lets the world model get ahead of
+            the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
         warmup_updates: Updates over which the learning rate rises from zero.
         world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
 
@@ -70,9 +77,12 @@ class LearnerConfig:
     slow_critic_rate: float = 0.02
     replay_value_scale: float = 0.3
     replay_value_gradient: bool = True
+    compile: bool = False
+    cuda_graph: bool = False
     mixed_precision: bool = False
     optimizer: str = "laprop"
     lr: float = 4e-5
+    behavior_lr: float | None = None
     warmup_updates: int = 1000
     world_model_loss: str = "reconstruction"
     actor_loss: str = "reinforce"
@@ -103,15 +113,51 @@ class Agent(nn.Module):
         self.critic = Critic(size.features, *head, size.bins)
 
 
-def _laprop(parameters: Iterable[nn.Parameter], config: LearnerConfig) -> torch.optim.Optimizer:
+ParameterGroups = list[dict[str, Any]]
+"""Parameters with their learning rates: ``[{"params": [...], "lr": ...}, ...]``."""
+
+
+def _laprop(groups: ParameterGroups, config: LearnerConfig) -> torch.optim.Optimizer:
     """Make the 2025 reference's optimiser: LaProp with adaptive gradient clipping."""
     from torchrl.trainers.algorithms import DreamerV3Optimizer
 
-    return DreamerV3Optimizer(parameters, lr=config.lr, warmup_steps=config.warmup_updates)
+    return DreamerV3Optimizer(groups, lr=config.lr, warmup_steps=config.warmup_updates)
 
 
-OPTIMIZERS: dict[str, Callable[[Iterable[nn.Parameter], LearnerConfig], torch.optim.Optimizer]] = {"laprop": _laprop}
+OPTIMIZERS: dict[str, Callable[[ParameterGroups, LearnerConfig], torch.optim.Optimizer]] = {"laprop": _laprop}
 """Optimiser factories by the name in ``LearnerConfig``; those of your own must clip gradients themselves."""
+
+
+class NonFiniteLossError(RuntimeError):
+    """The loss became infinite or not a number.
+
+    Attributes:
+        batch: The batch that it happened with, ``[B, T]``.
+    """
+
+    def __init__(self, batch: TensorDictBase) -> None:
+        super().__init__("The loss is not finite: the learning rate may be too high, or a reward or observation is bad.")
+        self.batch = batch
+
+
+class FiniteGuard:
+    """Raises once a loss is not finite.
+
+    Args:
+        lag: Updates after which a loss is looked at: 0 at once, which waits for the device.
+    """
+
+    def __init__(self, lag: int) -> None:
+        self._lag = lag
+        self._pending: deque[tuple[Tensor, TensorDictBase]] = deque()
+
+    def check(self, loss: Tensor, batch: TensorDictBase) -> None:
+        """Take note of a scalar loss and its batch; raise ``NonFiniteLossError`` if one ``lag`` updates ago was bad."""
+        self._pending.append((loss.isfinite(), batch))
+        if len(self._pending) > self._lag:
+            finite, earlier = self._pending.popleft()
+            if not finite:
+                raise NonFiniteLossError(earlier)
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
@@ -186,37 +232,76 @@ class DreamerLearner:
                 {name: loss.from_config(self.agent, self.config) for name, loss in losses.items()}
             ).to(self.device)
         self._networks = self._trained_parameters()
-        self.optimizer = OPTIMIZERS[self.config.optimizer](
-            [parameter for parameters in self._networks.values() for parameter in parameters], self.config
-        )
+        self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
         self.updates = 0
+        self._timed: Timer = untimed
+        self._compute = self.compute_losses
+        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
+        self._step = self._make_step()
 
-    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make one gradient step of everything.
 
         Args:
-            batch: Replay records, batch size ``[B, T]``: ``pixels``, ``previous_action``, ``reward``, ``is_init``,
-                ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
+            batch: Replay records, batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``,
+                ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
+            timed: Context manager by activity (``world_model``, ``imagine``, ``optimise``), to measure the time spent
+                in each; tells them apart only on a CPU and without ``compile``.
 
         Returns:
             Scalar tensors on the device: every loss and metric of the three losses, ``gradient_norm/<network>`` (before
             clipping) and ``loss``. Reading one waits for the device; do it seldom.
+
+        Raises:
+            KeyError: If the batch lacks what a loss reads.
+            NonFiniteLossError: If the loss is not finite. On a CPU nothing has been changed by this batch; on a CUDA
+                device this is noticed two updates late, because waiting for the device would stall it.
         """
-        self.optimizer.zero_grad(set_to_none=True)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.mixed_precision):
-            metrics = self.compute_losses(batch.to(self.device))
-        total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
-        total.backward()
-        norms = {f"gradient_norm/{name}": _gradient_norm(parameters) for name, parameters in self._networks.items()}
-        self.optimizer.step()
-        self.agent.critic.update_slow(self.config.slow_critic_rate)
+        self._timed = timed
+        batch = batch.to(self.device, non_blocking=True)
+        metrics = self._step(batch)
+        self._guard.check(metrics["loss"], batch)
+        with timed("optimise"):
+            self.optimizer.step()
+            self.agent.critic.update_slow(self.config.slow_critic_rate)
+            if not self.config.cuda_graph:
+                self.optimizer.zero_grad(set_to_none=True)
         self.updates += 1
+        return metrics
+
+    def _make_step(self) -> Step:
+        """Return the function that computes gradients, as fast as the configuration allows."""
+        config, step = self.config, self._backward
+        if config.compile:
+            self._compute = torch.compile(self.compute_losses, dynamic=False)
+        if not config.cuda_graph:
+            return step
+        if self.device.type != "cuda":
+            raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
+        return GraphedStep(step, nn.ModuleList([self.agent, self.losses]))
+
+    def _backward(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Compute losses and gradients of a batch; return detached scalars."""
+        with torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self.config.mixed_precision, cache_enabled=False
+        ):
+            metrics = self._compute(batch)
+        total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
+        with self._timed("optimise"):
+            total.backward()
+            norms = {f"gradient_norm/{name}": _gradient_norm(parameters) for name, parameters in self._networks.items()}
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
 
     def compute_losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""
-        model: TensorDict = self.losses["world_model"](batch)
-        context = model.pop("replay_context")
+        with self._timed("world_model"):
+            model: TensorDict = self.losses["world_model"](batch)
+        with self._timed("imagine"):
+            behavior = self._behavior_losses(model.pop("replay_context"), batch)
+        return {key: value for part in (model, behavior) for key, value in part.items()}
+
+    def _behavior_losses(self, context: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Imagine from the latents of a batch and judge; losses and metrics of actor and critic."""
         imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
         imagination = imagined.pop("imagination")
         replay = batch.select("reward", "is_init", "terminated", "truncated")
@@ -225,7 +310,7 @@ class DreamerLearner:
             # Every record was a start: its first imagined return is a better value than the critic's.
             replay.set("bootstrap", imagination.get("lambda_return")[0].reshape(*batch.batch_size, 1))
         critic: TensorDict = self.losses["critic"](TensorDict({**replay, "imagination": imagination}, []))
-        return {key: value for part in (model, imagined, critic) for key, value in part.items()}
+        return {**imagined, **critic}
 
     def policy(self, deterministic: bool = False) -> DreamerPolicy:
         """Return the acting step, which shares this learner's parameters."""
@@ -278,6 +363,15 @@ class DreamerLearner:
             for name, network in networks.items()
         }
 
+    def _parameter_groups(self) -> ParameterGroups:
+        """Return the world model's parameters, and actor's and critic's, with their learning rates."""
+        networks, config = self._networks, self.config
+        behavior_lr = config.lr if config.behavior_lr is None else config.behavior_lr
+        return [
+            {"params": networks["world_model"], "lr": config.lr},
+            {"params": networks["actor"] + networks["critic"], "lr": behavior_lr},
+        ]
+
     def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
         """Return the latents ``[N]`` to imagine from, with their ``terminated``."""
         starts = TensorDict(
@@ -288,7 +382,8 @@ class DreamerLearner:
         count = self.config.imagination_starts
         if count is None:
             return starts
-        return starts[torch.randperm(len(starts), device=self.device)[:count]]
+        # Not randperm, which a CUDA graph cannot capture.
+        return starts[torch.rand(len(starts), device=self.device).topk(min(count, len(starts))).indices]
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

@@ -209,6 +209,7 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         imagination_horizon=model.imagination_horizon,
         imagination_starts=model.imagination_starts,
         lr=model.learning_rate,
+        behavior_lr=model.behavior_learning_rate,
         warmup_updates=model.warmup_updates,
         **{f"{part}_loss": name for part, name in names.items()},
         **loss,

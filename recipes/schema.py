@@ -28,6 +28,7 @@ class ModelConfig:
     batch_length: int = MISSING  # records in a window
     replay_ratio: float = MISSING  # records trained on per environment step
     learning_rate: float = MISSING
+    behavior_learning_rate: float | None = None  # of actor and critic; null: the same
     warmup_updates: int = MISSING  # over which the learning rate rises from zero
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.losses.imagination import imagine, lambda_return
 from dreamer_racing.modules.actor import Actor
 from dreamer_racing.modules.critic import Critic
@@ -121,6 +122,7 @@ class ActorLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of imagining from a batch of starts; keys in the class's docstring."""
+        require_keys(self, tensordict, self.in_keys)
         belief, state, terminated = (tensordict.get(key).detach().flatten(0, -2) for key in self.in_keys)
         loss, judged = self._objective(belief, state, terminated)
         imagination = TensorDict(

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.losses.imagination import lambda_return
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import join_features
@@ -114,6 +115,7 @@ class CriticLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the losses; keys in the class's docstring."""
+        require_keys(self, tensordict, self.in_keys)
         imagination = tensordict.get("imagination")
         returns = imagination.get("lambda_return")
         features = imagination.get("features")

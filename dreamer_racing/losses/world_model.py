@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules.rssm import Posterior, mix_uniform
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
@@ -134,6 +135,7 @@ class WorldModelLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the losses of a batch ``[B, T]``; keys in the class's docstring."""
+        require_keys(self, tensordict, self.in_keys)
         embedding = self.world_model.encoder(tensordict)
         posterior = self.world_model.rssm.observe(
             embedding, tensordict.get("previous_action"), tensordict.get("is_init").squeeze(-1)
