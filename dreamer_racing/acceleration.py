@@ -39,18 +39,17 @@ class GraphedStep:
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of its scalars."""
-        if self._graph is None:
-            self._capture(batch)
+        graph = self._graph or self._capture(batch)
         if batch.batch_size != self._batch.batch_size:
             raise ValueError(
                 f"The CUDA graph was captured for a batch of {list(self._batch.batch_size)}, got "
                 f"{list(batch.batch_size)}: keep the shape, or set cuda_graph=False."
             )
         self._batch.update_(batch)
-        self._graph.replay()
+        graph.replay()
         return dict(zip(self._names, torch.stack(self._scalars).unbind(0), strict=True))
 
-    def _capture(self, batch: TensorDictBase) -> None:
+    def _capture(self, batch: TensorDictBase) -> torch.cuda.CUDAGraph:
         self._batch = batch.clone()
         buffers = {name: buffer.clone() for name, buffer in self._module.named_buffers()}
         side = torch.cuda.Stream()
@@ -68,3 +67,4 @@ class GraphedStep:
             metrics = self._step(self._batch)
         self._names, self._scalars = list(metrics), [value.detach() for value in metrics.values()]
         self._graph = graph
+        return graph

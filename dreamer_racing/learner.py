@@ -136,7 +136,9 @@ class NonFiniteLossError(RuntimeError):
     """
 
     def __init__(self, batch: TensorDictBase) -> None:
-        super().__init__("The loss is not finite: the learning rate may be too high, or a reward or observation is bad.")
+        super().__init__(
+            "The loss is not finite: the learning rate may be too high, or a reward or observation is bad."
+        )
         self.batch = batch
 
 
@@ -269,6 +271,11 @@ class DreamerLearner:
         self.updates += 1
         return metrics
 
+    def autocast(self) -> torch.autocast:
+        """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
+        kind = self.device.type if torch.amp.is_autocast_available(self.device.type) else "cpu"  # meta has none
+        return torch.autocast(kind, torch.bfloat16, enabled=self.config.mixed_precision, cache_enabled=False)
+
     def _make_step(self) -> Step:
         """Return the function that computes gradients, as fast as the configuration allows."""
         config, step = self.config, self._backward
@@ -282,9 +289,7 @@ class DreamerLearner:
 
     def _backward(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
-        with torch.autocast(
-            self.device.type, torch.bfloat16, enabled=self.config.mixed_precision, cache_enabled=False
-        ):
+        with self.autocast():
             metrics = self._compute(batch)
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with self._timed("optimise"):
@@ -344,14 +349,28 @@ class DreamerLearner:
         """Restore what ``state_dict`` returned.
 
         Raises:
-            ValueError: If it is that of a model of another size.
+            ValueError: If it is that of a model of another size or of other losses; nothing is changed then.
         """
         check_size(state_dict["size"], self.size)
+        self._check_parts(state_dict)
         self.agent.load_state_dict(state_dict["agent"])
         for name, loss in self.losses.items():
             loss.load_state_dict(state_dict["losses"][name], strict=False)
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.updates = state_dict["updates"]
+
+    def _check_parts(self, saved: dict[str, Any]) -> None:
+        """Refuse networks or losses of other parameters than these."""
+        parts = {"networks": (self.agent.state_dict(), saved["agent"])}
+        parts |= {f"{name} loss": (_own_state(loss), saved["losses"][name]) for name, loss in self.losses.items()}
+        for part, (wanted, found) in parts.items():
+            lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
+            if lacking or surplus:
+                raise ValueError(
+                    f"The checkpoint's {part} has {', '.join(surplus[:2]) or 'nothing'} beyond this learner's, and "
+                    f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
+                    "environment of other observations. Choose those it was trained with."
+                )
 
     def _trained_parameters(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters of each network, with those that its loss has of its own."""

@@ -26,12 +26,15 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayB
 from torchrl.data.replay_buffers import RandomSampler, Storage, Writer
 from torchrl.envs.transforms import Transform
 
-_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
+RACE_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
+"""The reward of a race and the terms of which `RelabelReward` recomputes it."""
 _END_KEYS = ("terminated", "truncated")
 
 
 def records_from_rollout(
-    rollout: TensorDictBase, observation_keys: Sequence[NestedKey] = ("pixels",)
+    rollout: TensorDictBase,
+    observation_keys: Sequence[NestedKey] = ("pixels",),
+    reward_keys: Sequence[str] = RACE_REWARD_KEYS,
 ) -> TensorDictBase:
     """Converts what a TorchRL collector yields into replay records.
 
@@ -41,8 +44,9 @@ def records_from_rollout(
     Args:
         rollout: batch ``[N, T]`` (further leading dimensions, as of a multi-process collector, are flattened into N)
             with root keys ``action``, ``is_init`` and the observations, and ``("next", ...)`` keys of the
-            observations, ``reward``, ``reward_base``, ``body_rate_norm``, ``terminated``, ``truncated``.
+            observations, the rewards, ``terminated``, ``truncated``.
         observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
 
     Returns:
         Records, batch ``[M]`` with M = N·T + number of first observations, first all arrivals, then all first
@@ -53,7 +57,7 @@ def records_from_rollout(
         KeyError: if the rollout lacks a key.
         ValueError: if the rollout has no time dimension.
     """
-    _check_rollout(rollout, observation_keys)
+    _check_rollout(rollout, observation_keys, reward_keys)
     steps = rollout.shape[-1]
     flat = rollout.reshape(-1)  # [N·T], environment by environment
     is_init = flat["is_init"].reshape(-1)
@@ -64,21 +68,21 @@ def records_from_rollout(
     before = torch.nn.functional.pad(count[steps - 1 :: steps], (1, 0))[stream]  # (N·T,)
     order = count - before - 1
 
-    arrival = flat["next"].select(*observation_keys, *_REWARD_KEYS, *_END_KEYS)
+    arrival = flat["next"].select(*observation_keys, *reward_keys, *_END_KEYS)
     arrival.update({"previous_action": flat["action"], "is_init": torch.zeros_like(flat["is_init"])})
     arrival.update({"stream": stream, "order": order})
     initial = flat.select(*observation_keys)[first]
-    zeros = arrival.select("previous_action", *_REWARD_KEYS, *_END_KEYS)[: len(first)]
+    zeros = arrival.select("previous_action", *reward_keys, *_END_KEYS)[: len(first)]
     initial.update(zeros.apply(torch.zeros_like))
     initial.update({"is_init": flat["is_init"][first], "stream": stream[first], "order": order[first] - 1})
     return torch.cat([arrival, initial])
 
 
-def _check_rollout(rollout: TensorDictBase, observation_keys: Sequence[NestedKey]) -> None:
+def _check_rollout(rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str]) -> None:
     if rollout.ndim < 2:
         raise ValueError(f"Expected a rollout of batch [environments, time], got batch {list(rollout.shape)}.")
     root = [*observation_keys, "action", "is_init"]
-    arrived = [*observation_keys, *_REWARD_KEYS, *_END_KEYS]
+    arrived = [*observation_keys, *reward_keys, *_END_KEYS]
     missing = [key for key in root if rollout.get(key, None) is None]
     missing += [("next", key) for key in arrived if rollout["next"].get(key, None) is None]
     if missing:
@@ -251,17 +255,31 @@ class StreamWriter(Writer):
 
 
 class StreamSampler(RandomSampler):
-    """Draws windows of T consecutive records inside one stream, uniformly over all such windows.
+    """Draws windows of T consecutive records inside one stream, uniformly over all such windows or the newest of them.
 
     Args:
         writer: whose streams are sampled.
         batch_length: T.
+        recent_share: share of a batch's windows that lie in the newest records of their streams.
+        recent_length: how many records of each stream those are, at least T.
+        held_out: the last streams are never sampled.
     """
 
-    def __init__(self, writer: StreamWriter, batch_length: int) -> None:
+    def __init__(
+        self,
+        writer: StreamWriter,
+        batch_length: int,
+        recent_share: float = 0.0,
+        recent_length: int | None = None,
+        held_out: int = 0,
+    ) -> None:
         super().__init__()
         self.writer = writer
         self.batch_length = batch_length
+        self.recent_share = recent_share
+        self.recent_length = max(batch_length, recent_length or writer.stream_length)
+        self._held_out = torch.arange(writer.num_streams) >= writer.num_streams - held_out  # (N,)
+        self._held_out_rng = torch.Generator().manual_seed(0)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
         """Returns the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and an empty dictionary.
@@ -269,26 +287,39 @@ class StreamSampler(RandomSampler):
         Raises:
             RuntimeError: if no stream holds T records yet.
         """
-        writer, length = self.writer, self.batch_length
-        ends = self._windows().cumsum(0)  # (N,) windows in the streams up to each
-        total = int(ends[-1])
-        if total == 0:
+        filled = self.writer.filled.masked_fill(self._held_out, 0)  # (N,)
+        if not self._sampleable_count(storage, batch_size):
             raise RuntimeError(
-                f"The replay cannot be sampled yet: a window needs batch_length={length} consecutive records and the "
-                f"longest stream holds {int(writer.filled.max())}. Collect more steps before the first update."
+                f"The replay cannot be sampled yet: a window needs batch_length={self.batch_length} consecutive "
+                f"records and the longest stream holds {int(filled.max())}. Collect more steps before the first update."
             )
-        window = torch.randint(total, (batch_size,), generator=self._rng)  # (B,)
-        stream = torch.searchsorted(ends, window, right=True)
-        oldest = writer.cursor[stream] - writer.filled[stream]
-        start = oldest + window - (ends - self._windows())[stream]
-        position = (start.unsqueeze(-1) + torch.arange(length)) % writer.stream_length  # (B, T)
-        return stream.unsqueeze(-1) * writer.stream_length + position, {}
+        recent = round(self.recent_share * batch_size)
+        slots = [self._draw(batch_size - recent, self.batch_length, filled, self._rng)]
+        if recent:
+            slots.append(self._draw(recent, self.batch_length, filled.clamp(max=self.recent_length), self._rng))
+        return torch.cat(slots), {}
 
-    def _windows(self) -> Tensor:
-        return (self.writer.filled - self.batch_length + 1).clamp(min=0)  # (N,)
+    def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
+        """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`."""
+        reach = self.writer.filled.masked_fill(~self._held_out, 0).clamp(max=recent)
+        if int(reach.max()) < length:
+            return None
+        return self._draw(num_windows, length, reach, self._held_out_rng)
+
+    def _draw(self, count: int, length: int, reach: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Slots ``(count, length)`` of windows in the newest ``reach`` records ``(N,)`` of the streams."""
+        writer = self.writer
+        windows = (reach - length + 1).clamp(min=0)  # (N,)
+        ends = windows.cumsum(0)  # (N,) windows in the streams up to each
+        window = torch.randint(int(ends[-1]), (count,), generator=generator)
+        stream = torch.searchsorted(ends, window, right=True)
+        start = writer.cursor[stream] - reach[stream] + window - (ends - windows)[stream]
+        position = (start.unsqueeze(-1) + torch.arange(length)) % writer.stream_length  # (count, T)
+        return stream.unsqueeze(-1) * writer.stream_length + position
 
     def _sampleable_count(self, storage: Storage, batch_size: int) -> int:
-        return int(self._windows().sum())
+        windows = (self.writer.filled - self.batch_length + 1).clamp(min=0)  # (N,)
+        return int(windows.masked_fill(self._held_out, 0).sum())
 
 
 class StreamReplay(TensorDictReplayBuffer):
@@ -298,20 +329,42 @@ class StreamReplay(TensorDictReplayBuffer):
 
     Args:
         observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
         **kwargs: of `TensorDictReplayBuffer`.
     """
 
     _storage: _RecordAccess
     _writer: StreamWriter
+    _sampler: StreamSampler
     _rng: torch.Generator
 
-    def __init__(self, *, observation_keys: Sequence[NestedKey] = ("pixels",), **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *,
+        observation_keys: Sequence[NestedKey] = ("pixels",),
+        reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(**kwargs)
         self.observation_keys = tuple(observation_keys)
+        self.reward_keys = tuple(reward_keys)
 
     def extend(self, rollout: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Appends a collector's rollout ``[N, T]``; see `records_from_rollout`. Returns the slots, int64 ``(M,)``."""
-        return super().extend(records_from_rollout(rollout, self.observation_keys), update_priority=update_priority)
+        records = records_from_rollout(rollout, self.observation_keys, self.reward_keys)
+        return super().extend(records, update_priority=update_priority)
+
+    def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
+        """Returns windows ``[num_windows, length]`` of records that are never sampled, delivered as samples are.
+
+        They are drawn from the newest ``recent`` records of the streams that are held out, with a generator of their
+        own. None if there are no such streams, or if those are too short yet.
+        """
+        slots = self._sampler.held_out(num_windows, length, recent)
+        if slots is None:
+            return None
+        records = self._storage.get(slots)
+        return self._transform(records) if self._transform is not None and len(self._transform) else records
 
     def records(self, stream: int) -> TensorDictBase:
         """Returns all records of one stream, oldest first, untransformed, batch ``[filled]``."""
@@ -369,10 +422,19 @@ class StreamReplay(TensorDictReplayBuffer):
         return saved
 
 
-def replay_bytes(capacity: int, image_shape: Sequence[int] = (64, 64, 3), action_size: int = 4) -> int:
-    """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64)."""
+def replay_bytes(
+    capacity: int, image_shape: Sequence[int] = (64, 64, 3), action_size: int = 4, numbers: int = 0
+) -> int:
+    """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
+
+    Args:
+        capacity: records.
+        image_shape: of ``pixels``.
+        action_size: A.
+        numbers: float32 observed beside the image: ``vector`` and the privileged one.
+    """
     flags = 1 + len(_END_KEYS)
-    return capacity * (math.prod(image_shape) + 4 * (action_size + len(_REWARD_KEYS)) + flags)
+    return capacity * (math.prod(image_shape) + 4 * (action_size + len(RACE_REWARD_KEYS) + numbers) + flags)
 
 
 def make_replay(
@@ -388,6 +450,11 @@ def make_replay(
     seed: int = 0,
     transform: Transform | None = None,
     observation_keys: Sequence[NestedKey] = ("pixels",),
+    reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+    recent_share: float = 0.0,
+    recent_records: int | None = None,
+    held_out: int = 0,
+    prefetch: int | None = None,
 ) -> StreamReplay:
     """Builds the replay of N streams.
 
@@ -403,15 +470,26 @@ def make_replay(
         seed: of the sampler's own generator.
         transform: applied to samples, for example `RelabelReward`.
         observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
+        recent_share: share of a sample's windows drawn from the newest records, so that the model soon knows where the
+            policy has come to; the others are drawn from all. Reference: danijar/dreamerv3, ``replay.fracs.recency``.
+        recent_records: how many records in all those are; all if None.
+        held_out: the last streams are kept out of samples, for `StreamReplay.held_out`.
+        prefetch: samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the newest
+            records, and a restored replay then does not continue the same samples.
 
     Raises:
-        ValueError: if a stream could not hold one window.
+        ValueError: if a stream could not hold one window, ``recent_share`` is not a share, or all streams are held out.
 
     Example:
         >>> replay = make_replay(capacity=100_000, num_envs=16, batch_size=16, batch_length=64)
         >>> replay.batch_size, len(replay)
         (16, 0)
     """
+    if not 0.0 <= recent_share <= 1.0:
+        raise ValueError(f"recent_share={recent_share}: a share lies between 0 and 1.")
+    if not 0 <= held_out < num_envs:
+        raise ValueError(f"held_out={held_out} of num_envs={num_envs} streams: at least one must be left to sample.")
     stream_length = capacity // num_envs
     if stream_length < batch_length:
         raise ValueError(
@@ -427,12 +505,18 @@ def make_replay(
     replay = StreamReplay(
         storage=records,
         writer=writer,
-        sampler=StreamSampler(writer, batch_length),
+        sampler=StreamSampler(
+            writer, batch_length, recent_share, recent_records and recent_records // num_envs, held_out
+        ),
         generator=torch.Generator().manual_seed(seed),
         transform=transform,
         batch_size=batch_size,
         observation_keys=observation_keys,
+        reward_keys=reward_keys,
+        prefetch=prefetch,
+        # Copies from pinned memory do not wait for the device.
+        pin_memory=torch.device(device).type == "cuda" and records.device.type == "cpu",
     )
     if records.device != torch.empty((), device=device).device:
-        replay.append_transform(lambda sample: sample.to(device))
+        replay.append_transform(lambda sample: sample.to(device, non_blocking=True))
     return replay

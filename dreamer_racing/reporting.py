@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
@@ -79,17 +79,94 @@ class EvaluationReport:
         return self._policy(tensordict.to(self._learner.device)).to("cpu")
 
     def write(self, name: str, result: Evaluation) -> None:
-        """Write `evaluations/<name>.json`, `plots/<name>.png` and `videos/<name>.mp4`."""
+        """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`."""
         for folder in ("evaluations", "plots", "videos"):
             (self.directory / folder).mkdir(parents=True, exist_ok=True)
         (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
         plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
+        if trajectory.pixels is None:
+            return
         frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
         write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
     def close(self) -> None:
         """Free the evaluation's simulator."""
+        self._env.close(raise_if_closed=False)
+
+
+class ReturnReport:
+    """Evaluates a learner's policy in any environment by its returns, and films one episode.
+
+    Args:
+        directory: of the run; files go to its `videos` and `evaluations` folders.
+        learner: whose policy acts.
+        env: batch size [N], with `pixels` or `vector`.
+        episodes: episodes of an evaluation, dealt to the N worlds beforehand.
+        video_steps: steps that the video shows at most.
+    """
+
+    def __init__(
+        self, directory: str | Path, learner: DreamerLearner, env: EnvBase, episodes: int, video_steps: int = 500
+    ) -> None:
+        self.directory = Path(directory)
+        self.episodes = episodes
+        self.video_steps = video_steps
+        self._learner = learner
+        self._policy = learner.policy()
+        self._env = TransformedEnv(env, Compose(InitTracker(), self._policy.make_primer()))
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+
+        Returns:
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+        """
+        metrics: dict[str, float] = {}
+        for suffix in ("", "_stochastic") if stochastic else ("",):
+            self._policy.deterministic = not suffix
+            returns, lengths, frames = self._act()
+            numbers = {
+                "num_episodes": float(len(returns)),
+                "return_mean": returns.mean().item(),
+                "return_std": returns.std(correction=0).item(),
+                "episode_length": lengths.mean().item(),
+            }
+            self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
+            metrics |= {f"evaluation{suffix}/{name}": value for name, value in numbers.items()}
+        return metrics
+
+    @torch.no_grad()
+    def _act(self) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Return the episodes' returns and lengths ``(episodes,)`` and the images of world 0's first episode."""
+        num_envs = self._env.batch_size[0]
+        left = torch.tensor([self.episodes // num_envs + (i < self.episodes % num_envs) for i in range(num_envs)])
+        total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
+        returns, lengths, frames, filming = [], [], [], True
+        tensordict = self._env.reset()
+        while (left > 0).any():
+            if filming and "pixels" in tensordict:
+                frames.append(tensordict["pixels"][0].clone())
+            acted = self._policy(tensordict.to(self._learner.device)).to("cpu")
+            step, tensordict = self._env.step_and_maybe_reset(acted)
+            total, length = total + step["next", "reward"].view(-1), length + 1
+            done = step["next", "done"].view(-1)
+            counted = done & (left > 0)
+            returns.append(total[counted])
+            lengths.append(length[counted])
+            left, total, length = left - counted.long(), total.masked_fill(done, 0), length.masked_fill(done, 0)
+            filming = filming and not done[0] and len(frames) < self.video_steps
+        return torch.cat(returns), torch.cat(lengths), frames
+
+    def _write(self, name: str, numbers: dict[str, Any], frames: list[Tensor]) -> None:
+        for folder in ("evaluations", "videos"):
+            (self.directory / folder).mkdir(parents=True, exist_ok=True)
+        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(numbers, indent=2))
+        if frames:
+            write_video(self.directory / "videos" / f"{name}.mp4", torch.stack(frames), fps=30)
+
+    def close(self) -> None:
+        """Free the evaluation's simulators."""
         self._env.close(raise_if_closed=False)
 
 

@@ -3,36 +3,52 @@
     python recipes/dreamer_v3.py track=kidney
     python recipes/dreamer_v3.py track=figure8 env=faithful model=size12m total_env_steps=2000000
     python recipes/dreamer_v3.py resume=runs/dreamer_v3_kidney_20260101-120000
+    python recipes/dreamer_v3.py env=dmc task=cartpole_swingup
 
 Everything of a run lands in its run directory: checkpoints/, metrics.csv, tensorboard/, videos/, plots/, config.yaml.
 """
 
+import random
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
+import numpy as np
 import torch
+from arena import (
+    Environment,
+    Report,
+    crash_causes,
+    is_race,
+    learner_config,
+    make_env,
+    make_report,
+    reward_terms,
+    scene_name,
+)
 from command_line import CONFIG_DIR, choose_device, merge_overrides, new_run_dir, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from schema import DreamerConfig, register
+from schema import Collection, DreamerConfig, Storage, register
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from tqdm import tqdm
 
-from dreamer_racing.checkpoint import GracefulExit, RunCheckpoints, ensure_writable, latest_checkpoint
+from dreamer_racing.checkpoint import CollectorState, GracefulExit, RunCheckpoints, ensure_writable, latest_checkpoint
+from dreamer_racing.collection import OverlappedRollouts, acting_copy
+from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
-from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.scene import Camera
-from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.learner import DreamerLearner, NonFiniteLossError
+from dreamer_racing.memory import available_memory, check_fits, out_of_memory_advice
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
-from dreamer_racing.modules import Interface
+from dreamer_racing.modules import DreamerPolicy, Interface
 from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
-from dreamer_racing.reporting import EvaluationReport
 from dreamer_racing.timing import RunClock
+
+HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
 
@@ -43,13 +59,14 @@ class Run:
 
     config: DreamerConfig
     directory: Path
-    env: DroneRacingEnv
+    env: Environment
     collector: Collector
+    rollouts: Iterator[TensorDictBase]
     tracker: EpisodeTracker
-    curriculum: BodyRateCurriculum
+    curriculum: BodyRateCurriculum | None
     replay: StreamReplay
     learner: DreamerLearner
-    report: EvaluationReport
+    report: Report
     metrics: MetricsLog
     checkpoints: RunCheckpoints
     counters: dict[str, int]  # env_steps, updates, episodes
@@ -58,12 +75,20 @@ class Run:
     @property
     def updates_due(self) -> int:
         """Updates that the replay ratio still owes for the environment steps made since the prefill."""
-        model, steps = self.config.model, self.counters["env_steps"] - self.config.prefill
-        per_step = model.replay_ratio / (model.batch_size * model.batch_length)
-        return max(0, int(steps * per_step) - self.counters["updates"])
+        return max(0, updates_in(self.config, self.counters["env_steps"]) - self.counters["updates"])
+
+    @property
+    def last_good(self) -> str:
+        """Which checkpoint is left when training breaks off."""
+        try:
+            return f"the last good checkpoint is {latest_checkpoint(self.directory)}"
+        except FileNotFoundError:
+            return "there is no checkpoint yet"
 
     def close(self) -> None:
         """Free simulators and files."""
+        if isinstance(self.rollouts, OverlappedRollouts):
+            self.rollouts.close()
         self.collector.shutdown()
         self.report.close()
         self.metrics.close()
@@ -81,6 +106,15 @@ def main(config: DictConfig) -> None:
         run = build(cast(DreamerConfig, OmegaConf.to_object(resolve(config))), overrides)
     try:
         train(run)
+    except NonFiniteLossError as error:
+        torch.save(error.batch.to("cpu").to_dict(), run.directory / "nonfinite_batch.pt")
+        raise SystemExit(
+            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
+            f"kept in {run.directory / 'nonfinite_batch.pt'}; {run.last_good}. Continue from there with a lower "
+            "model.learning_rate, or model.mixed_precision=false."
+        ) from error
+    except torch.OutOfMemoryError as error:
+        raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
 
@@ -108,74 +142,70 @@ def resolve(config: DictConfig) -> DictConfig:
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
     if config.run_dir is None:
-        config.run_dir = str(new_run_dir("dreamer_v3", config.track))
+        config.run_dir = str(new_run_dir("dreamer_v3", scene_name(cast(DreamerConfig, config))))
+    if config.env.num_envs == 1 and config.replay.held_out:
+        print("held out: nothing, because there is a single world (replay.held_out=0)")
+        config.replay.held_out = 0
     return config
+
+
+def updates_in(config: DreamerConfig, env_steps: int) -> int:
+    """Updates that the replay ratio asks for in a run of so many env_steps."""
+    model = config.model
+    return max(0, int((env_steps - config.prefill) * model.replay_ratio / (model.batch_size * model.batch_length)))
+
+
+def check(config: DreamerConfig) -> None:
+    """Refuse settings with which a run could not learn.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    model = config.model
+    if model.replay_ratio <= 0:
+        raise ValueError(f"model.replay_ratio={model.replay_ratio}: records trained on per environment step, above 0.")
+    prefilled = config.prefill // config.env.num_envs
+    if prefilled < model.batch_length:
+        raise ValueError(
+            f"prefill={config.prefill} gives each of env.num_envs={config.env.num_envs} worlds {prefilled} records, "
+            f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
+            f"{config.env.num_envs * model.batch_length}."
+        )
+    if not updates_in(config, config.total_env_steps):
+        raise ValueError(
+            f"model.replay_ratio={model.replay_ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
+            f"prefill={config.prefill:,} asks for no whole update of {model.batch_size * model.batch_length} records. "
+            "Raise total_env_steps or the ratio, or lower the prefill."
+        )
 
 
 def build(config: DreamerConfig, overrides: list[str]) -> Run:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     assert config.run_dir is not None, "resolve() names it"
+    check(config)
     directory = ensure_writable(config.run_dir)
-    worlds: dict[str, Any] = {
-        "track": config.track,
-        "preset": config.env.preset,
-        "renderer": config.env.renderer,
-        "camera": Camera(tilt=config.env.camera_tilt),
-    }
-    env = DroneRacingEnv(
-        num_envs=config.env.num_envs,
-        episode_steps=config.env.episode_steps,
-        from_pixels=config.env.from_pixels,
-        privileged=find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).reads_privileged,
-        seed=config.seed,
-        **worlds,
-    )
+    env = make_env(config)
     interface = Interface.of(env)
     learner = DreamerLearner(config.model.size, interface, learner_config(config), config.device, config.seed)
-    torch.manual_seed(config.seed)
+    seed_generators(config.seed)
     policy = learner.policy()
-    collector = Collector(
-        TransformedEnv(env, Compose(InitTracker(), policy.make_primer())),
-        policy,
-        frames_per_batch=config.env.num_envs * config.rollout_steps,
-        total_frames=-1,
-        env_device="cpu",
-        policy_device=config.device,
-        storing_device="cpu",
-        no_cuda_sync=False,
-    )
-    curriculum = BodyRateCurriculum(
-        **{name: value for name, value in asdict(config.curriculum).items() if name != "relabel"}
-    )
-    replay = make_replay(
-        config.replay.capacity,
-        config.env.num_envs,
-        config.model.batch_size,
-        config.model.batch_length,
-        config.device,
-        storage=config.replay.storage.value,
-        storage_device="cpu",
-        seed=config.seed,
-        transform=RelabelReward(curriculum) if config.curriculum.relabel else None,
-        observation_keys=interface.replay_keys,
-    )
-    print(f"replay: {config.replay.capacity:,} records, {replay_bytes(config.replay.capacity) / 1e9:.1f} GB when full")
-    tracker = EpisodeTracker(config.env.num_envs, CrashCause)
+    overlapped = config.collection is Collection.overlapped
+    acting = acting_copy(policy) if overlapped else policy
+    collector = make_collector(config, env, acting)
+    curriculum = make_curriculum(config)
+    replay = make_run_replay(config, env, interface, curriculum)
+    tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
-    checkpoints = RunCheckpoints(
-        directory,
-        {"learner": learner, "replay": replay, "curriculum": curriculum, "counters": counters},
-        config.checkpoint.keep,
-    )
+    parts = {"learner": learner, "replay": replay, "counters": counters, "env": env, "tracker": tracker}
+    parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
+    checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
     if config.resume:
         checkpoints.load(config.resume)
-        env.set_seed(config.seed + counters["env_steps"])
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     OmegaConf.save(OmegaConf.structured(config), directory / "config.yaml")
     OmegaConf.save(
         OmegaConf.create([o for o in overrides if not o.startswith("resume=")]), directory / "overrides.yaml"
     )
-    report = EvaluationReport(directory, learner, worlds, config.evaluation.episodes, config.evaluation.video_steps)
     metrics = MetricsLog(
         directory,
         tensorboard=config.logger.tensorboard,
@@ -187,11 +217,12 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
         directory=directory,
         env=env,
         collector=collector,
+        rollouts=OverlappedRollouts(collector, acting, policy) if overlapped else iter(collector),
         tracker=tracker,
         curriculum=curriculum,
         replay=replay,
         learner=learner,
-        report=report,
+        report=make_report(config, directory, learner, config.evaluation.episodes, config.evaluation.video_steps),
         metrics=metrics,
         checkpoints=checkpoints,
         counters=counters,
@@ -199,20 +230,68 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
     )
 
 
-def learner_config(config: DreamerConfig) -> LearnerConfig:
-    """The learner's numbers from the groups `model` and `loss`."""
-    model, loss = config.model, asdict(config.loss)
-    names = {name: loss.pop(name) for name in ("world_model", "actor", "critic")}
-    return LearnerConfig(
-        batch_size=model.batch_size,
-        batch_length=model.batch_length,
-        imagination_horizon=model.imagination_horizon,
-        imagination_starts=model.imagination_starts,
-        lr=model.learning_rate,
-        behavior_lr=model.behavior_learning_rate,
-        warmup_updates=model.warmup_updates,
-        **{f"{part}_loss": name for part, name in names.items()},
-        **loss,
+def seed_generators(seed: int) -> None:
+    """Seed all global generators, of which torch's samples actions and latents."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002: what libraries draw from
+    torch.manual_seed(seed)
+
+
+def make_collector(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> Collector:
+    """Make the collector of rollouts [num_envs, rollout_steps], on the CPU."""
+    return Collector(
+        TransformedEnv(env, Compose(InitTracker(), policy.make_primer())),
+        policy,
+        frames_per_batch=config.env.num_envs * config.rollout_steps,
+        total_frames=-1,
+        env_device="cpu",
+        policy_device=config.device,
+        storing_device="cpu",
+        no_cuda_sync=False,
+    )
+
+
+def make_curriculum(config: DreamerConfig) -> BodyRateCurriculum | None:
+    """Make the schedule of the race's body-rate penalty; other suites have none."""
+    if not is_race(config):
+        return None
+    settings = asdict(config.curriculum)
+    del settings["relabel"]
+    return BodyRateCurriculum(**settings)
+
+
+def make_run_replay(
+    config: DreamerConfig, env: Environment, interface: Interface, curriculum: BodyRateCurriculum | None
+) -> StreamReplay:
+    """Make the replay, on the learner's device if it has room there; say where and how large."""
+    settings = config.replay
+    numbers = interface.vector_dim + interface.privileged_dim
+    image = (64, 64, 3) if interface.pixels else (0,)
+    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers)
+    storage_device = settings.device
+    if storage_device == "auto":
+        on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
+        storage_device = config.device if on_learner else "cpu"
+    where = storage_device if settings.storage is Storage.tensor else "files"
+    if settings.storage is Storage.tensor:
+        check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
+    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
+    return make_replay(
+        settings.capacity,
+        config.env.num_envs,
+        config.model.batch_size,
+        config.model.batch_length,
+        config.device,
+        storage=settings.storage.value,
+        storage_device=storage_device,
+        seed=config.seed,
+        transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
+        observation_keys=interface.replay_keys,
+        reward_keys=reward_terms(env),
+        recent_share=settings.recent_share,
+        recent_records=settings.recent_records,
+        held_out=settings.held_out,
+        prefetch=2 if config.device != "cpu" and storage_device == "cpu" else None,
     )
 
 
@@ -222,34 +301,33 @@ def train(run: Run) -> None:
     schedule = Schedule(
         counters["env_steps"], log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every
     )
-    run.env.body_rate_weight = run.curriculum.body_rate_weight
-    collected = iter(run.collector)
     with (
         GracefulExit() as stop,
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
+        learn(run, stop)  # what a signal left undone
         while counters["env_steps"] < config.total_env_steps and not stop.requested:
             with run.clock.timed("collect"):
-                rollout = next(collected)
+                rollout = next(run.rollouts)
                 run.replay.extend(rollout)
             counters["env_steps"] += rollout.numel()
             bar.update(rollout.numel())
             finish_episodes(run, rollout)
-            with run.clock.timed("update"):
-                learn(run, stop)
+            learn(run, stop)
+            if stop.signal_name:
+                break
             if schedule.due("log", counters["env_steps"]):
-                run.metrics.push(run.clock.read())
+                measure(run)
                 show(bar, run.metrics.write(counters["env_steps"]))
             if schedule.due("evaluate", counters["env_steps"]):
-                with run.clock.timed("evaluate"):
-                    run.metrics.push(run.report.make(counters["env_steps"], config.evaluation.stochastic))
+                evaluate(run)
             if schedule.due("save", counters["env_steps"]):
                 run.checkpoints.save(counters["env_steps"])
         if stop.requested:
             bar.write(f"{stop.signal_name}: saving; continue with resume={run.directory}")
         saved = run.checkpoints.save(counters["env_steps"])
         if not stop.requested and config.evaluation.every:
-            run.metrics.push(run.report.make(counters["env_steps"], config.evaluation.stochastic))
+            evaluate(run)
         run.metrics.write(counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
 
@@ -258,8 +336,10 @@ def finish_episodes(run: Run, rollout: Any) -> None:
     """Account for the episodes that ended in a rollout; let the curriculum set the b₂ of the steps to come."""
     episodes = run.tracker.update(rollout)
     run.counters["episodes"] += len(episodes)
-    run.env.body_rate_weight = run.curriculum.update(episodes["return"])
-    run.metrics.push({**run.tracker.summary(episodes), "curriculum/body_rate_weight": run.env.body_rate_weight})
+    run.metrics.push(run.tracker.summary(episodes))
+    if run.curriculum:
+        run.env.body_rate_weight = run.curriculum.update(episodes["return"])
+        run.metrics.push({"curriculum/body_rate_weight": run.env.body_rate_weight})
 
 
 def learn(run: Run, stop: GracefulExit) -> None:
@@ -267,8 +347,25 @@ def learn(run: Run, stop: GracefulExit) -> None:
     for _ in range(run.updates_due):
         if stop.requested:
             return
-        run.metrics.push(run.learner.update(run.replay.sample()))
+        with run.clock.timed("sample"):
+            batch = run.replay.sample()
+        run.metrics.push(run.learner.update(batch, run.clock.timed))
         run.counters["updates"] += 1
+
+
+def measure(run: Run) -> None:
+    """Take the clock's readings, and the world model's errors on records that are never trained on."""
+    run.metrics.push(run.clock.read())
+    windows = run.replay.held_out(HELD_OUT_WINDOWS, CONTEXT + run.config.model.imagination_horizon, HELD_OUT_RECORDS)
+    if windows is not None and run.counters["updates"]:
+        run.metrics.push(held_out_metrics(run.learner, windows))
+
+
+def evaluate(run: Run) -> None:
+    """Evaluate, without a trace in the random numbers of training."""
+    devices = [run.learner.device] if run.learner.device.type == "cuda" else []
+    with run.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
+        run.metrics.push(run.report.make(run.counters["env_steps"], run.config.evaluation.stochastic))
 
 
 def show(bar: tqdm, row: dict[str, float]) -> None:

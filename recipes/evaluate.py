@@ -12,13 +12,12 @@ from typing import Any, cast
 
 import hydra
 import torch
+from arena import is_race, make_report, restore_learner
 from command_line import choose_device, plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
 from schema import DreamerConfig, EvaluateConfig, register
 
-from dreamer_racing.checkpoint import ensure_writable, latest_checkpoint, load_components
-from dreamer_racing.envs.scene import Camera
-from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.checkpoint import ensure_writable, latest_checkpoint
 from dreamer_racing.reporting import EvaluationReport
 
 register()
@@ -49,23 +48,17 @@ def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
     saved = OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
     trained = cast(DreamerConfig, OmegaConf.to_object(saved))
     torch.manual_seed(config.seed)
-    learner = DreamerLearner(trained.model.size, device=device)
-    counters: dict[str, int] = {}
-    load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
+    if not is_race(trained):
+        raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
+    trained.track, trained.env.preset = config.track or trained.track, config.preset or trained.env.preset
+    trained.env.renderer = config.renderer
+    learner, counters = restore_learner(trained, checkpoint, device)
     directory = ensure_writable(config.run_dir or run_dir / "evaluation")
-    track, preset = config.track or trained.track, config.preset or trained.env.preset
     print(f"checkpoint: {checkpoint} ({trained.model.size}, {counters['env_steps']:,} env_steps)")
-    print(f"race: {track}, {preset}, {config.episodes} episodes")
-    worlds = {
-        "track": track,
-        "preset": preset,
-        "renderer": config.renderer,
-        "camera": Camera(tilt=trained.env.camera_tilt),
-    }
-    report = EvaluationReport(
-        directory, learner, worlds, config.episodes, config.video_steps, num_envs=config.num_envs, seed=config.seed
-    )
-    return report, directory
+    print(f"race: {trained.track}, {trained.env.preset}, {config.episodes} episodes")
+    options = {"num_envs": config.num_envs, "seed": config.seed}
+    report = make_report(trained, directory, learner, config.episodes, config.video_steps, **options)
+    return cast(EvaluationReport, report), directory
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ from omegaconf import MISSING
 
 @dataclass
 class EnvConfig:
-    """The simulated race."""
+    """Where the agent acts: the race, or a task of the DeepMind Control Suite to compare with published curves."""
 
+    suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful
     num_envs: int = 32  # worlds flown side by side
     episode_steps: int = 1000  # control steps of 20 ms
@@ -29,6 +30,9 @@ class ModelConfig:
     replay_ratio: float = MISSING  # records trained on per environment step
     learning_rate: float = MISSING
     behavior_learning_rate: float | None = None  # of actor and critic; null: the same
+    mixed_precision: bool = False  # bfloat16 where it does not matter: halves the time of large models, also on CPU
+    compile: bool = False  # torch.compile of the losses
+    cuda_graph: bool = False  # forward and backward as one CUDA graph
     warmup_updates: int = MISSING  # over which the learning rate rises from zero
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
@@ -88,6 +92,10 @@ class ReplayConfig:
 
     capacity: int = 250_000  # records, 12.3 KB each
     storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
+    device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
+    held_out: int = 1  # worlds whose records are never trained on, to measure the model; 0 of a single world
+    recent_share: float = 0.0  # of a batch's windows, drawn from the newest records
+    recent_records: int = 20_000  # how many those are
 
 
 @dataclass
@@ -108,14 +116,23 @@ class CheckpointConfig:
     keep: int = 2
 
 
+class Collection(Enum):
+    """How acting and learning share time."""
+
+    sync = "sync"
+    overlapped = "overlapped"
+
+
 @dataclass
 class DreamerConfig:
     """`recipes/dreamer_v3.py`."""
 
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
+    task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     total_env_steps: int = 1_000_000  # control steps summed over environments
     prefill: int = 4_000  # env_steps collected before the first update
     rollout_steps: int = 8  # control steps of every environment between updates
+    collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
     seed: int = 0
     device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
     run_dir: str | None = None  # null: runs/dreamer_v3_<track>_<time>
@@ -146,11 +163,24 @@ class EvaluateConfig:
     seed: int = 0
 
 
+@dataclass
+class ExportConfig:
+    """`recipes/export.py`."""
+
+    checkpoint: str = MISSING  # run directory or checkpoint
+    output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
+    latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
+    steps: int = 200  # of a recorded flight, over which the export must fly as the original does
+    renderer: str = "auto"
+    seed: int = 0
+
+
 def register() -> None:
     """Make the schemas known to hydra."""
     store = ConfigStore.instance()
     store.store(name="dreamer_v3_schema", node=DreamerConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="export_schema", node=ExportConfig)
     for group, node in (
         ("env", EnvConfig),
         ("model", ModelConfig),

@@ -211,6 +211,18 @@ def test_windows_are_drawn_uniformly():
     assert (drawn[drawn > 0] - expected).abs().max() < 5 * expected**0.5
 
 
+def test_a_share_of_the_windows_is_recent():
+    replay = make_replay(2 * 40, 2, 10_000, 4, seed=1, recent_share=0.75, recent_records=2 * 10)
+    for rollout in collect(CountingEnv(2, end=0.0), steps=25, batches=3):  # the rings wrap
+        replay.extend(rollout)
+    newest = counter(replay.records(0)["pixels"])[-1]
+    age = newest - counter(replay.sample()["pixels"])  # (B, T)
+    assert age[2_500:].max() == 9 and age[2_500:].unique().tolist() == list(range(10))
+    assert age[:2_500].max() == 39
+    with pytest.raises(ValueError, match="recent_share=1.5"):
+        make_replay(100, 1, 1, 4, recent_share=1.5)
+
+
 def test_short_streams_are_never_drawn():
     replay = make_replay(40, 2, 64, 6)
     rollout = collect(CountingEnv(2, end=0.0), steps=5, batches=1)[0]

@@ -7,14 +7,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dreamer_racing.envs.dmc import ControlSuiteEnv as ControlSuiteEnv
     from dreamer_racing.envs.task import load as load
     from dreamer_racing.envs.torchrl_env import DroneRacingEnv as DroneRacingEnv
     from dreamer_racing.envs.tracks import load_track as load_track
     from dreamer_racing.envs.worlds import RaceWorlds as RaceWorlds
 
-_HOMES = {"DroneRacingEnv": "torchrl_env", "RaceWorlds": "worlds", "load": "task", "load_track": "tracks"}
+_HOMES = {
+    "ControlSuiteEnv": "dmc",
+    "DroneRacingEnv": "torchrl_env",
+    "RaceWorlds": "worlds",
+    "load": "task",
+    "load_track": "tracks",
+}
 
-__all__ = ["DroneRacingEnv", "RaceWorlds", "load", "load_track"]
+__all__ = ["ControlSuiteEnv", "DroneRacingEnv", "RaceWorlds", "load", "load_track"]
 
 
 def __getattr__(name: str) -> Any:

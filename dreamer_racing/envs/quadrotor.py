@@ -9,7 +9,9 @@ of the same laboratory; [choice] this project's, because nobody published it.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -217,6 +219,22 @@ class Quadrotor:
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what controllers and motors remember, and each drone's parameters."""
+        drones = (
+            None
+            if self._drones is None
+            else {field.name: getattr(self._drones, field.name) for field in fields(_Drones)}
+        )
+        return {"rotor_speed": self.rotor_speed, "setpoints": self._setpoints, "drones": drones}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.rotor_speed = state_dict["rotor_speed"].clone()
+        self._setpoints = state_dict["setpoints"].clone()
+        if self._drones is not None:
+            self._drones = _Drones(**state_dict["drones"])
 
     def command(self, action: Tensor) -> None:
         """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -76,6 +77,8 @@ class Race:
         >>> race.step(path, torch.zeros(1, 3), torch.tensor([False])).reward_base
         tensor([0.1000])
     """
+
+    _EPISODE = ("target_gate", "gates_passed", "step_count", "lap_start_step", "position")
 
     def __init__(
         self,
@@ -159,6 +162,15 @@ class Race:
             finished=finished,
             target_gate=self.target_gate,
         )
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return where every episode stands."""
+        return {name: getattr(self, name) for name in self._EPISODE}
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        for name in self._EPISODE:
+            setattr(self, name, state_dict[name].to(getattr(self, name)))
 
     def _judge(
         self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor

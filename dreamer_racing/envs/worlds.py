@@ -3,6 +3,9 @@
 The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -146,6 +149,29 @@ class RaceWorlds:
     def vector(self) -> Tensor:
         """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
         return self._vector(self.simulator.state, self.race.target_gate)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that coming steps and episodes depend on, for `torch.save`."""
+        return {
+            "simulator": self.simulator.state_dict(),
+            "race": self.race.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as the worlds would that returned this state.
+
+        Raises:
+            ValueError: they were of another number.
+        """
+        saved = len(state_dict["race"]["target_gate"])
+        if saved != self.num_envs:
+            raise ValueError(
+                f"The saved state is of {saved} worlds, these are {self.num_envs}: resume with num_envs={saved}."
+            )
+        self.simulator.load_state_dict(state_dict["simulator"])
+        self.race.load_state_dict(state_dict["race"])
+        self._generator.set_state(state_dict["generator"])
 
     def close(self) -> None:
         """Free rendering contexts and threads."""

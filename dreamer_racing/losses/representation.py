@@ -31,10 +31,12 @@ class ReconstructionLoss(WorldModelLoss):
     """
 
     decodes = True
-    represent_keys: ClassVar[tuple[str, ...]] = ("loss_image", "image_error")
 
     def __init__(self, world_model: WorldModel, **kwargs: Any) -> None:
         super().__init__(world_model, **kwargs)
+        images = ["loss_image", "image_error"] if world_model.decoder is not None else []
+        numbers = ["loss_vector"] if world_model.vector_decoder is not None else []
+        self.out_keys = [*images, *numbers, *self.out_keys]
         if world_model.decoder is None and world_model.vector_decoder is None:
             raise ValueError(f"{type(self).__name__} needs a world model with decoders: WorldModel(..., decode=True).")
 
@@ -123,8 +125,6 @@ class InformedLoss(PrivilegedLoss, ReconstructionLoss):
 
     Reference: as ``PrivilegedLoss``.
     """
-
-    represent_keys: ClassVar[tuple[str, ...]] = (*ReconstructionLoss.represent_keys, *PrivilegedLoss.represent_keys)
 
     def represent(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, tensordict: TensorDictBase

@@ -6,10 +6,14 @@ Shape legend: N any batch, I input features, O output features, G blocks.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from dreamer_racing.modules.deferred import DeferredWeight
 
 NORM_EPS = 1e-4
 """Epsilon of every normalisation layer. Reference: danijar/dreamerv3, ``nets.Norm``."""
@@ -35,7 +39,21 @@ def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
     nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
 
 
-def linear(in_features: int, out_features: int, bias: bool = True, scale: float = 1.0) -> nn.Linear:
+class Linear(nn.Linear):
+    """Linear layer that a time loop may use; see ``unrolled``."""
+
+    deferred: DeferredWeight | None = None
+
+    def defer(self) -> DeferredWeight:
+        """Return the weight for the steps of one loop."""
+        return DeferredWeight(self.weight.mT, self.bias)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map ``(..., I)`` to ``(..., O)``."""
+        return super().forward(inputs) if self.deferred is None else self.deferred.product(inputs)
+
+
+def linear(in_features: int, out_features: int, bias: bool = True, scale: float = 1.0) -> Linear:
     """Make a linear layer with the reference's initial weights and a zero bias.
 
     Args:
@@ -44,7 +62,7 @@ def linear(in_features: int, out_features: int, bias: bool = True, scale: float 
         bias: Whether the layer has a bias.
         scale: Multiplier of the initial weights.
     """
-    layer = nn.Linear(in_features, out_features, bias=bias)
+    layer = Linear(in_features, out_features, bias=bias)
     initialize(layer.weight, in_features, scale)
     if bias:
         nn.init.zeros_(layer.bias)
@@ -161,6 +179,8 @@ class BlockLinear(nn.Module):
         ValueError: If a size is not divisible by ``blocks``.
     """
 
+    deferred: DeferredWeight | None = None
+
     def __init__(
         self, in_features: int, out_features: int, blocks: int, fan_in: int | None = None, bias: bool = True
     ) -> None:
@@ -172,9 +192,33 @@ class BlockLinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_features)) if bias else None
         initialize(self.weight, fan_in or in_features // blocks)
 
+    def defer(self) -> DeferredWeight:
+        """Return the weight for the steps of one loop."""
+        return DeferredWeight(self.weight)
+
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``(N, I)`` to ``(N, O)``."""
         # (N, I) -> (G, N, I/G), multiplied, -> (N, O)
         blocked = inputs.unflatten(-1, (self.blocks, -1)).transpose(0, 1)
-        outputs = torch.bmm(blocked, self.weight).transpose(0, 1).flatten(1)
+        product = torch.bmm(blocked, self.weight) if self.deferred is None else self.deferred.product(blocked)
+        outputs = product.transpose(0, 1).flatten(1)
         return outputs if self.bias is None else outputs + self.bias
+
+
+@contextmanager
+def unrolled(*modules: nn.Module) -> Iterator[None]:
+    """Let the linear layers of modules that a time loop calls at every step compute their weight gradients after it.
+
+    Gradients are the same but for rounding. Does nothing without gradients, and under ``torch.compile``, which cannot
+    trace it.
+    """
+    layers = [layer for module in modules for layer in module.modules() if isinstance(layer, (Linear, BlockLinear))]
+    if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+        layers = []
+    for layer in layers:
+        layer.deferred = layer.defer() if layer.weight.requires_grad else None
+    try:
+        yield
+    finally:
+        for layer in layers:
+            layer.deferred = None

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear
+from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear, unrolled
 
 
 class Posterior(NamedTuple):
@@ -258,11 +258,12 @@ class RSSM(nn.Module):
         embeddings = self.posterior_hidden.project(embedding).unbind(1)
         noises = [None] * time if deterministic else self.draw_noise(time, batch).unbind(0)
         beliefs, states, logits = [], [], []
-        for reset, action, embedded, noise in zip(resets.unbind(1), actions, embeddings, noises, strict=True):
-            belief, state, logit = self._observe(belief, state, start, reset, action, embedded, noise)
-            beliefs.append(belief)
-            states.append(state)
-            logits.append(logit)
+        with unrolled(self.cell, self.posterior_hidden, self.posterior_output):
+            for reset, action, embedded, noise in zip(resets.unbind(1), actions, embeddings, noises, strict=True):
+                belief, state, logit = self._observe(belief, state, start, reset, action, embedded, noise)
+                beliefs.append(belief)
+                states.append(state)
+                logits.append(logit)
         belief = torch.stack(beliefs, 1)
         return Posterior(belief, torch.stack(states, 1), torch.stack(logits, 1), self.prior_logits(belief))
 

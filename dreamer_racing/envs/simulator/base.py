@@ -3,8 +3,9 @@
 Shapes: N worlds, P physics steps per control step. SI units, attitude wxyz.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -46,6 +47,14 @@ class Simulator(Protocol):
 
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images of the nose cameras, uint8 (M, height, width, 3): of all worlds, or of the M masked ones in order."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next step depends on, for `torch.save`."""
+        ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
         ...
 
     def close(self) -> None:

@@ -1,6 +1,8 @@
 """N worlds on CPU: MuJoCo's C engine for the rigid bodies, batched natively, and a renderer for their cameras."""
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import torch
@@ -94,6 +96,16 @@ class MujocoSimulator:
         if mask is not None:
             position, attitude = position[mask], attitude[mask]
         return self.renderer.render(position, attitude)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next step depends on."""
+        return {"qpos": self._qpos.clone(), "qvel": self._qvel.clone(), "quadrotor": self.quadrotor.state_dict()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._qpos.copy_(state_dict["qpos"])
+        self._qvel.copy_(state_dict["qvel"])
+        self.quadrotor.load_state_dict(state_dict["quadrotor"])
 
     def close(self) -> None:
         """Free the renderer's contexts and threads."""

@@ -1,0 +1,267 @@
+"""Seconds per update of the learner: sizes, losses, backends; FLOPs, calls, memory, share of the hardware's limit.
+
+    python benchmarks/learner.py --sizes cpu_small --batch 8 32 --horizon 15 --json results/learner.json
+    python benchmarks/learner.py --sizes size12m paper_large --backends eager graph compile+graph --mixed-precision
+    python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
+    python benchmarks/learner.py --peers torchrl            # the stock assembly, in the same run
+    python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
+
+Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
+`calls` are ATen calls; `GFLOP` of matrix products and convolutions, forward and backward, counted by torch; `share` is
+GFLOP / s over the speed of a large matrix product measured in the same run at the same precision; `sample_share` is the
+time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
+(resident) or of the device, GiB.
+"""
+
+import argparse
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+from measuring import print_table, write_json
+from tensordict import TensorDict
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.flop_counter import FlopCounterMode
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.modules import SIZES, Interface, get_size
+from dreamer_racing.replay import make_replay
+
+PRIVILEGED_DIM = 21
+COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
+           "sample_share", "memory")  # fmt: skip
+
+
+def main() -> None:
+    """Measure every combination asked for, each in a process of its own."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"of {', '.join(SIZES)}")
+    parser.add_argument("--losses", nargs="*", default=["reconstruction"])
+    parser.add_argument("--actor-losses", nargs="*", default=["reinforce"])
+    parser.add_argument("--backends", nargs="*", default=["eager"], help="eager | compile | graph | compile+graph")
+    parser.add_argument("--batch", nargs=2, type=int, default=(8, 32), metavar=("B", "T"))
+    parser.add_argument("--horizon", type=int, default=15)
+    parser.add_argument("--mixed-precision", action="store_true", help="bfloat16 autocast")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
+    parser.add_argument("--peers", nargs="*", default=[], choices=["torchrl"])
+    parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    if arguments.table:
+        write_size_table(Path(arguments.table))
+        return
+    shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    jobs: list[tuple[Callable[..., dict[str, Any]], tuple]] = [
+        (measure, (size, loss, actor, backend, arguments.mixed_precision, *shared))
+        for size in arguments.sizes
+        for loss in arguments.losses
+        for actor in arguments.actor_losses
+        for backend in arguments.backends
+    ]
+    if "torchrl" in arguments.peers:
+        from stock_dreamer import measure_stock
+
+        jobs.append((measure_stock, shared))
+    records = []
+    for function, values in jobs:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+            records.append(process.submit(function, *values).result())
+            print_table(records[-1:], COLUMNS)
+    print_table(records, COLUMNS)
+    write_json(records, arguments.json)
+
+
+def measure(
+    size: str,
+    loss: str,
+    actor: str,
+    backend: str,
+    mixed_precision: bool,
+    batch: tuple[int, int],
+    horizon: int,
+    device: str,
+    threads: int,
+    updates: int,
+) -> dict[str, Any]:
+    """Time updates of one configuration; return one record."""
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision("medium")
+    config = LearnerConfig(
+        *batch,
+        horizon,
+        world_model_loss=loss,
+        actor_loss=actor,
+        mixed_precision=mixed_precision,
+        compile="compile" in backend,
+        cuda_graph="graph" in backend,
+    )
+    learner = DreamerLearner(size, Interface(privileged_dim=PRIVILEGED_DIM), config, device, seed=0)
+    replay = filled_replay(batch, device)
+    samples = [seconds(replay.sample, device) for _ in range(5)]
+    data = replay.sample()
+    start = time.perf_counter()
+    learner.update(data)
+    synchronize(device)
+    first = time.perf_counter() - start
+    for _ in range(2):
+        learner.update(data)
+    times = [seconds(lambda: learner.update(data), device) for _ in range(updates)]
+    median = statistics.median(times)
+    memory = peak_memory(device)
+    limit = matmul_speed(device, torch.bfloat16 if mixed_precision else torch.float32)
+    flops = count_flops(size, loss, actor, batch, horizon)
+    return {
+        "benchmark": "learner", "size": size, "loss": loss, "actor": actor,
+        "backend": backend + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
+        "horizon": horizon, "parameters": parameters(learner), "s": median, "s_min": min(times), "s_first": first,
+        "calls": count_calls(learner, data) if backend == "eager" else None, "GFLOP": flops / 1e9,
+        "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
+        "sample_share": statistics.median(samples) / median, "memory": memory,
+    }  # fmt: skip
+
+
+def filled_replay(batch: tuple[int, int], device: str, streams: int = 8) -> Any:
+    """Return a replay of random records that delivers batches [B, T] on a device."""
+    replay = make_replay(
+        streams * batch[1] * 2, streams, *batch, device, observation_keys=["pixels", ("privileged", "vector")]
+    )
+    replay.extend(random_rollout(streams, batch[1] * 2))
+    return replay
+
+
+def random_rollout(streams: int, steps: int) -> TensorDict:
+    """Return what a collector would yield, [streams, steps], with an episode's end in 50 steps or so."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (streams, steps)
+
+    def normal(*sizes: int) -> Tensor:
+        return torch.randn(*shape, *sizes, generator=generator)
+
+    def image() -> Tensor:
+        return torch.randint(0, 256, (*shape, 64, 64, 3), dtype=torch.uint8, generator=generator)
+
+    done = torch.rand(*shape, 1, generator=generator) < 0.02
+    arrived = TensorDict(
+        {"pixels": image(), ("privileged", "vector"): normal(PRIVILEGED_DIM), "reward": normal(1),
+         "reward_base": normal(1), "body_rate_norm": normal(1), "terminated": done,
+         "truncated": torch.zeros_like(done)}, shape,
+    )  # fmt: skip
+    root = {"pixels": image(), ("privileged", "vector"): normal(PRIVILEGED_DIM), "action": normal(4).clamp(-1, 1)}
+    return TensorDict({**root, "is_init": done.roll(1, 1), "next": arrived}, shape)
+
+
+def seconds(function: Callable[[], Any], device: str) -> float:
+    """Time one call, with what it left running on the device."""
+    synchronize(device)
+    start = time.perf_counter()
+    function()
+    synchronize(device)
+    return time.perf_counter() - start
+
+
+def synchronize(device: str) -> None:
+    """Wait for a CUDA device."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def peak_memory(device: str) -> float:
+    """Return the peak memory in GiB: of the device, or of this process on a CPU."""
+    if device.startswith("cuda"):
+        return torch.cuda.max_memory_allocated() / 2**30
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def parameters(learner: DreamerLearner) -> int:
+    """Count what is trained."""
+    return sum(parameter.numel() for group in learner.optimizer.param_groups for parameter in group["params"])
+
+
+def count_calls(learner: DreamerLearner, data: Any) -> int:
+    """Count the ATen calls of an update."""
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+        learner.update(data)
+    return sum(event.count for event in profiler.key_averages() if event.key.startswith("aten::"))
+
+
+def matmul_speed(device: str, dtype: torch.dtype) -> float:
+    """Return the FLOP/s of a large matrix product: what this machine can reach."""
+    side = 8192 if device.startswith("cuda") else 2048
+    left, right = (torch.randn(side, side, device=device, dtype=dtype) for _ in range(2))
+    left @ right
+    return 2 * side**3 / min(seconds(lambda: left @ right, device) for _ in range(5))
+
+
+def count_flops(size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int) -> int:
+    """Count the FLOPs of the losses and their gradients, on the meta device: nothing is computed."""
+    return dry_update(size, loss, actor, batch, horizon)[0]
+
+
+def dry_update(size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int) -> tuple[int, int, int]:
+    """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
+    config = LearnerConfig(*batch, horizon, world_model_loss=loss, actor_loss=actor)
+    with torch.device("meta"):
+        learner = DreamerLearner(get_size(size), Interface(privileged_dim=PRIVILEGED_DIM), config, "meta")
+        records: dict[Any, Tensor] = {
+            "pixels": torch.empty(*batch, 64, 64, 3, dtype=torch.uint8),
+            ("privileged", "vector"): torch.empty(*batch, PRIVILEGED_DIM),
+            "previous_action": torch.empty(*batch, 4),
+            "reward": torch.empty(*batch, 1),
+        }
+        for key in ("is_init", "terminated", "truncated"):
+            records[key] = torch.empty(*batch, 1, dtype=torch.bool)
+        data = TensorDict(records, batch)
+        saved: dict[int, int] = {}
+
+        def keep(tensor: Tensor) -> Tensor:
+            if not isinstance(tensor, torch.nn.Parameter):
+                storage = tensor.untyped_storage()
+                saved[storage._cdata] = storage.nbytes()
+                kept.append(storage)
+            return tensor
+
+        kept: list[Any] = []  # alive until the end, so that no two storages share an address
+        with (
+            FlopCounterMode(display=False) as counter,
+            torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor),
+        ):
+            metrics = learner.compute_losses(data)
+            torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum().backward()
+    return counter.get_total_flops(), parameters(learner), sum(saved.values())
+
+
+def write_size_table(path: Path, batch: tuple[int, int] = (16, 64), horizon: int = 16) -> None:
+    """Write parameters, FLOPs and memory of every size as Markdown."""
+    lines = [
+        "# Sizes of the agent",
+        "",
+        "Made by `python benchmarks/learner.py --table docs/sizes.md`; nothing here is timed.",
+        f"One update of B {batch[0]}, T {batch[1]}, H {horizon}, losses `reconstruction` and `reinforce`, float32:",
+        "FLOPs of matrix products and convolutions, forward and backward, counted by torch. Memory is an estimate:",
+        "weights, gradients and two moments (16 bytes a parameter) plus the tensors kept for the backward pass.",
+        "",
+        "| size | recurrence | belief | latents | units | CNN depth | parameters | GFLOP | state, GiB | kept, GiB |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, size in SIZES.items():
+        flops, count, kept = dry_update(name, "reconstruction", "reinforce", batch, horizon)
+        lines.append(
+            f"| `{name}` | {size.recurrence} | {size.belief} | {size.latents}×{size.classes} | {size.units} | "
+            f"{size.cnn_depth} | {count / 1e6:.2f} M | {flops / 1e9:,.0f} | {count * 16 / 2**30:.2f} | "
+            f"{kept / 2**30:.2f} |"
+        )
+        print(lines[-1], flush=True)
+    path.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

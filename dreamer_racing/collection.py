@@ -1,0 +1,54 @@
+"""Acting while learning: the next rollout is collected in a thread, with a copy of the policy.
+
+The rollout that `next()` returns was collected during the updates before, with the weights from before those: the
+policy that acts is older than the learner's by one round of updates. Thread and learner share the global random
+generators, so two such runs differ from each other; without overlap they do not.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from tensordict import TensorDictBase
+
+from dreamer_racing.modules import DreamerPolicy
+
+
+def acting_copy(policy: DreamerPolicy) -> DreamerPolicy:
+    """Return a policy with parameters of its own, for a thread that must not see them change."""
+    return copy.deepcopy(policy).requires_grad_(False)
+
+
+class OverlappedRollouts(Iterator[TensorDictBase]):
+    """Collects one rollout ahead.
+
+    Args:
+        collector: A TorchRL collector that acts with ``acting``.
+        acting: The copy that acts.
+        policy: The learner's, whose weights are copied to ``acting`` before each rollout.
+
+    Example:
+        >>> # acting = acting_copy(policy); collector = Collector(env, acting, ...)
+        >>> # for rollout in OverlappedRollouts(collector, acting, policy): learn(...)
+    """
+
+    def __init__(self, collector: Any, acting: DreamerPolicy, policy: DreamerPolicy) -> None:
+        self._rollouts = iter(collector)
+        self._acting, self._policy = acting, policy
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collector")
+        self._next: Future[TensorDictBase] | None = None
+
+    def __next__(self) -> TensorDictBase:
+        """Return the rollout that was collected meanwhile, and begin the next."""
+        rollout = next(self._rollouts) if self._next is None else self._next.result()
+        rollout = rollout.clone()  # the collector writes the next one over it
+        self._acting.load_state_dict(self._policy.state_dict())
+        self._next = self._thread.submit(next, self._rollouts)
+        return rollout
+
+    def close(self) -> None:
+        """Wait for the rollout under way."""
+        self._thread.shutdown(wait=True)

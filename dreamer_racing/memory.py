@@ -1,0 +1,51 @@
+"""Whether something fits into memory, found out before it is allocated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+
+GB = 1e9
+
+
+def available_memory(device: torch.device | str) -> float:
+    """Return the bytes that can still be allocated on a device; infinity where nothing tells (a CPU without /proc)."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        return float(torch.cuda.mem_get_info(device)[0])
+    information = Path("/proc/meminfo")
+    if device.type != "cpu" or not information.exists():
+        return math.inf
+    lines = dict(line.split(":") for line in information.read_text().splitlines())
+    return float(lines["MemAvailable"].split()[0]) * 1024
+
+
+def check_fits(size: int, device: torch.device | str, setting: str) -> None:
+    """Refuse what is larger than the memory that is left.
+
+    Args:
+        size: bytes.
+        device: where.
+        setting: what asks for it, as the user wrote it.
+
+    Raises:
+        ValueError: the message gives both numbers and what to change.
+    """
+    available = available_memory(device)
+    if size > available:
+        raise ValueError(
+            f"{setting} needs {size / GB:.1f} GB when full, and {device} has {available / GB:.1f} GB left: lower it to "
+            f"{available / size:.0%} of that or less, or keep the records in files with replay.storage=memmap."
+        )
+
+
+def out_of_memory_advice(error: torch.OutOfMemoryError) -> str:
+    """Return the first line of the error, and which settings take memory, largest first."""
+    first = str(error).splitlines()[0]
+    return (
+        f"{first} What takes memory: the batch (model.batch_size times model.batch_length), imagination "
+        "(model.imagination_starts; null takes every record of the batch), the network (model=size12m and smaller), "
+        "the replay (replay.device=cpu). model.mixed_precision=true halves what the networks keep."
+    )

@@ -1,0 +1,83 @@
+"""Weight gradients of layers inside a time loop: one matrix product after the loop, not one product and sum a step.
+
+Backpropagation through T steps adds T products of thin matrices to a gradient as large as the weight, so that memory
+traffic, not arithmetic, takes the time. Here each step only keeps its input and the gradient of its output.
+
+Shape legend: N batch of a step, I input features, O output features.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import FunctionCtx
+
+Tape = list[tuple[Tensor, Tensor]]
+"""Input ``(..., N, I)`` and gradient of the output ``(..., N, O)`` of every step, as the backward pass reaches them."""
+
+
+class DeferredWeight:
+    """A weight for the steps of one loop; its gradient comes when all of them have passed theirs back.
+
+    Under autocast the weight is cast once, not at every step.
+
+    Args:
+        weight: ``(..., I, O)``; leading dimensions are those of a batched product.
+        bias: ``(O,)``, only with a weight ``(I, O)``; or None.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
+        self._dtype = _autocast_dtype(weight.device.type) or weight.dtype
+        self._tape: Tape = []
+        cast = None if bias is None else bias.to(self._dtype)
+        self._weight, self._bias = _Collect.apply(weight.to(self._dtype), cast, self._tape)
+
+    def product(self, inputs: Tensor) -> Tensor:
+        """Map ``(..., N, I)`` to ``(..., N, O)``."""
+        return _Product.apply(inputs.to(self._dtype), self._weight, self._bias, self._tape)
+
+
+def _autocast_dtype(device_type: str) -> torch.dtype | None:
+    """Return the type that autocast computes in on a kind of device; None where it is off."""
+    if not torch.amp.is_autocast_available(device_type) or not torch.is_autocast_enabled(device_type):
+        return None
+    return torch.get_autocast_dtype(device_type)
+
+
+class _Collect(Function):
+    """Hands out the weight; at the end of the backward pass, multiplies what the steps have kept."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, weight: Tensor, bias: Tensor | None, tape: Tape) -> tuple[Tensor, Tensor | None]:
+        ctx.set_materialize_grads(False)
+        ctx.tape = tape  # type: ignore[attr-defined]
+        return weight.view_as(weight), None if bias is None else bias.view_as(bias)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        # The steps pass nothing back to the weight itself, but autograd calls this after the last of them.
+        if not ctx.tape:
+            return None, None, None
+        inputs = torch.cat([entry[0] for entry in ctx.tape], -2)
+        outputs = torch.cat([entry[1] for entry in ctx.tape], -2)
+        ctx.tape.clear()
+        return inputs.mT @ outputs, outputs.sum(-2) if ctx.needs_input_grad[1] else None, None
+
+
+class _Product(Function):
+    """One step."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, tape: Tape) -> Tensor:
+        ctx.save_for_backward(inputs, weight)
+        ctx.tape = tape  # type: ignore[attr-defined]
+        return inputs @ weight if bias is None else torch.addmm(bias, inputs, weight)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, weight = ctx.saved_tensors
+        ctx.tape.append((inputs, gradient))
+        return gradient @ weight.mT if ctx.needs_input_grad[0] else None, None, None, None

@@ -1,0 +1,138 @@
+"""Where a run acts: the environment that its configuration names, and what comes with it."""
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from schema import DreamerConfig
+
+from dreamer_racing.checkpoint import load_components
+from dreamer_racing.envs.dmc import ControlSuiteEnv
+from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.modules import Interface
+from dreamer_racing.reporting import EvaluationReport, ReturnReport
+
+Environment = DroneRacingEnv | ControlSuiteEnv
+SUITES = ("race", "dmc")
+
+
+class Report(Protocol):
+    """Evaluates a learner's policy."""
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate, write what there is to look at, return metrics."""
+        ...
+
+    def close(self) -> None:
+        """Free simulators."""
+        ...
+
+
+def is_race(config: DreamerConfig) -> bool:
+    """Whether the run races drones, rather than being tested on the Control Suite.
+
+    Raises:
+        ValueError: unknown suite.
+    """
+    if config.env.suite not in SUITES:
+        raise ValueError(f"env.suite={config.env.suite}: there are {', '.join(SUITES)}.")
+    return config.env.suite == "race"
+
+
+def scene_name(config: DreamerConfig) -> str:
+    """The track or the task."""
+    return config.track if is_race(config) else config.task
+
+
+def worlds_of(config: DreamerConfig) -> dict[str, Any]:
+    """Arguments of every `DroneRacingEnv` of the run."""
+    env = config.env
+    return {
+        "track": config.track,
+        "preset": env.preset,
+        "renderer": env.renderer,
+        "camera": Camera(tilt=env.camera_tilt),
+    }
+
+
+def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
+    """Make the environment to train in, with `env.num_envs` worlds or another number."""
+    env = config.env
+    num_envs = num_envs or env.num_envs
+    reads_privileged = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).reads_privileged
+    if is_race(config):
+        return DroneRacingEnv(
+            num_envs=num_envs,
+            episode_steps=env.episode_steps,
+            from_pixels=env.from_pixels,
+            privileged=reads_privileged,
+            seed=config.seed,
+            **worlds_of(config),
+        )
+    if reads_privileged:
+        raise ValueError(
+            f"loss.world_model={config.loss.world_model} decodes the race's privileged state, which env=dmc does not "
+            "have: choose another loss, e.g. loss=reconstruction."
+        )
+    return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, seed=config.seed)
+
+
+def make_report(
+    config: DreamerConfig, directory: Path, learner: DreamerLearner, episodes: int, video_steps: int, **options: Any
+) -> Report:
+    """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
+    if is_race(config):
+        worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels}
+        return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
+    env = ControlSuiteEnv(config.task, min(8, episodes), from_pixels=config.env.from_pixels, seed=config.seed + 1)
+    return ReturnReport(directory, learner, env, episodes, video_steps)
+
+
+def crash_causes(config: DreamerConfig) -> type[CrashCause] | None:
+    """How episodes may end badly, for the metrics."""
+    return CrashCause if is_race(config) else None
+
+
+def reward_terms(env: Environment) -> list[str]:
+    """What a replay keeps of rewards: `reward`, and the terms of which the curriculum recomputes it."""
+    present = env.observation_spec.keys()
+    return ["reward", *(name for name in ("reward_base", "body_rate_norm") if name in present)]
+
+
+def learner_config(config: DreamerConfig) -> LearnerConfig:
+    """The learner's numbers from the groups `model` and `loss`."""
+    model, loss = config.model, vars(config.loss).copy()
+    names = {name: loss.pop(name) for name in ("world_model", "actor", "critic")}
+    return LearnerConfig(
+        batch_size=model.batch_size,
+        batch_length=model.batch_length,
+        imagination_horizon=model.imagination_horizon,
+        imagination_starts=model.imagination_starts,
+        lr=model.learning_rate,
+        behavior_lr=model.behavior_learning_rate,
+        warmup_updates=model.warmup_updates,
+        compile=model.compile,
+        cuda_graph=model.cuda_graph,
+        mixed_precision=model.mixed_precision,
+        **{f"{part}_loss": name for part, name in names.items()},
+        **loss,
+    )
+
+
+def restore_learner(
+    config: DreamerConfig, checkpoint: Path, device: torch.device
+) -> tuple[DreamerLearner, dict[str, int]]:
+    """Bring back the learner of a checkpoint of a run, and the run's counters."""
+    env = make_env(config, num_envs=1)
+    interface = Interface.of(env)
+    env.close()
+    settings = learner_config(config)
+    settings = LearnerConfig(**{**vars(settings), "compile": False, "cuda_graph": False})
+    learner = DreamerLearner(config.model.size, interface, settings, device)
+    counters: dict[str, int] = {}
+    load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
+    return learner, counters

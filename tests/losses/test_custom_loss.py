@@ -1,0 +1,92 @@
+"""The losses that docs/losses.md writes, run as a reader would run them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, kl_losses
+from dreamer_racing.modules import Interface
+
+PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+REGISTRIES = (WORLD_MODEL_LOSSES, ACTOR_LOSSES, CRITIC_LOSSES)
+
+
+@pytest.fixture
+def example() -> Iterator[dict[str, Any]]:
+    """Names that the page's code leaves behind; what it registers is taken back after the test."""
+    before = [dict(registry) for registry in REGISTRIES]
+    torch.manual_seed(0)
+    names: dict[str, Any] = {"__name__": "example"}
+    for number, block in enumerate(BLOCKS):
+        exec(compile(block, f"docs/losses.md, block {number}", "exec"), names)
+    yield names
+    for registry, entries in zip(REGISTRIES, before, strict=True):
+        registry.clear()
+        registry.update(entries)
+
+
+def test_metrics_of_the_custom_loss_are_among_those_of_the_update(example):
+    metrics = example["metrics"]
+    assert {"loss_overshooting", "overshooting_kl", "loss_image", "loss_actor"} < metrics.keys()
+    assert all(value.isfinite() for value in metrics.values())
+    assert metrics["overshooting_kl"] > 0
+    assert example["learner"].updates == 5
+    total = sum(value for key, value in metrics.items() if key.startswith("loss_"))
+    torch.testing.assert_close(metrics["loss"], total)
+
+
+def test_custom_loss_is_what_its_text_says(example):
+    """The prior after three blind steps, by hand; nothing is compared across a reset."""
+    loss, batch = example["learner"].losses["world_model"], example["batch"].clone()
+    batch["is_init"] = batch["is_init"].clone()
+    batch["is_init"][:, 7] = True
+    rssm = loss.world_model.rssm
+    rssm.draw_noise = lambda *shape: torch.full((*shape, rssm.latents, 1), 0.5)
+    loss.free_nats = 0.0
+    posterior = loss.world_model.observe(batch, batch["previous_action"], batch["is_init"].squeeze(-1))
+    kl = []
+    for start in range(13):
+        belief, state = posterior.belief[:, start], posterior.state[:, start]
+        for step in (1, 2, 3):
+            belief, state = rssm.imagine_step(belief, state, batch["previous_action"][:, start + step])
+        target = posterior.posterior_logits[:, start + 3]
+        kl.append(kl_losses(target, rssm.prior_logits(belief), 0.0, rssm.unimix)[2])
+    counted = [value for start, value in enumerate(kl) if not start < 7 <= start + 3]
+    losses = loss(batch)
+    torch.testing.assert_close(losses["overshooting_kl"], torch.stack(counted).mean())
+    torch.testing.assert_close(losses["loss_overshooting"], 0.3 * torch.stack(counted).sum() / (13 * 4))
+
+
+def test_custom_loss_trains_the_prior_and_not_the_heads(example):
+    world_model = example["learner"].agent.world_model
+    example["learner"].losses["world_model"](example["batch"])["loss_overshooting"].backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in world_model.rssm.prior.parameters())
+    assert all(parameter.grad is None for parameter in world_model.decoder.parameters())
+
+
+def test_custom_actor_updates_and_reports(example):
+    config = LearnerConfig(actor_loss="cautious", imagination_horizon=5)
+    metrics = DreamerLearner("debug", config=config, seed=0).update(example["batch"])
+    assert metrics["loss_actor"].isfinite()
+    torch.testing.assert_close(metrics["danger"], 1 - metrics["continuation"])
+
+
+def test_page_names_every_loss_and_key():
+    quoted = set(re.findall(r"`([^`]+)`", PAGE))
+    for registry in REGISTRIES:
+        for name, loss in registry.items():
+            assert re.search(rf"^\| `{name}` \| `{loss.__name__}` \|", PAGE, re.MULTILINE), name
+    interface = Interface(vector_dim=3, privileged_dim=5)
+    for name in WORLD_MODEL_LOSSES:
+        learner = DreamerLearner("debug", interface, LearnerConfig(world_model_loss=name))
+        for loss in learner.losses.values():
+            for key in (*loss.in_keys, *loss.out_keys):
+                assert str(key).replace("'", '"') in quoted or key in quoted, (name, key)

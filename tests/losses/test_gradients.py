@@ -1,0 +1,258 @@
+"""Which loss trains which network, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, DecoderFreeLoss
+from dreamer_racing.losses.actor import frozen
+from dreamer_racing.modules import RSSM, Interface, WorldModel
+
+PRIVILEGED_DIM = 5
+CONFIG = LearnerConfig(imagination_horizon=3, lr=1e-3, warmup_updates=0, free_nats=0.0)
+
+
+def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
+    torch.manual_seed(1)
+    is_init, terminated, truncated = torch.zeros(3, batch, time, 1, dtype=torch.bool).unbind(0)
+    terminated[0, 1] = truncated[1, 2] = True
+    is_init[0, 2] = is_init[1, 3] = is_init[2, 0] = True
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
+            "privileged": {"vector": torch.randn(batch, time, PRIVILEGED_DIM)},
+            "previous_action": torch.rand(batch, time, 4) * 2 - 1,
+            "reward": torch.randn(batch, time, 1),
+            "is_init": is_init,
+            "terminated": terminated,
+            "truncated": truncated,
+        },
+        [batch, time],
+    )
+
+
+def make_learner(**options) -> DreamerLearner:
+    learner = DreamerLearner(
+        "debug", Interface(privileged_dim=PRIVILEGED_DIM), config=replace(CONFIG, **options), seed=0
+    )
+    torch.manual_seed(0)
+    # Two-hot heads are zero at first, which would hide what lies below them.
+    for head in (learner.agent.world_model.reward_head, learner.agent.critic.head):
+        with torch.no_grad():
+            head.mlp.output.weight.normal_(std=0.1)
+    return learner
+
+
+def reached(module: nn.Module) -> set[str]:
+    """Names of the parameters that a gradient other than zero has reached."""
+    return {
+        name
+        for name, parameter in module.named_parameters()
+        if parameter.grad is not None and parameter.grad.abs().sum() > 0
+    }
+
+
+def trainable(module: nn.Module) -> set[str]:
+    return {name for name, parameter in module.named_parameters() if parameter.requires_grad}
+
+
+def untouched(module: nn.Module) -> bool:
+    return all(parameter.grad is None for parameter in module.parameters())
+
+
+@pytest.mark.parametrize("name", WORLD_MODEL_LOSSES)
+def test_world_model_loss_trains_all_of_the_world_model_and_nothing_else(name):
+    learner = make_learner(world_model_loss=name)
+    losses = learner.losses["world_model"](make_batch())
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    assert reached(learner.agent.world_model) == trainable(learner.agent.world_model)
+    assert reached(learner.losses["world_model"]) == trainable(learner.losses["world_model"])
+    assert untouched(learner.agent.actor)
+    assert untouched(learner.agent.critic)
+
+
+@pytest.mark.parametrize("name", ACTOR_LOSSES)
+def test_actor_loss_trains_all_of_the_actor_and_nothing_else(name):
+    learner = make_learner(actor_loss=name)
+    agent = learner.agent
+    torch.manual_seed(0)
+    starts = TensorDict(
+        {
+            "belief": torch.randn(6, 32, requires_grad=True),
+            "state": torch.rand(6, 16, requires_grad=True),
+            "terminated": torch.zeros(6, 1, dtype=torch.bool),
+        },
+        [6],
+    )
+    losses = learner.losses["actor"](starts)
+    losses["loss_actor"].backward()
+    assert reached(agent.actor) == trainable(agent.actor)
+    assert untouched(agent.world_model)
+    assert untouched(agent.critic)
+    assert starts["belief"].grad is None and starts["state"].grad is None
+    assert not any(value.requires_grad for value in losses["imagination"].values())
+    assert not any(losses[key].requires_grad for key in losses.keys() - {"loss_actor", "imagination"})
+
+
+def test_dynamics_gradient_comes_through_the_model_and_reinforce_does_without():
+    """Without entropy, only the gradient through the dynamics needs a reward that depends on the action."""
+    starts = TensorDict(
+        {
+            "belief": torch.randn(6, 32),
+            "state": torch.rand(6, 16),
+            "terminated": torch.zeros(6, 1, dtype=torch.bool),
+        },
+        [6],
+    )
+    for name, expected in (("dynamics", False), ("reinforce", True)):
+        learner = make_learner(actor_loss=name, entropy_scale=0.0, continuation=False)
+        cell = learner.agent.world_model.rssm.cell
+        cell.project_action = lambda action, project=cell.project_action: project(action.detach())
+        learner.losses["actor"](starts)["loss_actor"].backward()
+        assert bool(reached(learner.agent.actor)) == expected
+
+
+def behaviour_losses(learner: DreamerLearner) -> dict[str, Tensor]:
+    """The losses of actor and critic on latents that carry the world model's graph."""
+    batch = make_batch()
+    context = learner.losses["world_model"](batch)["replay_context"]
+    assert context["belief"].requires_grad and context["state"].requires_grad
+    return learner._behavior_losses(context, batch)
+
+
+@pytest.mark.parametrize("actor_loss", ACTOR_LOSSES)
+def test_replayed_returns_train_the_world_model_only_if_asked_to(actor_loss):
+    learner = make_learner(actor_loss=actor_loss, replay_value_gradient=False)
+    losses = behaviour_losses(learner)
+    (losses["loss_critic"] + losses["loss_replay_critic"] + losses["loss_actor"]).backward()
+    assert untouched(learner.agent.world_model)
+
+    learner = make_learner(actor_loss=actor_loss, replay_value_gradient=True)
+    behaviour_losses(learner)["loss_replay_critic"].backward()
+    found = reached(learner.agent.world_model)
+    # What makes the latents, not what is predicted from them.
+    assert {name.split(".")[0] for name in found} == {"encoder", "rssm"}
+    assert not any(name.startswith("rssm.prior") for name in found)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_slow_critic_never_gets_a_gradient(shared):
+    learner = make_learner(replay_value_gradient=shared)
+    losses = learner.compute_losses(make_batch())
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    critic = learner.agent.critic
+    assert untouched(critic.slow_head)
+    assert reached(critic.head) == trainable(critic.head)
+    optimized = {id(parameter) for group in learner.optimizer.param_groups for parameter in group["params"]}
+    assert optimized.isdisjoint(map(id, critic.slow_head.parameters()))
+
+
+def test_targets_of_the_critic_carry_no_gradient():
+    """Returns and values that the critic is taught are numbers: nothing flows through them."""
+    learner = make_learner(actor_loss="dynamics")
+    losses = behaviour_losses(learner)
+    losses["loss_critic"].backward()
+    assert untouched(learner.agent.actor)
+    assert untouched(learner.agent.world_model)
+
+
+def test_embedding_is_a_fixed_target_of_the_decoder_free_loss():
+    """The loss reaches the encoder through the latents alone."""
+    torch.manual_seed(0)
+    world_model = WorldModel("debug", decode=False)
+    loss, batch = DecoderFreeLoss(world_model), make_batch()
+    embedding = world_model.encoder(batch).detach().requires_grad_()
+    features = torch.randn(3, 5, world_model.size.features, requires_grad=True)
+    loss.represent(None, features, embedding, batch)["loss_barlow"].backward()
+    assert embedding.grad is None
+    assert features.grad.abs().sum() > 0
+    assert loss.projector.weight.grad.abs().sum() > 0
+    assert untouched(world_model)
+
+    loss(batch)["loss_barlow"].backward()
+    assert reached(world_model.encoder) == trainable(world_model.encoder)
+    assert untouched(world_model.reward_head)
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [("privileged", "privileged_decoder"), ("informed", "privileged_decoder"), ("decoder_free", "projector")],
+)
+def test_parameters_of_a_loss_are_trained_and_saved(name, own):
+    learner = make_learner(world_model_loss=name)
+    module = getattr(learner.losses["world_model"], own)
+    before = [parameter.detach().clone() for parameter in module.parameters()]
+    for _ in range(2):
+        learner.update(make_batch())
+    assert not any(torch.equal(old, new) for old, new in zip(before, module.parameters(), strict=True))
+
+    restored = make_learner(world_model_loss=name)
+    restored.load_state_dict(learner.state_dict())
+    pairs = zip(module.parameters(), getattr(restored.losses["world_model"], own).parameters(), strict=True)
+    assert all(torch.equal(saved, loaded) for saved, loaded in pairs)
+
+
+def test_frozen_lets_gradient_through_and_restores_every_flag():
+    module = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 1))
+    module[0].bias.requires_grad_(False)
+    flags = [parameter.requires_grad for parameter in module.parameters()]
+    inputs = torch.ones(1, 2, requires_grad=True)
+    with frozen(module, nn.Linear(1, 1)):
+        assert not any(parameter.requires_grad for parameter in module.parameters())
+        output = module(inputs)
+    assert [parameter.requires_grad for parameter in module.parameters()] == flags
+    output.sum().backward()
+    assert inputs.grad.abs().sum() > 0
+    assert untouched(module)
+
+
+def test_frozen_restores_flags_after_an_error():
+    module = nn.Linear(2, 2)
+    with pytest.raises(RuntimeError, match="out of memory"), frozen(module):
+        raise RuntimeError("out of memory")
+    assert all(parameter.requires_grad for parameter in module.parameters())
+
+
+def test_actor_through_the_dynamics_leaves_the_flags_as_they_were():
+    learner = make_learner(actor_loss="dynamics")
+    before = trainable(learner.agent)
+    assert "world_model.rssm.initial_belief" not in before
+    learner.update(make_batch())
+    assert trainable(learner.agent) == before
+
+
+@pytest.mark.parametrize("recurrence", ["dense", "block"])
+def test_gradients_of_an_unroll_are_those_of_its_steps(recurrence, monkeypatch):
+    """Also across a reset, and with the same samples."""
+    torch.manual_seed(0)
+    rssm = RSSM(8, 4, 16, latents=3, classes=4, hidden=8, recurrence=recurrence, blocks=4, learned_initial=True)
+    embedding, action = torch.randn(2, 6, 8), torch.rand(2, 6, 4) * 2 - 1
+    is_init = torch.zeros(2, 6, dtype=torch.bool)
+    is_init[1, 3] = True
+    noise, weight = torch.rand(6, 2, 3, 1), torch.randn(6, 2, 28)
+    parameters = dict(rssm.named_parameters())
+
+    monkeypatch.setattr(rssm, "draw_noise", lambda *batch: noise)
+    posterior = rssm.observe(embedding, action, is_init)
+    features = torch.cat((posterior.belief, posterior.state), -1).transpose(0, 1)
+    unrolled = torch.autograd.grad((features * weight).sum(), list(parameters.values()), allow_unused=True)
+
+    belief, state = (value.expand(2, -1) for value in rssm.initial())
+    total = torch.zeros(())
+    for step in range(6):
+        monkeypatch.setattr(rssm, "draw_noise", lambda *batch, step=step: noise[step])
+        belief, state = rssm.observe_step(embedding[:, step], action[:, step], is_init[:, step], belief, state)
+        total = total + (torch.cat((belief, state), -1) * weight[step]).sum()
+    stepped = torch.autograd.grad(total, list(parameters.values()), allow_unused=True)
+
+    for name, one, other in zip(parameters, unrolled, stepped, strict=True):
+        assert (one is None) == (other is None), name
+        if one is not None:
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
+    assert sum(gradient is not None and bool(gradient.any()) for gradient in unrolled) > 8

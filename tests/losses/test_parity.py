@@ -1,0 +1,463 @@
+"""Whole losses against TorchRL's own DreamerV3 losses, with the same weights, batch and noise.
+
+Our networks stand behind adapters with the keys that TorchRL reads; every number after the networks' outputs is then
+computed twice, by independent code. Where TorchRL deviates from the reference the test's docstring says so.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.model_based import DreamerEnv
+from torchrl.modules import WorldModelWrapper
+from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3ModelLoss, DreamerV3ValueLoss, SoftUpdate
+from torchrl.objectives.dreamer_v3 import categorical_kl_balanced
+from torchrl.objectives.utils import ValueEstimators
+
+from dreamer_racing.learner import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.losses import CriticLoss, DynamicsActorLoss, ReconstructionLoss, ReinforceLoss, kl_losses
+from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
+
+SIZE = SIZES["debug"]
+HORIZON = 333
+DISCOUNT = 1 - 1 / HORIZON
+TOLERANCE = {"rtol": 1e-5, "atol": 1e-5}
+
+
+def stir(agent: Agent) -> Agent:
+    """Make every head predict something moderate of its own; fresh two-hot heads all say zero."""
+    for head in (agent.world_model.reward_head, agent.critic.head, agent.critic.slow_head):
+        bins = len(head.two_hot.values)
+        with torch.no_grad():
+            head.mlp.output.weight.normal_(std=0.5)
+            head.mlp.output.bias.copy_(-0.5 * (torch.arange(bins) - bins // 2 - torch.randn(())).abs())
+    with torch.no_grad():
+        agent.actor.mlp.output.weight.mul_(100.0)
+        agent.world_model.continue_head.mlp.output.bias.fill_(3.0)
+    return agent
+
+
+def make_agent() -> Agent:
+    torch.manual_seed(0)
+    return stir(Agent(SIZE, Interface()))
+
+
+def make_batch(batch: int = 3, time: int = 7, crashes: bool = False) -> TensorDict:
+    """Records with a reset in the middle, a cut that only the next reset shows, and maybe crashes."""
+    torch.manual_seed(1)
+    is_init, terminated, truncated = torch.zeros(3, batch, time, 1, dtype=torch.bool).unbind(0)
+    is_init[0, 0] = is_init[1, 3] = is_init[2, 5] = True
+    truncated[1, 2] = True
+    if crashes:
+        terminated[2, 4] = terminated[0, 6] = True
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
+            "previous_action": torch.rand(batch, time, 4) * 2 - 1,
+            "reward": torch.randn(batch, time, 1) * 3,
+            "is_init": is_init,
+            "terminated": terminated,
+            "truncated": truncated,
+        },
+        [batch, time],
+    )
+
+
+def stock_batch(batch: TensorDict) -> TensorDict:
+    """The same records under TorchRL's keys: a record is what lies under ``next``, its first action at the root."""
+    followed_by_init = torch.cat((batch["is_init"][:, 1:], torch.zeros_like(batch["is_init"][:, :1])), 1)
+    record = batch.select("pixels", "reward", "terminated")
+    record["done"] = batch["terminated"] | batch["truncated"] | followed_by_init
+    return TensorDict(
+        {"action": batch["previous_action"], "is_init": batch["is_init"], "next": record}, batch.batch_size
+    )
+
+
+class StockWorldModel(nn.Module):
+    """Our world model with the keys of ``DreamerV3ModelLoss``."""
+
+    def __init__(self, world_model: WorldModel) -> None:
+        super().__init__()
+        self.world_model = world_model
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        seen = tensordict["next"]
+        posterior = self.world_model.observe(seen, tensordict["action"], tensordict["is_init"].squeeze(-1))
+        features = join_features(posterior.belief, posterior.state)
+        predicted = {
+            **posterior._asdict(),
+            "reco_pixels": self.world_model.decoder(posterior.belief, posterior.state),
+            "reward_logits": self.world_model.reward_head(features),
+            "continue_pred": self.world_model.continue_head(features),
+        }
+        for key, value in predicted.items():
+            tensordict["next", key] = value
+        return tensordict
+
+
+class StockActor(nn.Module):
+    """Mean and standard deviation of our actor."""
+
+    def __init__(self, actor: nn.Module) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, belief: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        return tuple(self.actor(join_features(belief, state)))
+
+
+class StockValue(nn.Module):
+    """Logits and mean of a two-hot head."""
+
+    def __init__(self, head: TwoHotHead) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, belief: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        features = join_features(belief, state)
+        return self.head(features), self.head.mean(features)
+
+
+class StockContinuation(TensorDictModule):
+    """Continuation as we define it: true at the starts, predicted after them; TorchRL predicts that of the starts too.
+
+    ``DreamerV3ActorLoss`` first asks for the starts, then for all that follow.
+    """
+
+    def __init__(self, world_model: WorldModel, terminated: Tensor | None = None) -> None:
+        super().__init__(world_model.continue_head, in_keys=["belief", "state"], out_keys=["continuation"])
+        self.terminated = terminated
+        self.asked = 0
+
+    def forward(self, tensordict: TensorDict) -> TensorDict:
+        features = join_features(tensordict["belief"], tensordict["state"])
+        probability = self.module.probability(features)
+        if self.asked == 0:
+            probability = torch.ones_like(probability)
+            if self.terminated is not None:
+                probability = 1.0 - self.terminated.float().view_as(probability)
+        self.asked += 1
+        return tensordict.set("continuation", probability)
+
+
+def stock_environment(world_model: WorldModel) -> DreamerEnv:
+    """Our dynamics and reward head as TorchRL's imagination environment."""
+
+    class Reward(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.head = world_model.reward_head
+
+        def forward(self, belief: Tensor, state: Tensor) -> Tensor:
+            return self.head.mean(join_features(belief, state))
+
+    class Transition(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            # Before the RSSM's own parameter, which is fixed: TorchRL holds out a network only if its first one is not.
+            self.cell = world_model.rssm.cell
+            self.rssm = world_model.rssm
+
+        def forward(self, belief: Tensor, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+            return self.rssm.imagine_step(belief, state, action)
+
+    environment = DreamerEnv(
+        WorldModelWrapper(
+            TensorDictModule(Transition(), in_keys=["belief", "state", "action"], out_keys=["belief", "state"]),
+            TensorDictModule(Reward(), in_keys=["belief", "state"], out_keys=["reward"]),
+        ),
+        prior_shape=(SIZE.state,),
+        belief_shape=(SIZE.belief,),
+    )
+    environment.observation_spec = Composite(state=Unbounded(SIZE.state), belief=Unbounded(SIZE.belief))
+    environment.state_spec = environment.observation_spec.clone()
+    environment.action_spec = Unbounded((4,))
+    environment.reward_spec = Unbounded((1,))
+    return environment
+
+
+def stock_model_loss(world_model: WorldModel, **options) -> DreamerV3ModelLoss:
+    return DreamerV3ModelLoss(
+        StockWorldModel(world_model), **{"kl_mode": "separate", "unimix": 0.01} | options,
+        lambda_continue=1.0, reco_symlog=False, detach_output=False,
+    )  # fmt: skip
+
+
+def stock_value(critic: Critic) -> TensorDictModule:
+    return TensorDictModule(
+        StockValue(critic.head), in_keys=["belief", "state"], out_keys=["state_value_logits", "state_value"]
+    )
+
+
+def stock_actor_loss(agent: Agent, terminated: Tensor | None = None, **options) -> DreamerV3ActorLoss:
+    actor = ProbabilisticTensorDictSequential(
+        TensorDictModule(StockActor(agent.actor), in_keys=["belief", "state"], out_keys=["loc", "scale"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=lambda loc, scale: Independent(Normal(loc, scale), 1),
+        ),
+    )
+    loss = DreamerV3ActorLoss(
+        actor,
+        stock_value(agent.critic),
+        stock_environment(agent.world_model),
+        continuation_model=StockContinuation(agent.world_model, terminated),
+        **{"imagination_horizon": 5, "use_reinforce": True} | options,
+    )
+    loss.make_value_estimator(ValueEstimators.TDLambda, gamma=DISCOUNT, lmbda=0.95)
+    return loss
+
+
+def stock_value_loss(critic: Critic, slow_scale: float = 1.0) -> DreamerV3ValueLoss:
+    loss = DreamerV3ValueLoss(stock_value(critic), "two_hot", slow_critic_regularization=slow_scale)
+    SoftUpdate(loss, tau=0.02)
+    for key, parameter in critic.slow_head.named_parameters():
+        loss.target_value_model_params["module", "head", *key.split(".")].data.copy_(parameter)
+    return loss
+
+
+def gradients(module: nn.Module) -> dict[str, Tensor]:
+    return {name: parameter.grad for name, parameter in module.named_parameters() if parameter.grad is not None}
+
+
+def assert_same_gradients(ours: nn.Module, stock: nn.Module, rtol: float = 1e-4) -> None:
+    """Compare all gradients, within a share of each tensor's largest entry."""
+    expected, found = gradients(stock), gradients(ours)
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
+        torch.testing.assert_close(value, expected[name], rtol=rtol, atol=rtol * expected[name].abs().max().item())
+
+
+@pytest.mark.parametrize("free_nats", [0.0, 1.0])
+def test_world_model_loss(free_nats):
+    ours, batch = make_agent().world_model, make_batch(crashes=True)
+    stock = copy.deepcopy(ours)
+    torch.manual_seed(2)
+    losses = ReconstructionLoss(ours, free_nats=free_nats)(batch)
+    torch.manual_seed(2)
+    expected, posterior = stock_model_loss(stock, free_bits=free_nats)(stock_batch(batch))
+    pairs = {
+        "loss_image": "loss_model_reco",
+        "loss_reward": "loss_model_reward",
+        "loss_continue": "loss_model_continue",
+        "loss_dynamics": "loss_model_dynamic",
+        "loss_representation": "loss_model_representation",
+    }
+    for key, stock_key in pairs.items():
+        torch.testing.assert_close(losses[key], expected[stock_key].squeeze(), **TOLERANCE)
+    torch.testing.assert_close(losses["replay_context", "belief"], posterior["next", "belief"])
+    assert losses["kl"] > 0.1
+    sum(losses[key] for key in pairs).backward()
+    sum(expected[key] for key in pairs.values()).backward()
+    assert_same_gradients(ours, stock)
+
+
+def test_per_latent_kl():
+    """TorchRL's ``"balanced"`` takes the mean over latents where we sum, and knows no uniform mixture."""
+    torch.manual_seed(0)
+    ours = [torch.randn(3, 5, 8, 4, requires_grad=True) for _ in range(2)]
+    stock = [logits.detach().clone().requires_grad_() for logits in ours]
+    dynamics, representation, _ = kl_losses(*ours, free_nats=4.0, unimix=0.0, mode="per_latent")
+    expected = 8 * categorical_kl_balanced(*stock, alpha=1.0, free_bits=0.5)
+    torch.testing.assert_close(dynamics.mean(), expected, **TOLERANCE)
+    torch.testing.assert_close(
+        representation.mean(), 8 * categorical_kl_balanced(*stock, alpha=0.0, free_bits=0.5), **TOLERANCE
+    )
+    (0.8 * dynamics + 0.2 * representation).mean().backward()
+    (8 * categorical_kl_balanced(*stock, alpha=0.8, free_bits=0.5)).backward()
+    for our, their in zip(ours, stock, strict=True):
+        torch.testing.assert_close(our.grad, their.grad, rtol=1e-4, atol=1e-6)
+        assert (our.grad == 0).all(-1).any()  # some latents lie below their share of the free nats
+
+
+def test_per_latent_world_model_loss():
+    """The loss module passes the mode on: as TorchRL's ``"balanced"`` but for the number of latents."""
+    ours, batch = make_agent().world_model, make_batch()
+    ours.rssm.unimix = 0.0
+    stock = copy.deepcopy(ours)
+    torch.manual_seed(2)
+    losses = ReconstructionLoss(ours, free_nats=1.0, kl_mode="per_latent")(batch)
+    torch.manual_seed(2)
+    expected, _ = stock_model_loss(stock, kl_mode="balanced", free_bits=1.0 / SIZE.latents, kl_alpha=1.0)(
+        stock_batch(batch)
+    )
+    torch.testing.assert_close(losses["loss_dynamics"], SIZE.latents * expected["loss_model_kl"].squeeze(), **TOLERANCE)
+
+
+def make_starts(count: int = 12) -> TensorDict:
+    torch.manual_seed(3)
+    state = torch.nn.functional.one_hot(torch.randint(4, (count, SIZE.latents)), SIZE.classes).float().flatten(1)
+    terminated = torch.zeros(count, 1, dtype=torch.bool)
+    terminated[4] = True
+    return TensorDict({"belief": torch.randn(count, SIZE.belief), "state": state, "terminated": terminated}, [count])
+
+
+@pytest.mark.parametrize("entropy_scale", [3e-4, 0.3])
+@pytest.mark.parametrize(("loss_class", "use_reinforce"), [(ReinforceLoss, True), (DynamicsActorLoss, False)])
+def test_actor_loss(loss_class, use_reinforce, entropy_scale):
+    """Imagination, λ-returns, weights, return range, estimator and entropy at once.
+
+    Two updates: the second meets a moved return range.
+    """
+    agent, starts = make_agent(), make_starts()
+    stock = copy.deepcopy(agent)
+    loss = loss_class(
+        agent.world_model, agent.actor, agent.critic, horizon=5, discount=DISCOUNT, entropy_scale=entropy_scale
+    )
+    oracle = stock_actor_loss(stock, starts["terminated"], use_reinforce=use_reinforce, entropy_bonus=entropy_scale)
+    for module in (loss.return_normalizer, oracle.retnorm):
+        module.high.fill_(2.5)  # above the floor, which would hide a wrong range
+    for _ in range(2):
+        torch.manual_seed(4)
+        losses = loss(starts)
+        torch.manual_seed(4)
+        oracle.__dict__["continuation_model"].asked = 0
+        expected, imagined = oracle(starts)
+        torch.testing.assert_close(losses["loss_actor"], expected["loss_actor"], **TOLERANCE)
+        torch.testing.assert_close(losses["return_scale"], expected["return_scale"], **TOLERANCE)
+        torch.testing.assert_close(losses["continuation"], expected["continuation_mean"], **TOLERANCE)
+        ours = losses["imagination"]
+        for key, stock_key in {"lambda_return": "lambda_target", "weight": "discount_weight"}.items():
+            torch.testing.assert_close(ours[key].transpose(0, 1), imagined[stock_key], **TOLERANCE)
+        assert losses["return_scale"] > 1.5
+    losses["loss_actor"].backward()
+    expected["loss_actor"].backward()
+    assert_same_gradients(agent.actor, stock.actor)
+
+
+def test_return_range_is_the_moving_percentiles_with_a_floor_of_one():
+    """By hand, as TorchRL's normaliser is the one in use: no debiasing, from zero, 5th to 95th percentile."""
+    agent = make_agent()
+    loss = ReinforceLoss(agent.world_model, agent.actor, agent.critic, horizon=5, return_decay=0.5)
+    low = high = 0.0
+    scales = []
+    for seed in range(4):
+        torch.manual_seed(seed)
+        losses = loss(make_starts())
+        returns = losses["imagination", "lambda_return"].numpy()
+        low = 0.5 * low + 0.5 * np.quantile(returns, 0.05)
+        high = 0.5 * high + 0.5 * np.quantile(returns, 0.95)
+        scales.append(max(1.0, high - low))
+        assert losses["return_scale"].item() == pytest.approx(scales[-1], rel=1e-5)
+    assert scales[-1] > 1.0
+
+
+def make_critic_input(batch: TensorDict) -> TensorDict:
+    torch.manual_seed(5)
+    shape = batch.batch_size
+    imagination = TensorDict(
+        {
+            "features": torch.randn(5, 12, SIZE.features),
+            "lambda_return": torch.randn(5, 12, 1) * 4,
+            "weight": torch.rand(5, 12, 1),
+        },
+        [5, 12],
+    )
+    replay = batch.select("reward", "is_init", "terminated", "truncated")
+    latents = {"belief": torch.randn(*shape, SIZE.belief), "state": torch.rand(*shape, SIZE.state)}
+    return TensorDict({**replay, **latents, "bootstrap": torch.randn(*shape, 1) * 4, "imagination": imagination}, [])
+
+
+def stock_replay(inputs: TensorDict, batch: TensorDict) -> TensorDict:
+    replay = TensorDict(
+        {**inputs.select("belief", "state"), "bootstrap": inputs["bootstrap"].squeeze(-1)}, batch.batch_size
+    )
+    replay["next"] = stock_batch(batch)["next"].select("reward", "done", "terminated")
+    return replay
+
+
+@pytest.mark.parametrize("slow_scale", [1.0, 0.3])
+def test_critic_loss(slow_scale):
+    """Imagined part: two-hot regression on returns and on the slow copy, weighted; with gradients."""
+    agent = make_agent()
+    stock = copy.deepcopy(agent.critic)
+    inputs = make_critic_input(make_batch())
+    losses = CriticLoss(agent.critic, discount=DISCOUNT, slow_scale=slow_scale)(inputs)
+    imagination = inputs["imagination"]
+    belief, state = imagination["features"].split([SIZE.belief, SIZE.state], -1)
+    stock_imagination = {"lambda_target": imagination["lambda_return"], "discount_weight": imagination["weight"]}
+    oracle = stock_value_loss(stock, slow_scale)
+    expected, _ = oracle(TensorDict({"belief": belief, "state": state, **stock_imagination}, [5, 12]))
+    torch.testing.assert_close(losses["loss_critic"], expected["loss_value"], **TOLERANCE)
+    losses["loss_critic"].backward()
+    expected["loss_value"].backward()
+    found = gradients(oracle.value_model_params)
+    for name, gradient in gradients(agent.critic.head).items():
+        torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)
+
+
+def test_replay_critic_loss_without_crashes():
+    """TorchRL and the reference average over the T − 1 records that have a next one, we over all T."""
+    agent, batch = make_agent(), make_batch()
+    inputs = make_critic_input(batch)
+    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_scale=1.0)(inputs)["loss_replay_critic"]
+    oracle = stock_value_loss(copy.deepcopy(agent.critic))
+    expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
+    torch.testing.assert_close(7 * ours, 6 * expected, **TOLERANCE)
+
+
+def test_replay_critic_loss_with_crashes():
+    """TorchRL leaves out records that end an episode; we teach the critic that a crash is worth zero from there on."""
+    agent, batch = make_agent(), make_batch(crashes=True)
+    inputs = make_critic_input(batch)
+    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_scale=1.0)(inputs)["loss_replay_critic"]
+    oracle = stock_value_loss(copy.deepcopy(agent.critic))
+    expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
+    crashed = batch["terminated"].squeeze(-1)
+    features = join_features(inputs["belief"], inputs["state"])[crashed]
+    log_probabilities = agent.critic(features).log_softmax(-1)
+    slow_value = agent.critic.slow_value(features)
+    targets = (oracle._step_value_loss(log_probabilities, target) for target in (torch.zeros(2), slow_value[..., 0]))
+    torch.testing.assert_close(3 * 7 * ours, 3 * 6 * expected + sum(targets).sum(), **TOLERANCE)
+
+
+@pytest.mark.parametrize("actor_loss", ["reinforce", "dynamics"])
+def test_whole_objective(actor_loss):
+    """One update's losses and the gradient of every parameter against ``DreamerV3Loss``, end to end."""
+    config = LearnerConfig(imagination_horizon=5, discount=DISCOUNT, actor_loss=actor_loss)
+    learner, batch = DreamerLearner("debug", config=config, seed=0), make_batch()
+    torch.manual_seed(0)
+    stir(learner.agent)
+    stock = copy.deepcopy(learner.agent)
+    actor = stock_actor_loss(stock, use_reinforce=actor_loss == "reinforce")
+    oracle = DreamerV3Loss(
+        stock_model_loss(stock.world_model),
+        actor,
+        stock_value_loss(stock.critic),
+        replay_value_loss_weight=config.replay_value_scale * 6 / 7,  # as in test_replay_critic_loss_without_crashes
+        continuation_horizon=HORIZON,
+    )
+    torch.manual_seed(6)
+    losses = learner.compute_losses(batch)
+    torch.manual_seed(6)
+    expected = oracle(stock_batch(batch))
+    pairs = {
+        "loss_image": "loss_model_reco",
+        "loss_reward": "loss_model_reward",
+        "loss_continue": "loss_model_continue",
+        "loss_dynamics": "loss_model_dynamic",
+        "loss_representation": "loss_model_representation",
+        "loss_actor": "loss_actor",
+        "loss_critic": "loss_value",
+        "loss_replay_critic": "loss_replay_value",
+    }
+    assert {key for key in losses if key.startswith("loss_")} == pairs.keys()
+    assert {key for key in expected.keys() if key.startswith("loss_")} == set(pairs.values())  # noqa: SIM118
+    for key, stock_key in pairs.items():
+        torch.testing.assert_close(losses[key], expected[stock_key].squeeze(), **TOLERANCE)
+    sum(losses[key] for key in pairs).backward()
+    sum(expected[key] for key in pairs.values()).backward()
+    for name in ("world_model", "actor"):
+        assert_same_gradients(getattr(learner.agent, name), getattr(stock, name))
+    found = gradients(oracle.value_loss.value_model_params)
+    for name, gradient in gradients(learner.agent.critic.head).items():
+        torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)

@@ -1,0 +1,76 @@
+"""A run that was interrupted and resumed equals one that was not, bit for bit: on a CPU, with one thread."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dreamer_racing.checkpoint import latest_checkpoint
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = [
+    "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4", "env.num_envs=4",
+    "env.episode_steps=40", "prefill=64", "replay.capacity=1200", "replay.recent_share=0.5",
+    "evaluation.every=500", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=0",
+    "logger.every=400", "logger=csv", "device=cpu", "curriculum.threshold=-100", "curriculum.cooldown=3",
+]  # fmt: skip
+
+
+def train(directory: Path, steps: int, *overrides: str) -> None:
+    command = [sys.executable, str(ROOT / "recipes" / "dreamer_v3.py"), *overrides, f"total_env_steps={steps}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def parts(run_dir: Path) -> dict[str, Any]:
+    """Everything that a checkpoint holds, by file."""
+    found: dict[str, Any] = {}
+    for path in sorted(latest_checkpoint(run_dir).rglob("*")):
+        name = str(path.relative_to(latest_checkpoint(run_dir)))
+        if path.suffix == ".pt":
+            found[name] = torch.load(path, weights_only=True)
+        elif path.suffix in (".bin", ".json") and path.name != "manifest.json":
+            found[name] = path.read_bytes()
+    return found
+
+
+def learner_updates(checkpoint: dict[str, Any]) -> int:
+    return next(value["updates"] for name, value in checkpoint.items() if "learner" in name)
+
+
+def assert_same(first: Any, second: Any, where: str) -> None:
+    if isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), where
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        for key in first:
+            assert_same(first[key], second[key], f"{where}/{key}")
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second), where
+        for index, (left, right) in enumerate(zip(first, second, strict=True)):
+            assert_same(left, right, f"{where}/{index}")
+    else:
+        assert first == second, where
+
+
+@pytest.mark.slow
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    settings = [*SETTINGS, "track=circle", "env=faithful"]
+    train(tmp_path, 2000, *settings, "run_dir=whole")
+    train(tmp_path, 1024, *settings, "run_dir=parted")
+    before = parts(tmp_path / "parted")
+    train(tmp_path, 2000, "resume=parted")
+    whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
+    assert learner_updates(whole) - learner_updates(before) >= 200
+    names = {name.split("/")[1].partition("-")[2] for name in whole}
+    assert names == {"learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "random_state"}
+    assert_same(whole, parted, "checkpoint")
