@@ -3,7 +3,8 @@
     python benchmarks/learner.py --sizes cpu_small --batch 8 32 --horizon 15 --json results/learner.json
     python benchmarks/learner.py --sizes size12m paper_large --backends eager graph compile+graph --mixed-precision
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
-    python benchmarks/learner.py --peers torchrl            # the stock assembly, in the same run
+    python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
+    python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
 Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
@@ -35,6 +36,7 @@ from dreamer_racing.modules import SIZES, Interface, get_size
 from dreamer_racing.replay import make_replay
 
 PRIVILEGED_DIM = 21
+PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
 
@@ -52,7 +54,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
-    parser.add_argument("--peers", nargs="*", default=[], choices=["torchrl"])
+    parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
     arguments = parser.parse_args()
@@ -67,10 +69,11 @@ def main() -> None:
         for actor in arguments.actor_losses
         for backend in arguments.backends
     ]
-    if "torchrl" in arguments.peers:
+    if arguments.peers:
         from stock_dreamer import measure_stock
 
-        jobs.append((measure_stock, shared))
+        shapes = [peer.removeprefix("torchrl_") for peer in arguments.peers]
+        jobs += [(measure_stock, (*shared, shape, tuned)) for shape in shapes for tuned in (False, True)]
     records = []
     for function, values in jobs:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:

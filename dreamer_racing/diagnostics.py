@@ -69,7 +69,7 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
     discount = learner.config.discount ** torch.arange(horizon + 1, device=reward.device)
     value = critic.value(join_features(belief[:, -1], state[:, -1])).squeeze(-1)
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
-    real = reward @ discount[:-1] + discount[-1] * goes_on * value
+    real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value
     imagined = _imagined_return(learner, start, horizon, discount)
     metrics["imagination/return_correlation"] = correlation(imagined, real)
     metrics["imagination/return_bias"] = (imagined - real).mean()
@@ -94,10 +94,10 @@ def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], hori
     reached = torch.cat((torch.ones_like(continuation[:1]), continuation[:-1])).cumprod(0)
     reward = model.reward_head.mean(features).squeeze(-1) * reached
     value = learner.agent.critic.value(features[-1]).squeeze(-1) * reached[-1] * continuation[-1]
-    return discount[:-1] @ reward + discount[-1] * value
+    return (discount[:-1, None] * reward).sum(0) + discount[-1] * value
 
 
 def correlation(first: Tensor, second: Tensor) -> Tensor:
     """Return the correlation of two vectors ``(W,)``, a scalar; 0 where one does not vary."""
     first, second = first - first.mean(), second - second.mean()
-    return (first @ second) / (first.norm() * second.norm()).clamp_min(1e-8)
+    return (first * second).sum() / (first.norm() * second.norm()).clamp_min(1e-8)

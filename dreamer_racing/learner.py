@@ -129,7 +129,7 @@ OPTIMIZERS: dict[str, Callable[[ParameterGroups, LearnerConfig], torch.optim.Opt
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss became infinite or not a number.
+    """The loss, its gradient or a reward became infinite or not a number.
 
     Attributes:
         batch: The batch that it happened with, ``[B, T]``.
@@ -137,25 +137,34 @@ class NonFiniteLossError(RuntimeError):
 
     def __init__(self, batch: TensorDictBase) -> None:
         super().__init__(
-            "The loss is not finite: the learning rate may be too high, or a reward or observation is bad."
+            "The loss, its gradient or a reward is not finite: the learning rate may be too high, or a reward or "
+            "observation is bad."
         )
         self.batch = batch
 
 
 class FiniteGuard:
-    """Raises once a loss is not finite.
+    """Raises once an update would spoil the networks.
 
     Args:
-        lag: Updates after which a loss is looked at: 0 at once, which waits for the device.
+        lag: Updates after which one is looked at: 0 at once, which waits for the device.
     """
 
     def __init__(self, lag: int) -> None:
         self._lag = lag
         self._pending: deque[tuple[Tensor, TensorDictBase]] = deque()
 
-    def check(self, loss: Tensor, batch: TensorDictBase) -> None:
-        """Take note of a scalar loss and its batch; raise ``NonFiniteLossError`` if one ``lag`` updates ago was bad."""
-        self._pending.append((loss.isfinite(), batch))
+    def check(self, metrics: dict[str, Tensor], batch: TensorDictBase) -> None:
+        """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
+
+        The loss alone does not tell: two-hot targets are clamped, so that an infinite reward makes it merely large.
+        """
+        watched = [
+            value
+            for name, value in metrics.items()
+            if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
+        ]
+        self._pending.append((torch.stack(watched).isfinite().all(), batch))
         if len(self._pending) > self._lag:
             finite, earlier = self._pending.popleft()
             if not finite:
@@ -256,13 +265,14 @@ class DreamerLearner:
 
         Raises:
             KeyError: If the batch lacks what a loss reads.
-            NonFiniteLossError: If the loss is not finite. On a CPU nothing has been changed by this batch; on a CUDA
-                device this is noticed two updates late, because waiting for the device would stall it.
+            NonFiniteLossError: If loss, gradient or a reward is not finite. On a CPU no network has been changed by
+                this batch; on a CUDA device this is noticed two updates late, because waiting for the device would
+                stall it.
         """
         self._timed = timed
         batch = batch.to(self.device, non_blocking=True)
         metrics = self._step(batch)
-        self._guard.check(metrics["loss"], batch)
+        self._guard.check(metrics, batch)
         with timed("optimise"):
             self.optimizer.step()
             self.agent.critic.update_slow(self.config.slow_critic_rate)
@@ -349,7 +359,8 @@ class DreamerLearner:
         """Restore what ``state_dict`` returned.
 
         Raises:
-            ValueError: If it is that of a model of another size or of other losses; nothing is changed then.
+            ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
+                changed then.
         """
         check_size(state_dict["size"], self.size)
         self._check_parts(state_dict)
@@ -371,6 +382,12 @@ class DreamerLearner:
                     f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
                     "environment of other observations. Choose those it was trained with."
                 )
+            for key, value in wanted.items():
+                if value.shape != found[key].shape:
+                    raise ValueError(
+                        f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
+                        f"{list(value.shape)}: it was trained in an environment of other observations or actions."
+                    )
 
     def _trained_parameters(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters of each network, with those that its loss has of its own."""

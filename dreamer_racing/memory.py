@@ -37,7 +37,7 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
     if size > available:
         raise ValueError(
             f"{setting} needs {size / GB:.1f} GB when full, and {device} has {available / GB:.1f} GB left: lower it to "
-            f"{available / size:.0%} of that or less, or keep the records in files with replay.storage=memmap."
+            f"{100 * available / size:.3g}% of that or less, or keep the records in files with replay.storage=memmap."
         )
 
 

@@ -301,7 +301,8 @@ class StreamSampler(RandomSampler):
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
         """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`."""
-        reach = self.writer.filled.masked_fill(~self._held_out, 0).clamp(max=recent)
+        reach = self.writer.filled.masked_fill(~self._held_out, 0)  # (N,)
+        reach = reach if recent is None else reach.clamp(max=recent)
         if int(reach.max()) < length:
             return None
         return self._draw(num_windows, length, reach, self._held_out_rng)

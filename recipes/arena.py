@@ -70,6 +70,7 @@ def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
             episode_steps=env.episode_steps,
             from_pixels=env.from_pixels,
             privileged=reads_privileged,
+            start_beyond_gate=env.start_beyond_gate,
             seed=config.seed,
             **worlds_of(config),
         )
@@ -117,7 +118,7 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         warmup_updates=model.warmup_updates,
         compile=model.compile,
         cuda_graph=model.cuda_graph,
-        mixed_precision=model.mixed_precision,
+        mixed_precision=bool(model.mixed_precision),
         **{f"{part}_loss": name for part, name in names.items()},
         **loss,
     )

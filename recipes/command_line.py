@@ -62,6 +62,14 @@ def choose_device(device: str) -> torch.device:
     return chosen
 
 
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether a device multiplies in bfloat16 natively, rather than slowly by way of float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
 def new_run_dir(recipe: str, track: str) -> Path:
     """A fresh folder name below `runs/`."""
     return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"

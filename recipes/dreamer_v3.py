@@ -28,7 +28,15 @@ from arena import (
     reward_terms,
     scene_name,
 )
-from command_line import CONFIG_DIR, choose_device, merge_overrides, new_run_dir, plain_errors, start_logging
+from command_line import (
+    CONFIG_DIR,
+    choose_device,
+    computes_bfloat16,
+    merge_overrides,
+    new_run_dir,
+    plain_errors,
+    start_logging,
+)
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, Storage, register
@@ -141,6 +149,10 @@ def resolve(config: DictConfig) -> DictConfig:
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
+    if config.model.mixed_precision is None:
+        config.model.mixed_precision = computes_bfloat16(device)
+        state, ability = ("on", "computes") if config.model.mixed_precision else ("off", "does not compute")
+        print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
     if config.run_dir is None:
         config.run_dir = str(new_run_dir("dreamer_v3", scene_name(cast(DreamerConfig, config))))
     if config.env.num_envs == 1 and config.replay.held_out:
@@ -233,7 +245,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> Run:
 def seed_generators(seed: int) -> None:
     """Seed all global generators, of which torch's samples actions and latents."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002: what libraries draw from
+    np.random.seed(seed)  # noqa: NPY002 - what libraries draw from
     torch.manual_seed(seed)
 
 

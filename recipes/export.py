@@ -13,6 +13,7 @@ from typing import cast
 
 import hydra
 import torch
+from arena import is_race
 from command_line import plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
 from schema import DreamerConfig, ExportConfig, register
@@ -23,18 +24,14 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import (
     LATENTS,
     ActorStep,
-    Flight,
     MissingPackagesError,
-    ParityError,
-    TorchActor,
     check_output,
-    episode_steps,
     export_actor,
     load_agent,
-    make_contract,
     make_step,
-    record_flight,
 )
+from dreamer_racing.export_contract import make_contract
+from dreamer_racing.export_parity import Flight, ParityError, TorchActor, episode_steps, record_flight
 from dreamer_racing.modules import Interface
 from dreamer_racing.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
 
@@ -62,9 +59,11 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = latest_checkpoint(config.checkpoint)
     run_dir = checkpoint.parent.parent
-    output = check_output(config.output or run_dir / "export" / "actor.onnx")
     saved = OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
     trained = cast(DreamerConfig, OmegaConf.to_object(saved))
+    if not is_race(trained):
+        raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
+    output = check_output(config.output or run_dir / "export" / "actor.onnx")
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     deviation = export_actor(step, contract, flight, output, config.seed)

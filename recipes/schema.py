@@ -15,6 +15,7 @@ class EnvConfig:
     preset: str = "easy"  # physics: easy | faithful
     num_envs: int = 32  # worlds flown side by side
     episode_steps: int = 1000  # control steps of 20 ms
+    start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
     renderer: str = "auto"  # auto | egl | osmesa | warp
     from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
     camera_tilt: float = 25.0  # degrees upwards
@@ -30,7 +31,7 @@ class ModelConfig:
     replay_ratio: float = MISSING  # records trained on per environment step
     learning_rate: float = MISSING
     behavior_learning_rate: float | None = None  # of actor and critic; null: the same
-    mixed_precision: bool = False  # bfloat16 where it does not matter: halves the time of large models, also on CPU
+    mixed_precision: bool | None = None  # bfloat16 where it does not matter; null: if the device computes in it
     compile: bool = False  # torch.compile of the losses
     cuda_graph: bool = False  # forward and backward as one CUDA graph
     warmup_updates: int = MISSING  # over which the learning rate rises from zero

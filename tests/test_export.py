@@ -24,21 +24,22 @@ from dreamer_racing.envs.quadrotor import PRESETS
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import (
-    MIN_STEPS,
     ActorStep,
-    Flight,
     MissingPackagesError,
-    ParityError,
     SampledActorStep,
-    TorchActor,
     check_output,
+    export_actor,
+    load_agent,
+    make_step,
+)
+from dreamer_racing.export_contract import hash_weights, make_contract
+from dreamer_racing.export_parity import (
+    MIN_STEPS,
+    Flight,
+    ParityError,
+    TorchActor,
     check_parity,
     episode_steps,
-    export_actor,
-    hash_weights,
-    load_agent,
-    make_contract,
-    make_step,
     record_flight,
 )
 from dreamer_racing.learner import Agent, DreamerLearner

@@ -1,13 +1,14 @@
 import copy
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import ACTOR_LOSSES, ReinforceLoss
-from dreamer_racing.modules import SIZES
+from dreamer_racing.learner import DreamerLearner, FiniteGuard, LearnerConfig, NonFiniteLossError
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
+from dreamer_racing.modules import SIZES, Interface
 
 CONFIG = LearnerConfig(imagination_horizon=4, lr=1e-3, warmup_updates=0)
 
@@ -131,6 +132,50 @@ def test_state_of_another_size_is_refused_with_what_to_do():
     assert "\n" not in str(error.value)
 
 
+def learner_of(world_model_loss, seed, **interface):
+    if WORLD_MODEL_LOSSES[world_model_loss].reads_privileged:
+        interface["privileged_dim"] = 21
+    return DreamerLearner(
+        "debug", Interface(**interface), replace(CONFIG, world_model_loss=world_model_loss), seed=seed
+    )
+
+
+def assert_refused(saved, learner, words):
+    before = copy.deepcopy(learner.state_dict())
+    with pytest.raises(ValueError, match=words) as error:
+        learner.load_state_dict(saved.state_dict())
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    after = learner.state_dict()
+    for name, value in before["agent"].items():
+        assert torch.equal(value, after["agent"][name]), name
+    for name, loss in before["losses"].items():
+        assert all(torch.equal(value, after["losses"][name][key]) for key, value in loss.items()), name
+    assert after["updates"] == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("privileged", "reconstruction"), ("decoder_free", "reward_only"), ("informed", "privileged")]
+)
+def test_state_of_another_loss_is_refused(first, second):
+    for there, here in ((first, second), (second, first)):
+        saved = learner_of(there, 1)
+        saved.updates = 7
+        assert_refused(saved, learner_of(here, 2), r"beyond this learner's, and lacks .* trained with another loss")
+
+
+@pytest.mark.parametrize(
+    ("there", "here"),
+    [
+        ({"action_dim": 6}, {}),
+        ({"pixels": False, "vector_dim": 21}, {}),
+        ({"pixels": False, "vector_dim": 21}, {"pixels": False, "vector_dim": 9}),
+    ],
+    ids=["actions", "pixels", "numbers"],
+)
+def test_state_of_another_environment_is_refused(there, here):
+    assert_refused(learner_of("reconstruction", 1, **there), learner_of("reconstruction", 2, **here), "environment")
+
+
 def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
     torch.manual_seed(3)
     expected = torch.rand(1)
@@ -166,6 +211,44 @@ def test_open_loop_video():
     images = learner.open_loop(make_batch(), context=2)
     assert images.shape == (3, 6, 64, 64, 3)
     assert images.dtype == torch.uint8
+
+
+def spoil_reward(value):
+    return lambda batch, learner: batch["reward"][0, 1].fill_(value)
+
+
+def spoil_gradient(batch, learner):
+    weight = next(learner.agent.critic.head.parameters())
+    weight.register_hook(lambda gradient: gradient * math.inf)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoil_reward(math.nan), spoil_reward(math.inf), spoil_reward(-math.inf), spoil_gradient],
+    ids=["nan", "inf", "-inf", "gradient"],
+)
+def test_what_would_spoil_the_networks_is_refused(spoil):
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    before, batch = copy.deepcopy(learner.agent.state_dict()), make_batch()
+    spoil(batch, learner)
+    with pytest.raises(NonFiniteLossError, match="not finite") as error:
+        learner.update(batch)
+    assert error.value.batch["reward"].shape == (3, 6, 1)
+    assert learner.updates == 0
+    for name, value in learner.agent.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_a_lagging_guard_names_the_batch_that_was_bad():
+    guard, names = FiniteGuard(lag=2), ("loss", "reward_error", "gradient_norm/actor")
+    metrics = {name: torch.tensor(1.0) for name in names} | {"agreement": torch.tensor(math.nan)}
+    for number in range(4):
+        guard.check(metrics, number)
+    guard.check(metrics | {"gradient_norm/actor": torch.tensor(math.inf)}, "bad")
+    guard.check(metrics, 5)
+    with pytest.raises(NonFiniteLossError) as error:
+        guard.check(metrics, 6)
+    assert error.value.batch == "bad"
 
 
 def test_policy_shares_the_parameters():
@@ -218,4 +301,6 @@ def test_mixed_precision_is_close_to_full(recurrence):
         torch.manual_seed(0)
         results.append(learner.update(make_batch()))
         assert all(parameter.dtype == torch.float32 for parameter in learner.agent.parameters())
+        assert all(value.dtype == torch.float32 and value.isfinite() for value in results[-1].values())
+    assert not torch.equal(results[0]["loss"], results[1]["loss"]), "nothing was computed in bfloat16"
     torch.testing.assert_close(results[0]["loss"], results[1]["loss"], rtol=1e-2, atol=0)

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
+import math
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import hydra
 import pytest
+import torch
 from omegaconf import OmegaConf
+
+from dreamer_racing.checkpoint import latest_checkpoint
+from dreamer_racing.envs.dmc import ControlSuiteEnv
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
@@ -23,8 +31,24 @@ SMALL = [
 ]  # fmt: skip
 
 
-def recipe(name: str, *overrides: str, cwd: Path, timeout: float = 240) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "recipes" / f"{name}.py"), *overrides]
+TINY = [
+    "track=circle", "model=debug", "model.batch_size=2", "env.num_envs=4", "env.episode_steps=40", "prefill=100",
+    "total_env_steps=200", "replay.capacity=1000", "replay.held_out=1", "evaluation.every=0", "evaluation.episodes=1",
+    "evaluation.video_steps=20", "checkpoint.every=0", "logger=csv", "logger.every=100", "device=cpu",
+]  # fmt: skip
+
+
+AT_THE_END = "evaluation.every=1000000"
+
+
+def recipe(
+    name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Run a recipe as a user does, or after some lines of Python."""
+    path = str(ROOT / "recipes" / f"{name}.py")
+    start = f"import runpy, sys\nsys.path.insert(0, {str(Path(path).parent)!r})\n{before}\nsys.argv[0] = {path!r}\n"
+    program = ["-c", f"{start}runpy.run_path({path!r}, run_name='__main__')"] if before else [path]
+    command = [sys.executable, *program, *overrides]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
 
 
@@ -43,13 +67,17 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def compose(recipe_name: str, *overrides: str) -> OmegaConf:
+def recipe_module(name: str) -> ModuleType:
+    """A module of the recipes' folder, which is no package."""
     sys.path.insert(0, str(ROOT / "recipes"))
     try:
-        from schema import register
+        return importlib.import_module(name)
     finally:
         sys.path.pop(0)
-    register()
+
+
+def compose(recipe_name: str, *overrides: str) -> OmegaConf:
+    recipe_module("schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         return hydra.compose(recipe_name, overrides=list(overrides))
 
@@ -150,3 +178,152 @@ def test_bad_input_gets_a_plain_error(overrides: list[str], words: list[str], tm
     assert "Traceback" not in done.stderr
     assert all(word in done.stderr for word in words), done.stderr
     assert len(done.stderr.strip().splitlines()) <= 6
+
+
+def build(*overrides: str) -> None:
+    """Resolve and build a run as `recipes/dreamer_v3.py` does, in this process."""
+    dreamer, command_line = recipe_module("dreamer_v3"), recipe_module("command_line")
+    with command_line.plain_errors():
+        config = dreamer.resolve(compose("dreamer_v3", "model=debug", "env.from_pixels=false", *overrides))
+        dreamer.build(OmegaConf.to_object(config), list(overrides)).close()
+
+
+REFUSED = [
+    (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
+    (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
+    (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4,000", "prefill=4,000", "no whole update"]),
+    (["prefill=4000", "total_env_steps=3000"], ["total_env_steps=3,000", "prefill=4,000"]),
+    (["prefill=512", "total_env_steps=527"], ["total_env_steps=527", "64 records"]),  # 15 × 4 are less than 4 × 16
+    (["replay.capacity=100000000000"], ["replay.capacity=100,000,000,000", " GB when full", "left", "memmap"]),
+    (["replay.capacity=100"], ["capacity=100", "batch_length=16", "at least 512"]),
+    (["replay.held_out=32"], ["held_out=32", "num_envs=32"]),
+    (["replay.recent_share=1.5"], ["recent_share=1.5", "between 0 and 1"]),
+    (["env.suite=atari"], ["env.suite=atari", "race", "dmc"]),
+    (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
+    (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
+    (["device=quantum"], ["device=quantum", "cpu"]),
+]
+
+
+@pytest.mark.parametrize(("overrides", "words"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
+def test_what_cannot_work_is_refused_before_it_starts(
+    overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exited:
+        build(f"run_dir={tmp_path / 'run'}", *overrides)
+    assert exited.value.code == 2
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("error: ") and "\n" not in message
+    assert all(word in message for word in words), message
+    assert not list((tmp_path / "run").glob("*.yaml")), "a run that was refused left its configuration"
+
+
+def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
+    build(f"run_dir={tmp_path}", "env.num_envs=4", "prefill=64", "total_env_steps=80", "replay.capacity=1000")
+    assert OmegaConf.load(tmp_path / "config.yaml").model.batch_length == 16
+
+
+def test_a_single_world_holds_nothing_out(capsys: pytest.CaptureFixture[str]) -> None:
+    dreamer = recipe_module("dreamer_v3")
+    for num_envs, held_out in ((1, 0), (2, 1)):
+        config = dreamer.resolve(compose("dreamer_v3", "model=debug", f"env.num_envs={num_envs}"))
+        assert config.replay.held_out == held_out
+        assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 1)
+
+
+@pytest.mark.slow
+def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
+    try:
+        ControlSuiteEnv("cartpole_swingup", 1).close()
+    except RendererUnavailableError as error:
+        pytest.skip(str(error))
+    settings = [setting for setting in TINY if not setting.startswith(("track=", "env."))]
+    settings += ["env=dmc", "task=cartpole_swingup", "prefill=1000", "total_env_steps=1050", AT_THE_END]
+    done = recipe("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = rows(tmp_path / "run")
+    assert any(row["episode/return"] for row in table), "an episode has 500 records"
+    for column in ("evaluation/return_mean", "loss_image", "held_out/image_error"):
+        assert any(row[column] for row in table), column
+    assert not any(name.startswith("curriculum/") or "gates" in name for name in table[0])
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    for other in ("evaluate", "export"):
+        refused = recipe(other, "checkpoint=run", cwd=tmp_path)
+        assert refused.returncode == 2 and "Traceback" not in refused.stderr, refused.stderr
+        assert "cartpole_swingup" in refused.stderr and "race" in refused.stderr
+    resumed = recipe("dreamer_v3", "resume=run", "task=walker_walk", cwd=tmp_path)
+    assert resumed.returncode == 2 and "Traceback" not in resumed.stderr, resumed.stderr
+
+
+@pytest.mark.slow
+def test_an_overlapped_run(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "collection=overlapped", "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = rows(tmp_path / "run")
+    assert [int(row["env_steps"]) for row in table] == [128, 224]
+    assert any(float(row["loss_image"] or "nan") > 0 for row in table)
+    assert latest_checkpoint(tmp_path / "run").name.endswith("224")
+
+
+@pytest.mark.slow
+def test_a_run_without_images(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    run_dir = tmp_path / "run"
+    table = rows(run_dir)
+    for column in ("loss_vector", "evaluation/gates_per_episode", "evaluation/success_rate"):
+        assert any(row[column] for row in table), column
+    assert "loss_image" not in table[0]
+    assert list((run_dir / "plots").glob("*.png")) and list((run_dir / "evaluations").glob("*.json"))
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
+    done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
+    assert "environment of other observations" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_privileged_run_is_evaluated(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "loss=privileged", "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", "video_steps=20", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "run" / "evaluation" / "evaluation.json").read_text())
+    assert all(len(report[policy]["episodes"]) == 2 for policy in ("deterministic", "stochastic"))
+    assert (tmp_path / "run" / "evaluation" / "videos" / "deterministic.mp4").stat().st_size > 0
+
+
+POISON = """
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+step, steps = DroneRacingEnv._step, []
+
+def poisoned(env, tensordict):
+    steps.append(0)
+    data = step(env, tensordict)
+    return data if len(steps) < 45 else data.set("reward_base", data["reward_base"] + float("inf"))
+
+DroneRacingEnv._step = poisoned
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [100, 0], ids=["checkpoint", "no checkpoint"])
+def test_a_loss_that_is_not_finite_ends_the_run(every: int, tmp_path: Path) -> None:
+    settings = [*TINY, "env.from_pixels=false", f"checkpoint.every={every}", "total_env_steps=2000"]
+    done = recipe("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path, before=POISON)
+    assert done.returncode == 1, done.stderr
+    run_dir, message = tmp_path / "run", done.stderr[done.stderr.index("error:") :].strip()
+    assert "is not finite" in message and "nonfinite_batch.pt" in message and "model.learning_rate" in message
+    assert "Traceback" not in message and "\n" not in message
+    batch = torch.load(run_dir / "nonfinite_batch.pt", weights_only=True)
+    assert batch["reward"].shape == (2, 16, 1) and math.inf in batch["reward"]
+    if not every:
+        assert "there is no checkpoint yet" in message
+        return
+    kept = latest_checkpoint(run_dir)
+    assert kept.name in message
+    for path in kept.rglob("*learner*/**/*.pt"):
+        weights = torch.load(path, weights_only=True)["agent"]
+        assert all(value.isfinite().all() for value in weights.values()), "what was saved is not the last good state"
+    assert int(kept.name.rpartition("-")[2]) >= 100

@@ -223,6 +223,73 @@ def test_a_share_of_the_windows_is_recent():
         make_replay(100, 1, 1, 4, recent_share=1.5)
 
 
+def stream(pixels: torch.Tensor) -> torch.Tensor:
+    """The environment that `CountingEnv` wrote into images."""
+    return pixels.flatten(-3)[..., 0]
+
+
+def test_streams_that_are_held_out_are_never_sampled():
+    replay, plain = (make_replay(3 * 40, 3, 100, 4, seed=3, held_out=2) for _ in range(2))
+    for rollout in collect(CountingEnv(3), steps=15, batches=4):
+        for each in (replay, plain):
+            each.extend(rollout)
+        apart = replay.held_out(100, 6)
+        assert apart.batch_size == (100, 6) and apart.keys() >= set(KEYS)
+        assert stream(apart["pixels"]).unique().tolist() == [1, 2]
+        assert (counter(apart["pixels"]).diff(dim=1) == 1).all()
+        sample = replay.sample()
+        assert stream(sample["pixels"]).unique().tolist() == [0]
+        assert torch.equal(sample["pixels"], plain.sample()["pixels"]), "looking at what is held out changed a sample"
+    assert stream(make_both(held_out=0).sample()["pixels"]).unique().tolist() == [0, 1]
+
+
+def make_both(**arguments):
+    """A replay of two environments without ends, 31 records of each."""
+    replay = make_replay(2 * 40, 2, 500, 4, **arguments)
+    replay.extend(collect(CountingEnv(2, end=0.0), steps=30, batches=1)[0])
+    return replay
+
+
+def test_what_is_held_out_may_be_the_newest():
+    replay = make_both(held_out=1)
+    for recent, ages in ((10, 10), (4, 4), (None, 31), (1_000, 31)):
+        age = 31 - counter(replay.held_out(500, 4, recent)["pixels"])
+        assert age.unique().tolist() == list(range(ages)), recent
+    assert replay.held_out(5, 31).batch_size == (5, 31)
+    assert replay.held_out(5, 32) is None, "longer than the stream"
+    assert replay.held_out(5, 4, recent=3) is None, "longer than the newest"
+    assert make_both(held_out=0).held_out(5, 4) is None, "there is nothing apart"
+    assert make_replay(80, 2, 4, 4, held_out=1).held_out(5, 4) is None, "nothing has been written"
+    delivered = make_both(held_out=1, device="meta", storage_device="cpu").held_out(5, 4)
+    assert {value.device.type for value in delivered.values()} == {"meta"}
+
+
+def test_something_must_be_left_to_sample():
+    for held_out in (2, 3, -1):
+        with pytest.raises(ValueError, match=f"held_out={held_out} of num_envs=2"):
+            make_replay(80, 2, 4, 4, held_out=held_out)
+    replay = make_replay(80, 2, 4, 10, held_out=1)
+    replay.extend(collect(CountingEnv(2, end=0.0), steps=8, batches=1)[0])
+    replay.writer.filled[1] = 20
+    assert not replay.can_sample()
+    with pytest.raises(RuntimeError, match="longest stream holds 9"):
+        replay.sample()
+
+
+def test_an_environment_without_race_terms():
+    rollout = collect(CountingEnv(2), steps=20, batches=1)[0]
+    del rollout["next", "reward_base"], rollout["next", "body_rate_norm"]
+    with pytest.raises(KeyError, match="'next', 'reward_base'"):
+        make_replay(80, 2, 4, 4).extend(rollout)
+    replay = make_replay(80, 2, 4, 4, reward_keys=("reward",))
+    replay.extend(rollout)
+    records = replay.records(0)
+    assert set(records.keys()) == {"pixels", "previous_action", "reward", "is_init", "terminated", "truncated"}
+    assert torch.equal(records["reward"][~records["is_init"]], rollout["next", "reward"][0].flatten())
+    assert (records["reward"][records["is_init"]] == 0).all()
+    assert "reward_base" not in replay.sample()
+
+
 def test_short_streams_are_never_drawn():
     replay = make_replay(40, 2, 64, 6)
     rollout = collect(CountingEnv(2, end=0.0), steps=5, batches=1)[0]

@@ -219,11 +219,19 @@ class StartSampler:
     the free box, 0.3 m from its sides. ``load_track`` accepts only tracks on which neither the noise nor this move can
     carry a drone across the plane of its first gate.
 
+    A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random one, facing and flying along its
+    direction at 1.5–5 m/s, to the next gate. They practise the turn from one gate to the next before the policy flies
+    through the first well enough to get there.
+
     Args:
         track: the track.
         generator: source of randomness, on the sampler's device; None for torch's own.
         device: where the poses are wanted.
         dtype: floating-point type of the poses.
+        beyond_gate: share of training episodes that begin beyond a gate; the others are as above.
+
+    Raises:
+        ValueError: ``beyond_gate`` is not a share.
 
     Example:
         >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
@@ -235,6 +243,8 @@ class StartSampler:
     ATTITUDE_NOISE_DEGREES = (5.0, 5.0, 10.0)  # roll, pitch, yaw
     GATE_DISTANCE = (1.0, 3.0)  # m before a random gate
     SPEED = (1.5, 2.5)  # m/s towards a random gate
+    BEYOND_DISTANCE = (0.6, 2.0)  # m behind a random gate: more than the noise
+    BEYOND_SPEED = (1.5, 5.0)  # m/s along its direction
 
     def __init__(
         self,
@@ -242,7 +252,11 @@ class StartSampler:
         generator: torch.Generator | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
+        beyond_gate: float = 0.0,
     ):
+        if not 0.0 <= beyond_gate <= 1.0:
+            raise ValueError(f"beyond_gate={beyond_gate}: a share of episodes lies between 0 and 1.")
+        self._beyond_gate = beyond_gate
         self._generator = generator
         self._device, self._dtype = device, dtype
         self._gate_positions = track.gate_positions(device, dtype)
@@ -277,12 +291,14 @@ class StartSampler:
         )
 
     def _training_start(self, num: int) -> StartPose:
-        """Draw noisy poses at the start and before random gates."""
+        """Draw noisy poses at the start, before random gates and beyond them."""
         draw = torch.rand(num, 9, generator=self._generator, device=self._device, dtype=self._dtype)
         gate = torch.randint(len(self._gate_yaws), (num,), generator=self._generator, device=self._device)
-        at_gate = draw[:, 0] < 0.5  # (N,)
-        distance = _spread(draw[:, 1], self.GATE_DISTANCE)
-        speed = _spread(draw[:, 2], self.SPEED)
+        beyond = draw[:, 0] < self._beyond_gate  # (N,)
+        at_gate = draw[:, 0] < 0.5 * (1.0 + self._beyond_gate)
+        before = _spread(draw[:, 1], self.GATE_DISTANCE)
+        distance = torch.where(beyond, -_spread(draw[:, 1], self.BEYOND_DISTANCE), before)
+        speed = torch.where(beyond, _spread(draw[:, 2], self.BEYOND_SPEED), _spread(draw[:, 2], self.SPEED))
         noise = 2 * draw[:, 3:] - 1  # (N, 6)
 
         before_gate = self._gate_positions[gate] - distance.unsqueeze(-1) * self._gate_normals[gate]
@@ -292,12 +308,14 @@ class StartSampler:
         position = origin + rotate(from_roll_pitch_yaw(level, level, yaw), noise[:, :3] * self._position_noise)
         position = torch.minimum(torch.maximum(position, self._low), self._high)
         roll, pitch, yaw_noise = (noise[:, 3:] * self._attitude_noise).unbind(-1)
-        direction = torch.nn.functional.normalize(self._gate_positions[gate] - position, dim=-1)
+        towards = torch.nn.functional.normalize(self._gate_positions[gate] - position, dim=-1)
+        direction = torch.where(beyond.unsqueeze(-1), self._gate_normals[gate], towards)
+        target = (gate + beyond) % len(self._gate_yaws)
         return StartPose(
             position=position,
             attitude=from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise),
             linear_velocity=torch.where(at_gate, speed, 0.0).unsqueeze(-1) * direction,
-            target_gate=torch.where(at_gate, gate, 0),
+            target_gate=torch.where(at_gate, target, 0),
         )
 
 

@@ -36,6 +36,7 @@ class RaceWorlds:
         num_threads: of physics and rendering; all CPUs of the process if None.
         device: `cpu`; the CUDA backend is not built yet.
         seed: of start poses and physics randomisation.
+        start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -63,6 +64,7 @@ class RaceWorlds:
         num_threads: int | None = None,
         device: torch.device | str = "cpu",
         seed: int | None = None,
+        start_beyond_gate: float = 0.0,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
@@ -95,7 +97,7 @@ class RaceWorlds:
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
-        self._starts = StartSampler(self.track, self._generator, self.device, self.dtype)
+        self._starts = StartSampler(self.track, self._generator, self.device, self.dtype, start_beyond_gate)
 
     def seed(self, seed: int | None) -> None:
         """Seed start poses and physics randomisation; None draws a seed from the operating system."""

@@ -105,7 +105,8 @@ class TwoHot(nn.Module):
         half = self.values.shape[0] // 2
         # Mirrored bins are subtracted first: the bins reach 5e8, and uniform logits must still give exactly zero.
         difference = probabilities[..., half + 1 :] - probabilities[..., :half].flip(-1)
-        return (difference @ self.values[half + 1 :]).unsqueeze(-1)
+        # Not a matrix product, which autocast would round to bfloat16, and with it every return.
+        return (difference * self.values[half + 1 :]).sum(-1, keepdim=True)
 
     def cross_entropy(self, log_probabilities: Tensor, target: Tensor) -> Tensor:
         """Return −Σ two_hot(target)·log p.

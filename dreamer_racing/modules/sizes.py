@@ -93,6 +93,30 @@ _CPU = ModelSize(
 
 Channels in multiples of 16 fill the vector registers: 16-32-64 takes 60 % of the time of 24-36-48."""
 
+
+def _paper(name: str, belief: int, units: int, layers: int, cnn_depth: int) -> ModelSize:
+    """Size of the 2023 reference: the architecture of the paper, not the block GRU of the same widths."""
+    return ModelSize(
+        name,
+        belief=belief,
+        hidden=units,
+        classes=32,
+        units=units,
+        cnn_depth=cnn_depth,
+        recurrence="dense",
+        blocks=1,
+        prior_layers=1,
+        head_layers=layers,
+        actor_critic_layers=layers,
+        vector_layers=layers,
+        norm="layer",
+        learned_initial=True,
+        cnn_multipliers=(1, 2, 4, 8),
+        cnn_kernel=4,
+        strided=True,
+    )
+
+
 SIZES: dict[str, ModelSize] = {
     size.name: size
     for size in (
@@ -105,13 +129,18 @@ SIZES: dict[str, ModelSize] = {
         _reference("size50m", 4096, 512, 32),
         _reference("size100m", 6144, 768, 48),
         _reference("size200m", 8192, 1024, 64),
-        # The paper's "Large": the 2023 architecture of 77 M parameters, not the block GRU of the same widths.
-        ModelSize("paper_large", belief=2048, hidden=768, classes=32, units=768, cnn_depth=64,
-                  recurrence="dense", blocks=1, prior_layers=1, head_layers=4, actor_critic_layers=4, norm="layer",
-                  learned_initial=True, cnn_multipliers=(1, 2, 4, 8), cnn_kernel=4, strided=True),
+        _paper("paper_small", 512, 512, 2, 32),
+        _paper("paper_medium", 1024, 640, 3, 48),
+        _paper("paper_large", 2048, 768, 4, 64),
+        # The widths of paper_large with the block GRU, the heads and the convolutions of TorchRL's stock agent.
+        replace(_paper("block_large", 2048, 768, 3, 64), recurrence="block", blocks=8, learned_initial=False,
+                head_layers=1, cnn_multipliers=(1, 2, 4, 4)),
     )
 }  # fmt: skip
-"""Sizes by name. Reference: danijar/dreamerv3 ``configs.yaml``; paper, "Large (L)" configuration."""
+"""Sizes by name.
+
+Reference: ``size*`` danijar/dreamerv3 ``configs.yaml``; ``paper_*`` S, M and L of Hafner et al. 2023, Appendix B, of
+which the paper uses L."""
 
 
 def get_size(size: ModelSize | str) -> ModelSize:

@@ -377,3 +377,26 @@ def test_no_start_is_past_its_gate_however_tight_the_box(yaw, seed):
     distance = -(pose.position * track.gate_normals(dtype=torch.float64)[0]).sum(-1)
     assert distance.min() > 0.29
     assert pose.position[:, :2].abs().max() <= 1.01 + 1e-9
+
+
+def test_starts_beyond_a_gate_face_the_turn_to_the_next():
+    track = load_track("circle")
+    pose = StartSampler(track, torch.Generator().manual_seed(0), beyond_gate=1.0).sample(2000)
+    gate = (pose.target_gate - 1) % 4
+    normal = track.gate_normals()[gate]
+    behind = ((pose.position - track.gate_positions()[gate]) * normal).sum(-1)
+    assert behind.min() >= 0.1 and behind.max() <= 2.5
+    speed = pose.linear_velocity.norm(dim=-1)
+    assert 1.5 <= speed.min() < 1.6 and 4.9 < speed.max() <= 5.0
+    torch.testing.assert_close(pose.linear_velocity, speed.unsqueeze(-1) * normal)
+    assert pose.target_gate.unique().tolist() == [0, 1, 2, 3]
+
+
+def test_the_share_of_starts_beyond_a_gate_leaves_the_rest_as_it_was():
+    pose = StartSampler(load_track("circle"), torch.Generator().manual_seed(0), beyond_gate=0.4).sample(20_000)
+    at_rest = pose.linear_velocity.norm(dim=-1) == 0
+    fast = pose.linear_velocity.norm(dim=-1) > 2.5
+    assert at_rest.float().mean() == pytest.approx(0.3, abs=0.02)
+    assert fast.float().mean() == pytest.approx(0.4 * 2.5 / 3.5, abs=0.02)
+    with pytest.raises(ValueError, match="beyond_gate=2"):
+        StartSampler(load_track("circle"), beyond_gate=2)

@@ -64,3 +64,13 @@ def test_mlp_and_continue_head_shapes(norm):
     probability = ContinueHead(8, layers=1, units=16, norm=norm).probability(features)
     assert probability.shape == (2, 3, 1)
     assert ((probability > 0) & (probability < 1)).all()
+
+
+def test_values_keep_their_precision_under_autocast():
+    two_hot, values = TwoHot(255), torch.tensor([[53.2], [0.333], [-17.77]])
+    index, weight = two_hot.encode(values)
+    logits = torch.zeros(3, 255).scatter_(-1, index, weight).clamp_min(1e-30).log()
+    with torch.autocast("cpu", torch.bfloat16):
+        decoded = two_hot.decode(logits)
+    assert decoded.dtype == torch.float32
+    torch.testing.assert_close(decoded, values, rtol=1e-5, atol=1e-5)

@@ -1,0 +1,73 @@
+"""Compiled and graphed updates compute what plain ones do."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+
+
+def batch(device: str, windows: int = 2, steps: int = 4) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    shape = (windows, steps)
+    records = {
+        "pixels": torch.randint(0, 256, (*shape, 64, 64, 3), dtype=torch.uint8, generator=generator),
+        "previous_action": torch.rand(*shape, 4, generator=generator) * 2 - 1,
+        "reward": torch.randn(*shape, 1, generator=generator),
+        "is_init": torch.rand(*shape, 1, generator=generator) < 0.2,
+        "terminated": torch.zeros(*shape, 1, dtype=torch.bool),
+        "truncated": torch.zeros(*shape, 1, dtype=torch.bool),
+    }
+    return TensorDict(records, shape).to(device)
+
+
+def make(device: str, **settings: object) -> DreamerLearner:
+    return DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3, **settings), device=device, seed=0)
+
+
+def first_losses(learner: DreamerLearner, device: str) -> dict[str, float]:
+    """Losses that no random number reaches before the first step: with one record there is no dynamics to sample."""
+    metrics = learner.update(batch(device, steps=1))
+    return {name: metrics[name].item() for name in ("loss_image", "loss_reward", "loss_continue")}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile on a CPU needs a C++ compiler")
+def test_compiled_losses_and_gradients_are_those_of_eager_mode() -> None:
+    torch._dynamo.reset()
+    plain, compiled = make("cpu"), make("cpu", compile=True)
+    expected, found = first_losses(plain, "cpu"), first_losses(compiled, "cpu")
+    assert found == pytest.approx(expected, rel=1e-2)
+    for _ in range(2):
+        assert all(value.isfinite() for value in compiled.update(batch("cpu", steps=1)).values())
+
+
+def test_a_cuda_graph_needs_a_cuda_device() -> None:
+    with pytest.raises(ValueError, match="cuda_graph=True needs a CUDA device, but the learner is on 'cpu'"):
+        make("cpu", cuda_graph=True)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}], ids=str)
+def test_graphed_updates_learn_as_eager_ones(settings: dict[str, object]) -> None:
+    plain, graphed = make("cuda", **settings), make("cuda", cuda_graph=True, **settings)
+    data = batch("cuda")
+    for _ in range(20):
+        expected, found = plain.update(data), graphed.update(data)
+    assert expected.keys() == found.keys()
+    # Random numbers differ, what is learned does not.
+    assert found["loss_image"].item() == pytest.approx(expected["loss_image"].item(), rel=0.05)
+    for mine, theirs in zip(graphed.agent.parameters(), plain.agent.parameters(), strict=True):
+        assert mine.isfinite().all() and mine.shape == theirs.shape
+
+
+@pytest.mark.gpu
+def test_a_graph_refuses_another_batch_shape() -> None:
+    learner = make("cuda", cuda_graph=True)
+    learner.update(batch("cuda"))
+    with pytest.raises(ValueError, match=r"captured for a batch of \[2, 4\], got \[3, 4\]"):
+        learner.update(batch("cuda", windows=3))
