@@ -593,6 +593,16 @@ def test_bad_input_gets_a_plain_error(run_dir: Path, overrides: list[str], words
     assert len(done.stderr.strip().splitlines()) <= 6
 
 
+def test_only_actors_that_race_are_exported(run_dir: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_dir, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
+    config = OmegaConf.load(tmp_path / "run" / "config.yaml")
+    config.env.suite, config.task = "dmc", "cartpole_swingup"
+    OmegaConf.save(config, tmp_path / "run" / "config.yaml")
+    done = recipe("export", "checkpoint=run", cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "was trained on cartpole_swingup" in done.stderr and not (tmp_path / "run" / "export").exists()
+
+
 def test_missing_packages_are_named(run_dir: Path) -> None:
     before = "import dreamer_racing.export as export\nexport.PACKAGES = ('onnx', 'no_such_package')\n"
     done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent, before=before)
