@@ -281,6 +281,14 @@ class DreamerLearner:
         self.updates += 1
         return metrics
 
+    def check_finite(self) -> None:
+        """Wait for the latest updates' losses, so that nothing bad is saved.
+
+        Raises:
+            NonFiniteLossError: If one of them is not finite.
+        """
+        self._guard.settle()
+
     def autocast(self) -> torch.autocast:
         """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
         kind = self.device.type if torch.amp.is_autocast_available(self.device.type) else "cpu"  # meta has none

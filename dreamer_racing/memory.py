@@ -41,7 +41,12 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
         )
 
 
-def out_of_memory_advice(error: torch.OutOfMemoryError) -> str:
+def is_out_of_memory(error: RuntimeError) -> bool:
+    """Whether torch failed for want of memory, of a CUDA device or of the CPU."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
+def out_of_memory_advice(error: RuntimeError) -> str:
     """Return the first line of the error, and which settings take memory, largest first."""
     first = str(error).splitlines()[0]
     return (

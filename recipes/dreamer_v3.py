@@ -50,7 +50,7 @@ from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.learner import DreamerLearner, NonFiniteLossError
-from dreamer_racing.memory import available_memory, check_fits, out_of_memory_advice
+from dreamer_racing.memory import available_memory, check_fits, is_out_of_memory, out_of_memory_advice
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
 from dreamer_racing.modules import DreamerPolicy, Interface
 from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
@@ -121,7 +121,9 @@ def main(config: DictConfig) -> None:
             f"kept in {run.directory / 'nonfinite_batch.pt'}; {run.last_good}. Continue from there with a lower "
             "model.learning_rate, or model.mixed_precision=false."
         ) from error
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
         raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
@@ -334,10 +336,10 @@ def train(run: Run) -> None:
             if schedule.due("evaluate", counters["env_steps"]):
                 evaluate(run)
             if schedule.due("save", counters["env_steps"]):
-                run.checkpoints.save(counters["env_steps"])
+                save(run)
         if stop.requested:
             bar.write(f"{stop.signal_name}: saving; continue with resume={run.directory}")
-        saved = run.checkpoints.save(counters["env_steps"])
+        saved = save(run)
         if not stop.requested and config.evaluation.every:
             evaluate(run)
         run.metrics.write(counters["env_steps"])
@@ -371,6 +373,12 @@ def measure(run: Run) -> None:
     windows = run.replay.held_out(HELD_OUT_WINDOWS, CONTEXT + run.config.model.imagination_horizon, HELD_OUT_RECORDS)
     if windows is not None and run.counters["updates"]:
         run.metrics.push(held_out_metrics(run.learner, windows))
+
+
+def save(run: Run) -> Path:
+    """Save everything, unless the networks have just been spoilt."""
+    run.learner.check_finite()
+    return run.checkpoints.save(run.counters["env_steps"])
 
 
 def evaluate(run: Run) -> None:

@@ -29,21 +29,18 @@ def make(device: str, **settings: object) -> DreamerLearner:
     return DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3, **settings), device=device, seed=0)
 
 
-def first_losses(learner: DreamerLearner, device: str) -> dict[str, float]:
-    """Losses that no random number reaches before the first step: with one record there is no dynamics to sample."""
-    metrics = learner.update(batch(device, steps=1))
-    return {name: metrics[name].item() for name in ("loss_image", "loss_reward", "loss_continue")}
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile on a CPU needs a C++ compiler")
-def test_compiled_losses_and_gradients_are_those_of_eager_mode() -> None:
+def test_compiled_updates_are_those_of_eager_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch._inductor.config, "fallback_random", True)  # the same random numbers as eager mode
     torch._dynamo.reset()
     plain, compiled = make("cpu"), make("cpu", compile=True)
-    expected, found = first_losses(plain, "cpu"), first_losses(compiled, "cpu")
-    assert found == pytest.approx(expected, rel=1e-2)
-    for _ in range(2):
-        assert all(value.isfinite() for value in compiled.update(batch("cpu", steps=1)).values())
+    for seed in range(3):
+        metrics = []
+        for learner in (plain, compiled):
+            torch.manual_seed(seed)
+            metrics.append({name: value.item() for name, value in learner.update(batch("cpu", steps=2)).items()})
+        assert metrics[1] == pytest.approx(metrics[0], rel=1e-3, abs=1e-4)
 
 
 def test_a_cuda_graph_needs_a_cuda_device() -> None:
