@@ -165,10 +165,14 @@ class FiniteGuard:
             if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
         ]
         self._pending.append((torch.stack(watched).isfinite().all(), batch))
-        if len(self._pending) > self._lag:
-            finite, earlier = self._pending.popleft()
+        self.settle(self._lag)
+
+    def settle(self, lag: int = 0) -> None:
+        """Look at all updates but the latest ``lag``; raise ``NonFiniteLossError`` at the first that was bad."""
+        while len(self._pending) > lag:
+            finite, batch = self._pending.popleft()
             if not finite:
-                raise NonFiniteLossError(earlier)
+                raise NonFiniteLossError(batch)
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
@@ -282,10 +286,10 @@ class DreamerLearner:
         return metrics
 
     def check_finite(self) -> None:
-        """Wait for the latest updates' losses, so that nothing bad is saved.
+        """Wait for the latest updates, so that nothing bad is saved.
 
         Raises:
-            NonFiniteLossError: If one of them is not finite.
+            NonFiniteLossError: If one of them was not finite.
         """
         self._guard.settle()
 

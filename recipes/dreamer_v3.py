@@ -340,7 +340,7 @@ def train(run: Run) -> None:
         if stop.requested:
             bar.write(f"{stop.signal_name}: saving; continue with resume={run.directory}")
         saved = save(run)
-        if not stop.requested and config.evaluation.every:
+        if not stop.requested and config.evaluation.every and not schedule.did("evaluate", counters["env_steps"]):
             evaluate(run)
         run.metrics.write(counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
@@ -400,6 +400,11 @@ class Schedule:
     def __init__(self, env_steps: int, **every: int) -> None:
         self._every = every
         self._done = {name: env_steps // period if period else 0 for name, period in every.items()}
+        self._last: dict[str, int] = {}
+
+    def did(self, name: str, env_steps: int) -> bool:
+        """Whether it was due at just this number of env_steps."""
+        return self._last.get(name) == env_steps
 
     def due(self, name: str, env_steps: int) -> bool:
         """Whether another period has passed; asking takes note of it."""
@@ -407,6 +412,7 @@ class Schedule:
         if not period or env_steps // period <= self._done[name]:
             return False
         self._done[name] = env_steps // period
+        self._last[name] = env_steps
         return True
 
 
