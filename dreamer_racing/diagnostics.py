@@ -37,7 +37,8 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
         - ``held_out/open_loop_correlation``: of those sums with the real ones;
         - ``imagination/return_correlation`` and ``imagination/return_bias`` (imagined minus real): the return over the
           horizon plus the discounted value after it, imagined by the present policy, against the one that the world
-          paid. The actions of newest records are those of nearly the same policy.
+          paid. The actions of newest records are those of nearly the same policy. Windows that begin at an episode's
+          last record, or in which time ran out, are left out.
 
     Raises:
         ValueError: If the windows are too short.
@@ -71,9 +72,22 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
     real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value
     imagined = _imagined_return(learner, start, horizon, discount)
-    metrics["imagination/return_correlation"] = correlation(imagined, real)
-    metrics["imagination/return_bias"] = (imagined - real).mean()
+    comparable = _comparable(batch, alive)
+    if comparable.any():
+        imagined, real = imagined[comparable], real[comparable]
+        metrics["imagination/return_correlation"] = correlation(imagined, real)
+        metrics["imagination/return_bias"] = (imagined - real).mean()
     return metrics
+
+
+def _comparable(batch: TensorDictBase, alive: Tensor) -> Tensor:
+    """Which windows ``(W,)`` an imagined return can be held against: not begun or cut off where an episode ended.
+
+    A crash inside the horizon stays; a time limit there hides what the world would have paid.
+    """
+    ended, truncated = (batch["terminated"] | batch["truncated"]).squeeze(-1), batch["truncated"].squeeze(-1)
+    cut_off = (truncated[:, CONTEXT:] & alive.bool()).any(1)
+    return ~ended[:, CONTEXT - 1] & ~cut_off
 
 
 def _open_loop_features(learner: DreamerLearner, start: tuple[Tensor, Tensor], actions: Tensor) -> Tensor:
