@@ -49,6 +49,16 @@ class OverlappedRollouts(Iterator[TensorDictBase]):
         self._next = self._thread.submit(next, self._rollouts)
         return rollout
 
+    def drain(self) -> TensorDictBase | None:
+        """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.
+
+        What a checkpoint holds of replay, environment and collector then belongs together.
+        """
+        if self._next is None:
+            return None
+        rollout, self._next = self._next.result().clone(), None
+        return rollout
+
     def close(self) -> None:
         """Wait for the rollout under way."""
         self._thread.shutdown(wait=True)

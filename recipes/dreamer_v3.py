@@ -12,7 +12,7 @@ import random
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import hydra
 import numpy as np
@@ -185,6 +185,11 @@ def check(config: DreamerConfig) -> None:
             f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
             f"{config.env.num_envs * model.batch_length}."
         )
+    if config.collection is Collection.overlapped and not is_race(config):
+        raise ValueError(
+            f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
+            "thread that made them. Use collection=sync."
+        )
     if not updates_in(config, config.total_env_steps):
         raise ValueError(
             f"model.replay_ratio={model.replay_ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
@@ -322,11 +327,8 @@ def train(run: Run) -> None:
         learn(run, stop)  # what a signal left undone
         while counters["env_steps"] < config.total_env_steps and not stop.requested:
             with run.clock.timed("collect"):
-                rollout = next(run.rollouts)
-                run.replay.extend(rollout)
-            counters["env_steps"] += rollout.numel()
-            bar.update(rollout.numel())
-            finish_episodes(run, rollout)
+                take_in(run, next(run.rollouts))
+            bar.update(counters["env_steps"] - bar.n)
             learn(run, stop)
             if stop.signal_name:
                 break
@@ -346,8 +348,10 @@ def train(run: Run) -> None:
         bar.write(f"checkpoint: {saved}")
 
 
-def finish_episodes(run: Run, rollout: Any) -> None:
-    """Account for the episodes that ended in a rollout; let the curriculum set the b₂ of the steps to come."""
+def take_in(run: Run, rollout: TensorDictBase) -> None:
+    """Store a rollout, account for the episodes that ended in it, and let the curriculum set the b₂ of what comes."""
+    run.replay.extend(rollout)
+    run.counters["env_steps"] += rollout.numel()
     episodes = run.tracker.update(rollout)
     run.counters["episodes"] += len(episodes)
     run.metrics.push(run.tracker.summary(episodes))
@@ -378,6 +382,8 @@ def measure(run: Run) -> None:
 def save(run: Run) -> Path:
     """Save everything, unless the networks have just been spoilt."""
     run.learner.check_finite()
+    if isinstance(run.rollouts, OverlappedRollouts) and (rollout := run.rollouts.drain()) is not None:
+        take_in(run, rollout)
     return run.checkpoints.save(run.counters["env_steps"])
 
 

@@ -93,6 +93,22 @@ def test_who_acts_has_the_weights_from_before_the_last_updates() -> None:
     overlapped.rollouts.close()
 
 
+def test_after_drain_nothing_is_under_way_and_nothing_is_lost() -> None:
+    overlapped = Overlapped()
+    assert overlapped.rollouts.drain() is None
+    arrived = [overlapped.take()]
+    overlapped.collector.let_end.release()
+    drained = overlapped.rollouts.drain()
+    assert drained is not None
+    assert overlapped.rollouts.drain() is None
+    assert not overlapped.collector.begun.acquire(timeout=0.1), "the next waits to be asked for"
+    overlapped.begun = 0  # as at the first: taken at once, and one more begun
+    arrived += [drained, overlapped.take()]
+    assert [int(rollout["number"]) for rollout in arrived] == [0, 1, 2]
+    overlapped.collector.let_end.release()
+    overlapped.rollouts.close()
+
+
 def test_close_waits_for_the_rollout_under_way() -> None:
     overlapped = Overlapped()
     overlapped.take()
