@@ -7,6 +7,7 @@ process leaves behind has a name with a leading dot, is never read, and is remov
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
@@ -104,6 +105,7 @@ class RunCheckpoints:
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2) -> None:
         self.directory = Path(run_dir).absolute() / CHECKPOINTS
+        self.components = components
         self._checkpoint = _bind({**components, "random_state": RandomState()})
         self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, prefix=_PREFIX)
         self._last_saved: Path | None = None
@@ -172,6 +174,36 @@ class RunCheckpoints:
                 shutil.rmtree(tombstone, ignore_errors=True)
                 os.replace(path, tombstone)
                 shutil.rmtree(tombstone)
+
+
+class BestCheckpoint:
+    """Keeps the parts as they were at the best evaluation so far, below ``<run_dir>/best``.
+
+    Args:
+        run_dir: folder of the run.
+        components: as of `RunCheckpoints`.
+
+    Attributes:
+        score: of the evaluation whose parts are kept; None before the first.
+    """
+
+    def __init__(self, run_dir: str | Path, components: Mapping[str, Any]) -> None:
+        self.directory = Path(run_dir).absolute() / "best"
+        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
+        self.score: float | None = None
+        with contextlib.suppress(FileNotFoundError):
+            self.score = Checkpoint.manifest(latest_checkpoint(self.directory))["metadata"]["score"]
+
+    def offer(self, score: float, env_steps: int) -> bool:
+        """Save the parts if the score beats that of the kept ones; return whether it did."""
+        if self.score is not None and score <= self.score:
+            return False
+        # A run that was resumed from before the kept one must not remove what it saves now as the older.
+        shutil.rmtree(self._checkpoints.directory, ignore_errors=True)
+        self._checkpoints = RunCheckpoints(self.directory, self._checkpoints.components, keep_last=1)
+        self._checkpoints.save(env_steps, {"score": score})
+        self.score = score
+        return True
 
 
 def load_components(

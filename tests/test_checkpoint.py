@@ -19,6 +19,7 @@ from torchrl.checkpoint import CheckpointError
 
 from dreamer_racing import checkpoint as checkpoint_module
 from dreamer_racing.checkpoint import (
+    BestCheckpoint,
     GracefulExit,
     RunCheckpoints,
     ensure_writable,
@@ -321,3 +322,22 @@ def test_handlers_return_after_an_exception():
     with pytest.raises(ZeroDivisionError), GracefulExit():
         raise ZeroDivisionError
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_best_is_kept_and_only_the_best(tmp_path):
+    counters = {"env_steps": 10}
+    best = BestCheckpoint(tmp_path, {"counters": counters})
+    assert best.score is None
+    assert best.offer(1.0, 10)
+    counters["env_steps"] = 20
+    assert not best.offer(1.0, 20)
+    restored: dict[str, int] = {}
+    assert load_components(tmp_path / "best", {"counters": restored})["score"] == 1.0
+    assert restored == {"env_steps": 10}
+    resumed = BestCheckpoint(tmp_path, {"counters": counters})
+    assert resumed.score == 1.0
+    counters["env_steps"] = 5  # resumed from before the best
+    assert resumed.offer(2.0, 5)
+    load_components(tmp_path / "best", {"counters": restored})
+    assert restored == {"env_steps": 5}
+    assert len(list((tmp_path / "best").glob("checkpoints/checkpoint-*"))) == 1
