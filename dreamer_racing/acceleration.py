@@ -39,6 +39,10 @@ class GraphedStep:
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of its scalars."""
+        with torch.cuda.device(batch.device):  # streams and graphs belong to the current device
+            return self._replay(batch)
+
+    def _replay(self, batch: TensorDictBase) -> dict[str, Tensor]:
         graph = self._graph or self._capture(batch)
         if batch.batch_size != self._batch.batch_size:
             raise ValueError(
@@ -54,7 +58,8 @@ class GraphedStep:
         buffers = {name: buffer.clone() for name, buffer in self._module.named_buffers()}
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
+        # The warm-up leaves neither random numbers nor buffers changed: a resumed run makes it again.
+        with torch.random.fork_rng(devices=[batch.device]), torch.cuda.stream(side):
             for _ in range(self._warmups):
                 self._module.zero_grad(set_to_none=True)
                 self._step(self._batch)
@@ -63,7 +68,8 @@ class GraphedStep:
             buffer.copy_(buffers[name])
         self._module.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        # Threads that prefetch samples may use the device meanwhile.
+        with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
             metrics = self._step(self._batch)
         self._names, self._scalars = list(metrics), [value.detach() for value in metrics.values()]
         self._graph = graph

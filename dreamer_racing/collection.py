@@ -43,11 +43,18 @@ class OverlappedRollouts(Iterator[TensorDictBase]):
 
     def __next__(self) -> TensorDictBase:
         """Return the rollout that was collected meanwhile, and begin the next."""
-        rollout = next(self._rollouts) if self._next is None else self._next.result()
+        if self._next is None:
+            self._copy_weights()
+            rollout = next(self._rollouts)
+        else:
+            rollout = self._next.result()
         rollout = rollout.clone()  # the collector writes the next one over it
-        self._acting.load_state_dict(self._policy.state_dict())
+        self._copy_weights()
         self._next = self._thread.submit(next, self._rollouts)
         return rollout
+
+    def _copy_weights(self) -> None:
+        self._acting.load_state_dict(self._policy.state_dict())
 
     def drain(self) -> TensorDictBase | None:
         """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.

@@ -64,15 +64,18 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
 
     open_loop = _open_loop_features(learner, start, batch["previous_action"][:, CONTEXT:])  # (W, H, F)
     predicted = (model.reward_head.mean(open_loop).squeeze(-1) * alive).sum(1)
-    metrics["held_out/open_loop_reward_error"] = (predicted - reward.sum(1)).abs().mean()
-    metrics["held_out/open_loop_correlation"] = correlation(predicted, reward.sum(1))
+    goes_on_at_first = ~(batch["terminated"] | batch["truncated"])[:, CONTEXT - 1, 0]  # (W,)
+    if goes_on_at_first.any():
+        predicted, paid = predicted[goes_on_at_first], reward.sum(1)[goes_on_at_first]
+        metrics["held_out/open_loop_reward_error"] = (predicted - paid).abs().mean()
+        metrics["held_out/open_loop_correlation"] = correlation(predicted, paid)
 
     discount = learner.config.discount ** torch.arange(horizon + 1, device=reward.device)
     value = critic.value(join_features(belief[:, -1], state[:, -1])).squeeze(-1)
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
     real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value
     imagined = _imagined_return(learner, start, horizon, discount)
-    comparable = _comparable(batch, alive)
+    comparable = _comparable(batch, alive, goes_on_at_first)
     if comparable.any():
         imagined, real = imagined[comparable], real[comparable]
         metrics["imagination/return_correlation"] = correlation(imagined, real)
@@ -80,14 +83,13 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
     return metrics
 
 
-def _comparable(batch: TensorDictBase, alive: Tensor) -> Tensor:
+def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) -> Tensor:
     """Which windows ``(W,)`` an imagined return can be held against: not begun or cut off where an episode ended.
 
     A crash inside the horizon stays; a time limit there hides what the world would have paid.
     """
-    ended, truncated = (batch["terminated"] | batch["truncated"]).squeeze(-1), batch["truncated"].squeeze(-1)
-    cut_off = (truncated[:, CONTEXT:] & alive.bool()).any(1)
-    return ~ended[:, CONTEXT - 1] & ~cut_off
+    cut_off = (batch["truncated"].squeeze(-1)[:, CONTEXT:] & alive.bool()).any(1)
+    return goes_on_at_first & ~cut_off
 
 
 def _open_loop_features(learner: DreamerLearner, start: tuple[Tensor, Tensor], actions: Tensor) -> Tensor:
@@ -105,6 +107,8 @@ def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], hori
     model = learner.agent.world_model
     features = imagine(model.rssm, learner.agent.actor, *start, horizon).features[1:]  # (H, W, F)
     continuation = model.continue_head.probability(features).squeeze(-1)  # (H, W)
+    if not learner.config.continuation:
+        continuation = torch.ones_like(continuation)
     reached = torch.cat((torch.ones_like(continuation[:1]), continuation[:-1])).cumprod(0)
     reward = model.reward_head.mean(features).squeeze(-1) * reached
     value = learner.agent.critic.value(features[-1]).squeeze(-1) * reached[-1] * continuation[-1]

@@ -143,6 +143,27 @@ class NonFiniteLossError(RuntimeError):
         self.batch = batch
 
 
+class Flag:
+    """A truth value on its way from the device, so that reading it later waits for nothing that came after it.
+
+    Args:
+        value: bool, a scalar.
+    """
+
+    def __init__(self, value: Tensor) -> None:
+        self._value = value.to("cpu", non_blocking=True)
+        self._arrived: torch.cuda.Event | None = None
+        if value.is_cuda:
+            self._arrived = torch.cuda.Event()
+            self._arrived.record(torch.cuda.current_stream(value.device))
+
+    def __bool__(self) -> bool:
+        """Wait until it is here."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return bool(self._value)
+
+
 class FiniteGuard:
     """Raises once an update would spoil the networks.
 
@@ -152,7 +173,7 @@ class FiniteGuard:
 
     def __init__(self, lag: int) -> None:
         self._lag = lag
-        self._pending: deque[tuple[Tensor, TensorDictBase]] = deque()
+        self._pending: deque[tuple[Flag, TensorDictBase]] = deque()
 
     def check(self, metrics: dict[str, Tensor], batch: TensorDictBase) -> None:
         """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
@@ -164,7 +185,7 @@ class FiniteGuard:
             for name, value in metrics.items()
             if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
         ]
-        self._pending.append((torch.stack(watched).isfinite().all(), batch))
+        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch))
         self.settle(self._lag)
 
     def settle(self, lag: int = 0) -> None:
@@ -273,7 +294,7 @@ class DreamerLearner:
                 this batch; on a CUDA device this is noticed two updates late, because waiting for the device would
                 stall it.
         """
-        self._timed = timed
+        self._timed = untimed if self.config.compile else timed  # a clock would break the compiled graph in pieces
         batch = batch.to(self.device, non_blocking=True)
         metrics = self._step(batch)
         self._guard.check(metrics, batch)
@@ -379,8 +400,17 @@ class DreamerLearner:
         self.agent.load_state_dict(state_dict["agent"])
         for name, loss in self.losses.items():
             loss.load_state_dict(state_dict["losses"][name], strict=False)
+        # Rates are settings of this learner, not state: a run may be continued with others.
+        names = {"lr", "warmup_steps"}
+        own = [{name: value for name, value in group.items() if name in names} for group in self._groups]
         self.optimizer.load_state_dict(state_dict["optimizer"])
+        for group, settings in zip(self._groups, own, strict=True):
+            group.update(settings)
         self.updates = state_dict["updates"]
+
+    @property
+    def _groups(self) -> ParameterGroups:
+        return self.optimizer.param_groups
 
     def _check_parts(self, saved: dict[str, Any]) -> None:
         """Refuse networks or losses of other parameters than these."""

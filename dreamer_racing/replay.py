@@ -280,7 +280,11 @@ def make_replay(
         storage=records,
         writer=writer,
         sampler=StreamSampler(
-            writer, batch_length, recent_share, recent_records and recent_records // num_envs, held_out
+            writer,
+            batch_length,
+            recent_share,
+            None if recent_records is None else recent_records // num_envs,
+            held_out,
         ),
         generator=torch.Generator().manual_seed(seed),
         transform=transform,
@@ -288,9 +292,11 @@ def make_replay(
         observation_keys=observation_keys,
         reward_keys=reward_keys,
         prefetch=prefetch,
-        # Copies from pinned memory do not wait for the device.
-        pin_memory=torch.device(device).type == "cuda" and records.device.type == "cpu",
     )
     if records.device != torch.empty((), device=device).device:
-        replay.append_transform(lambda sample: sample.to(device, non_blocking=True))
+        # Copies from pinned memory do not wait for the device.
+        pinned = torch.device(device).type == "cuda" and records.device.type == "cpu"
+        replay.append_transform(
+            lambda sample: (sample.pin_memory() if pinned else sample).to(device, non_blocking=pinned)
+        )
     return replay

@@ -61,7 +61,7 @@ class RecordStorage(TensorStorage):
         if not self.initialized:
             self._init(data[0])
         for key, stored in self.fields():
-            new = data.get(key).to(self.device, non_blocking=True)
+            new = data.get(key).to(self.device, non_blocking=self.device.type == "cuda")
             check_layout(key, new, stored)
             if isinstance(cursor, slice):
                 stored[cursor] = new
@@ -217,7 +217,7 @@ class StreamSampler(RandomSampler):
         self.writer = writer
         self.batch_length = batch_length
         self.recent_share = recent_share
-        self.recent_length = max(batch_length, recent_length or writer.stream_length)
+        self.recent_length = max(batch_length, writer.stream_length if recent_length is None else recent_length)
         self._held_out = torch.arange(writer.num_streams) >= writer.num_streams - held_out  # (N,)
         self._held_out_rng = torch.Generator().manual_seed(0)
 

@@ -87,6 +87,7 @@ class Run:
     best: BestCheckpoint
     counters: dict[str, int]  # env_steps, updates, episodes
     clock: RunClock
+    evaluated: int = -1  # updates at the last evaluation
 
     @property
     def updates_due(self) -> int:
@@ -197,6 +198,11 @@ def check(config: DreamerConfig) -> None:
         raise ValueError(
             f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
             "thread that made them. Use collection=sync."
+        )
+    if config.collection is Collection.overlapped and model.cuda_graph:
+        raise ValueError(
+            "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
+            "refuses: choose one of them."
         )
     if not updates_in(config, config.total_env_steps):
         raise ValueError(
@@ -353,7 +359,7 @@ def train(run: Run) -> None:
         if stop.requested:
             bar.write(f"{stop.signal_name}: saving; continue with resume={run.directory}")
         saved = save(run)
-        if not stop.requested and config.evaluation.every and not schedule.did("evaluate", counters["env_steps"]):
+        if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
             evaluate(run)
         run.metrics.write(counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
@@ -404,6 +410,7 @@ def evaluate(run: Run) -> None:
     with run.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
         metrics = run.report.make(run.counters["env_steps"], run.config.evaluation.stochastic)
     run.metrics.push(metrics)
+    run.evaluated = run.counters["updates"]
     # Gates first, return where the gates are the same: a return lies far below a million.
     score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
     run.best.offer(score, run.counters["env_steps"])
@@ -421,11 +428,6 @@ class Schedule:
     def __init__(self, env_steps: int, **every: int) -> None:
         self._every = every
         self._done = {name: env_steps // period if period else 0 for name, period in every.items()}
-        self._last: dict[str, int] = {}
-
-    def did(self, name: str, env_steps: int) -> bool:
-        """Whether it was due at just this number of env_steps."""
-        return self._last.get(name) == env_steps
 
     def due(self, name: str, env_steps: int) -> bool:
         """Whether another period has passed; asking takes note of it."""
@@ -433,7 +435,6 @@ class Schedule:
         if not period or env_steps // period <= self._done[name]:
             return False
         self._done[name] = env_steps // period
-        self._last[name] = env_steps
         return True
 
 

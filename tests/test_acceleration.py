@@ -49,17 +49,22 @@ def test_a_cuda_graph_needs_a_cuda_device() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}, {"actor_loss": "dynamics"}], ids=str
+)
 def test_graphed_updates_learn_as_eager_ones(settings: dict[str, object]) -> None:
-    plain, graphed = make("cuda", **settings), make("cuda", cuda_graph=True, **settings)
-    data = batch("cuda")
-    for _ in range(20):
-        expected, found = plain.update(data), graphed.update(data)
-    assert expected.keys() == found.keys()
+    settings = {"lr": 1e-3, "warmup_updates": 0, **settings}
+    batches = [batch("cuda"), batch("cuda").flip(0)]  # stale inputs would show
+    first, last = [], []
+    for cuda_graph in (False, True):
+        learner = make("cuda", cuda_graph=cuda_graph, **settings)
+        losses = [learner.update(batches[number % 2])["loss_image"].item() for number in range(60)]
+        first.append(losses[0])
+        last.append(sum(losses[-10:]) / 10)
+        assert last[-1] < 0.8 * first[-1], "it learns"
     # Random numbers differ, what is learned does not.
-    assert found["loss_image"].item() == pytest.approx(expected["loss_image"].item(), rel=0.05)
-    for mine, theirs in zip(graphed.agent.parameters(), plain.agent.parameters(), strict=True):
-        assert mine.isfinite().all() and mine.shape == theirs.shape
+    assert first[1] == pytest.approx(first[0], rel=0.02)
+    assert last[1] == pytest.approx(last[0], rel=0.1)
 
 
 @pytest.mark.gpu

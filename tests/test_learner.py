@@ -304,3 +304,13 @@ def test_mixed_precision_is_close_to_full(recurrence):
         assert all(value.dtype == torch.float32 and value.isfinite() for value in results[-1].values())
     assert not torch.equal(results[0]["loss"], results[1]["loss"]), "nothing was computed in bfloat16"
     torch.testing.assert_close(results[0]["loss"], results[1]["loss"], rtol=1e-2, atol=0)
+
+
+def test_rates_are_the_settings_of_the_learner_that_goes_on():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(make_batch())
+    other = DreamerLearner("debug", config=replace(CONFIG, lr=1e-5, behavior_lr=1e-6, warmup_updates=7), seed=1)
+    other.load_state_dict(copy.deepcopy(learner.state_dict()))
+    assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6]
+    assert {group["warmup_steps"] for group in other.optimizer.param_groups} == {7}
+    assert other.updates == 1

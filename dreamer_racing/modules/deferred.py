@@ -15,8 +15,29 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-Tape = list[tuple[Tensor, Tensor]]
-"""Input ``(..., N, I)`` and gradient of the output ``(..., N, O)`` of every step, as the backward pass reaches them."""
+
+class Tape:
+    """Input ``(..., N, I)`` and gradient of the output ``(..., N, O)`` of every step that a backward pass reaches."""
+
+    def __init__(self) -> None:
+        self._steps: list[tuple[Tensor, Tensor]] = []
+        self._backward_pass = -1
+
+    def add(self, inputs: Tensor, gradient: Tensor) -> None:
+        """Keep one step; forget those of a backward pass that did not ask for the weight's gradient."""
+        backward_pass = torch._C._current_graph_task_id()
+        if backward_pass != self._backward_pass:
+            self._steps.clear()
+            self._backward_pass = backward_pass
+        self._steps.append((inputs, gradient))
+
+    def take(self) -> tuple[Tensor, Tensor] | None:
+        """Return all inputs and all gradients, ``(..., T·N, I)`` and ``(..., T·N, O)``, and forget them."""
+        if not self._steps:
+            return None
+        inputs, gradients = (torch.cat(tensors, -2) for tensors in zip(*self._steps, strict=True))
+        self._steps.clear()
+        return inputs, gradients
 
 
 class DeferredWeight:
@@ -31,7 +52,7 @@ class DeferredWeight:
 
     def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
         self._dtype = _autocast_dtype(weight.device.type) or weight.dtype
-        self._tape: Tape = []
+        self._tape = Tape()
         cast = None if bias is None else bias.to(self._dtype)
         self._weight, self._bias = _Collect.apply(weight.to(self._dtype), cast, self._tape)
 
@@ -59,11 +80,10 @@ class _Collect(Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         # The steps pass nothing back to the weight itself, but autograd calls this after the last of them.
-        if not ctx.tape:
+        taken = ctx.tape.take()
+        if taken is None:
             return None, None, None
-        inputs = torch.cat([entry[0] for entry in ctx.tape], -2)
-        outputs = torch.cat([entry[1] for entry in ctx.tape], -2)
-        ctx.tape.clear()
+        inputs, outputs = taken
         return inputs.mT @ outputs, outputs.sum(-2) if ctx.needs_input_grad[1] else None, None
 
 
@@ -79,5 +99,5 @@ class _Product(Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         inputs, weight = ctx.saved_tensors
-        ctx.tape.append((inputs, gradient))
+        ctx.tape.add(inputs, gradient)
         return gradient @ weight.mT if ctx.needs_input_grad[0] else None, None, None, None

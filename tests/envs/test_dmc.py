@@ -5,7 +5,6 @@ import io
 import numpy as np
 import pytest
 import torch
-from dm_control import suite
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -16,6 +15,8 @@ from dreamer_racing.envs.dmc import TASKS, ControlSuiteEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
 from dreamer_racing.modules.interface import Interface
+
+suite = dmc_module.suite  # imported by the package, which chooses the OpenGL library first
 
 
 def blind(task: str = "cartpole_swingup", num_envs: int = 3, **arguments) -> ControlSuiteEnv:
