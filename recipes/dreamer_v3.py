@@ -9,6 +9,7 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 """
 
 import random
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from arena import (
     reward_terms,
     scene_name,
 )
+from checks import check, check_overrides, refuse_to_replace, updates_in
 from command_line import (
     CONFIG_DIR,
     choose_device,
@@ -115,11 +117,13 @@ class Run:
 def main(config: DictConfig) -> None:
     """Compose the configuration, build the run, train."""
     start_logging()
+    sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("medium")  # fp32 in effect on CPU, TF32 on CUDA
     with plain_errors():
         overrides = list(HydraConfig.get().overrides.task)
         if config.resume:
             config, overrides = resumed_config(config.resume, overrides)
+        check_overrides(config, overrides)
         run = build(cast(DreamerConfig, OmegaConf.to_object(resolve(config))), overrides)
     try:
         train(run)
@@ -172,50 +176,11 @@ def resolve(config: DictConfig) -> DictConfig:
     return config
 
 
-def updates_in(config: DreamerConfig, env_steps: int) -> int:
-    """Updates that the replay ratio asks for in a run of so many env_steps."""
-    model = config.model
-    return max(0, int((env_steps - config.prefill) * model.replay_ratio / (model.batch_size * model.batch_length)))
-
-
-def check(config: DreamerConfig) -> None:
-    """Refuse settings with which a run could not learn.
-
-    Raises:
-        ValueError: the message gives the numbers and the setting to change.
-    """
-    model = config.model
-    if model.replay_ratio <= 0:
-        raise ValueError(f"model.replay_ratio={model.replay_ratio}: records trained on per environment step, above 0.")
-    prefilled = config.prefill // config.env.num_envs
-    if prefilled < model.batch_length:
-        raise ValueError(
-            f"prefill={config.prefill} gives each of env.num_envs={config.env.num_envs} worlds {prefilled} records, "
-            f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
-            f"{config.env.num_envs * model.batch_length}."
-        )
-    if config.collection is Collection.overlapped and not is_race(config):
-        raise ValueError(
-            f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
-            "thread that made them. Use collection=sync."
-        )
-    if config.collection is Collection.overlapped and model.cuda_graph:
-        raise ValueError(
-            "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
-            "refuses: choose one of them."
-        )
-    if not updates_in(config, config.total_env_steps):
-        raise ValueError(
-            f"model.replay_ratio={model.replay_ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
-            f"prefill={config.prefill:,} asks for no whole update of {model.batch_size * model.batch_length} records. "
-            "Raise total_env_steps or the ratio, or lower the prefill."
-        )
-
-
 def build(config: DreamerConfig, overrides: list[str]) -> Run:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     assert config.run_dir is not None, "resolve() names it"
     check(config)
+    refuse_to_replace(config)
     directory = ensure_writable(config.run_dir)
     env = make_env(config)
     interface = Interface.of(env)

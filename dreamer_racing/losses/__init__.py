@@ -6,6 +6,7 @@ name; it must read and write the keys that the class it replaces documents. See 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -50,17 +51,25 @@ CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
 
 
 def find_loss(registry: Mapping[str, T], name: str) -> T:
-    """Return the class registered under a name.
+    """Return the class registered under a name, or found in a module.
 
     Args:
         registry: ``WORLD_MODEL_LOSSES``, ``ACTOR_LOSSES`` or ``CRITIC_LOSSES``.
-        name: Key of the registry.
+        name: Key of the registry, or ``module:Class`` of a loss of your own.
 
     Raises:
         ValueError: If no loss has that name; the message lists those that exist.
     """
+    module, colon, attribute = name.partition(":")
+    if colon:
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"Loss {name!r}, given as module:Class, cannot be imported: {error}.") from error
     if name not in registry:
-        raise ValueError(f"Unknown loss {name!r}. Known here: {', '.join(registry)}.")
+        raise ValueError(
+            f"Unknown loss {name!r}. Known here: {', '.join(registry)}; a loss of your own is given as module:Class."
+        )
     return registry[name]
 
 

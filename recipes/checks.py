@@ -1,0 +1,150 @@
+"""What the recipe refuses before anything is built: settings with which a run could not work.
+
+Every message names the setting as the user writes it, its value, and what would be right.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from arena import is_race
+from omegaconf import DictConfig, OmegaConf
+from schema import Collection, DreamerConfig
+
+from dreamer_racing.checkpoint import latest_checkpoint
+
+
+class Range(NamedTuple):
+    """Allowed values of a setting: a whole interval, or one without its lower end."""
+
+    low: float
+    high: float = math.inf
+    open_below: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, (int, float)) and (
+            self.low < value <= self.high if self.open_below else self.low <= value <= self.high
+        )
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        below = f"above {self.low:g}" if self.open_below else f"at least {self.low:g}"
+        return below if self.high == math.inf else f"{below} and at most {self.high:g}"
+
+
+POSITIVE, SHARE, NOT_NEGATIVE = Range(0, open_below=True), Range(0, 1), Range(0)
+RANGES = {
+    "prefill": NOT_NEGATIVE,
+    "rollout_steps": Range(1),
+    "seed": Range(0, 2**32 - 1),
+    "env.num_envs": Range(1),
+    "env.episode_steps": Range(1),
+    "env.start_beyond_gate": SHARE,
+    "model.batch_size": Range(1),
+    "model.batch_length": Range(2),
+    "model.replay_ratio": POSITIVE,
+    "model.learning_rate": POSITIVE,
+    "model.behavior_learning_rate": POSITIVE,
+    "model.warmup_updates": NOT_NEGATIVE,
+    "model.imagination_horizon": Range(1),
+    "model.imagination_starts": Range(1),
+    "loss.discount": SHARE,
+    "loss.lambda_": SHARE,
+    "loss.entropy_scale": NOT_NEGATIVE,
+    "loss.dynamics_scale": NOT_NEGATIVE,
+    "loss.representation_scale": NOT_NEGATIVE,
+    "loss.free_nats": NOT_NEGATIVE,
+    "loss.privileged_scale": NOT_NEGATIVE,
+    "loss.barlow_scale": NOT_NEGATIVE,
+    "loss.replay_value_scale": NOT_NEGATIVE,
+    "replay.capacity": Range(1),
+    "replay.recent_share": SHARE,
+    "replay.recent_records": Range(1),
+    "replay.held_out": NOT_NEGATIVE,
+    "evaluation.every": NOT_NEGATIVE,
+    "evaluation.episodes": Range(1),
+    "evaluation.video_steps": Range(1),
+    "checkpoint.every": NOT_NEGATIVE,
+    "checkpoint.keep": Range(1),
+    "logger.every": NOT_NEGATIVE,
+}
+"""Allowed values by setting; null is allowed where the schema allows it."""
+
+
+def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a task without `env=dmc`, and a track with it: one of them would be ignored.
+
+    Raises:
+        ValueError: the message says what to add or leave out.
+    """
+    given = {override.partition("=")[0] for override in overrides}
+    race = config.env.suite == "race"
+    if race and "task" in given:
+        raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
+    if not race and "track" in given:
+        raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
+
+
+def refuse_to_replace(config: DreamerConfig) -> None:
+    """Refuse to begin a run where another has left checkpoints.
+
+    Raises:
+        ValueError: the message names the newest of them.
+    """
+    if config.resume:
+        return
+    assert config.run_dir is not None
+    try:
+        newest = latest_checkpoint(Path(config.run_dir) / "checkpoints")
+    except FileNotFoundError:
+        return
+    raise ValueError(
+        f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with resume={config.run_dir}, "
+        "or choose another run_dir."
+    )
+
+
+def updates_in(config: DreamerConfig, env_steps: int) -> int:
+    """Updates that the replay ratio asks for in a run of so many env_steps."""
+    model = config.model
+    return max(0, int((env_steps - config.prefill) * model.replay_ratio / (model.batch_size * model.batch_length)))
+
+
+def check(config: DreamerConfig) -> None:
+    """Refuse settings with which a run could not learn.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    values = OmegaConf.structured(config)
+    for name, allowed in RANGES.items():
+        value = OmegaConf.select(values, name)
+        if value is not None and value not in allowed:
+            raise ValueError(f"{name}={value}: must be {allowed}.")
+    model = config.model
+    if config.total_env_steps <= config.prefill:
+        raise ValueError(f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}.")
+    prefilled = config.prefill // config.env.num_envs
+    if prefilled < model.batch_length:
+        raise ValueError(
+            f"prefill={config.prefill} gives each of env.num_envs={config.env.num_envs} worlds {prefilled} records, "
+            f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
+            f"{config.env.num_envs * model.batch_length}."
+        )
+    if config.collection is Collection.overlapped and not is_race(config):
+        raise ValueError(
+            f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
+            "thread that made them. Use collection=sync."
+        )
+    if config.collection is Collection.overlapped and model.cuda_graph:
+        raise ValueError(
+            "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
+            "refuses: choose one of them."
+        )
+    if not updates_in(config, config.total_env_steps):
+        raise ValueError(
+            f"model.replay_ratio={model.replay_ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
+            f"prefill={config.prefill:,} asks for no whole update of {model.batch_size * model.batch_length} records. "
+            "Raise total_env_steps or the ratio, or lower the prefill."
+        )
