@@ -306,6 +306,8 @@ def train(run: Run) -> None:
         GracefulExit() as stop,
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
+        if counters["env_steps"] >= config.total_env_steps:
+            bar.write(f"complete already: raise total_env_steps={config.total_env_steps} to go on")
         learn(run, stop)  # what a signal left undone
         while counters["env_steps"] < config.total_env_steps and not stop.requested:
             with run.clock.timed("collect"):

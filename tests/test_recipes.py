@@ -191,13 +191,18 @@ def build(*overrides: str) -> None:
 REFUSED = [
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
-    (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4,000", "prefill=4,000", "no whole update"]),
-    (["prefill=4000", "total_env_steps=3000"], ["total_env_steps=3,000", "prefill=4,000"]),
+    (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4000", "above prefill=4000"]),
+    (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
+    (["model.batch_length=1"], ["model.batch_length=1", "at least 2"]),
+    (["model.learning_rate=-1"], ["model.learning_rate=-1", "above 0"]),
+    (["loss.discount=1.5"], ["loss.discount=1.5", "at least 0 and at most 1"]),
+    (["checkpoint.keep=0"], ["checkpoint.keep=0", "at least 1"]),
+    (["loss.world_model=nowhere:Loss"], ["nowhere:Loss", "cannot be imported"]),
     (["prefill=512", "total_env_steps=527"], ["total_env_steps=527", "64 records"]),  # 15 × 4 are less than 4 × 16
     (["replay.capacity=100000000000"], ["replay.capacity=100,000,000,000", " GB when full", "left", "memmap"]),
     (["replay.capacity=100"], ["capacity=100", "batch_length=16", "at least 512"]),
     (["replay.held_out=32"], ["held_out=32", "num_envs=32"]),
-    (["replay.recent_share=1.5"], ["recent_share=1.5", "between 0 and 1"]),
+    (["replay.recent_share=1.5"], ["recent_share=1.5", "at least 0 and at most 1"]),
     (["env.suite=atari"], ["env.suite=atari", "race", "dmc"]),
     (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
     (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
@@ -216,6 +221,27 @@ def test_what_cannot_work_is_refused_before_it_starts(
     assert message.startswith("error: ") and "\n" not in message
     assert all(word in message for word in words), message
     assert not list((tmp_path / "run").glob("*.yaml")), "a run that was refused left its configuration"
+
+
+def test_a_run_is_not_begun_over_another(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted((run_dir / "checkpoints").iterdir())
+    with pytest.raises(SystemExit):
+        build(f"run_dir='{run_dir}'")
+    message = capsys.readouterr().err
+    assert "holds a run already" in message and f"resume={run_dir}" in message and before[-1].name in message
+    assert sorted((run_dir / "checkpoints").iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
+        (["env=dmc", "track=circle"], "track=circle is for races"),
+    ],
+)
+def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        recipe_module("checks").check_overrides(compose("dreamer_v3", *overrides), overrides)
 
 
 def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
@@ -260,9 +286,10 @@ def test_an_overlapped_run(tmp_path: Path) -> None:
     done = recipe("dreamer_v3", *TINY, "collection=overlapped", "run_dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     table = rows(tmp_path / "run")
-    assert [int(row["env_steps"]) for row in table] == [128, 224]
+    # The rollout that was under way at the end is kept too.
+    assert [int(row["env_steps"]) for row in table] == [128, 224, 256]
     assert any(float(row["loss_image"] or "nan") > 0 for row in table)
-    assert latest_checkpoint(tmp_path / "run").name.endswith("224")
+    assert latest_checkpoint(tmp_path / "run").name.endswith("256")
 
 
 @pytest.mark.slow

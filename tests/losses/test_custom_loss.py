@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, kl_losses
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, find_loss, kl_losses
 from dreamer_racing.modules import Interface
 
 PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
@@ -90,3 +90,13 @@ def test_page_names_every_loss_and_key():
         for loss in learner.losses.values():
             for key in (*loss.in_keys, *loss.out_keys):
                 assert str(key).replace("'", '"') in quoted or key in quoted, (name, key)
+
+
+def test_a_loss_is_found_in_a_module_of_ones_own(tmp_path, monkeypatch):
+    (tmp_path / "my_losses.py").write_text("from dreamer_racing.losses import ReinforceLoss as MyLoss\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert find_loss(ACTOR_LOSSES, "my_losses:MyLoss") is ACTOR_LOSSES["reinforce"]
+    with pytest.raises(ValueError, match="'my_losses:Other', given as module:Class, cannot be imported"):
+        find_loss(ACTOR_LOSSES, "my_losses:Other")
+    with pytest.raises(ValueError, match=r"Unknown loss 'mine'. Known here: reinforce, dynamics"):
+        find_loss(ACTOR_LOSSES, "mine")
