@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from dreamer_racing.envs.privileged import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.export import OUTPUTS, ActorStep
@@ -55,9 +56,10 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
             "None outside the graph: pixels go in as rendered, uint8 RGB, row 0 at the top (the graph computes "
             "x / 255 - 0.5)."
             if step.interface.pixels
-            else "Scale the numbers as dreamer_racing.envs.privileged.RaceVector does; the graph computes their symlog."
+            else "Divide the numbers as 'vector' says; the graph computes their symlog."
         ),
         "camera": _describe_camera(camera) if step.interface.pixels else None,
+        "vector": None if step.interface.pixels else _describe_vector(),
         "control": {"rate_hz": 1.0 / parameters.control_dt, "period_s": parameters.control_dt},
         "frames": {
             "body": "FLU: x forward, y left, z up, right-handed",
@@ -104,6 +106,18 @@ def _describe_camera(camera: Camera) -> dict[str, Any]:
         "tilt_up_deg": camera.tilt,
         "position_body_m": list(camera.position),
         "model": "pinhole without distortion, looks along body +x tilted up, square pixels, centre at the image's",
+    }
+
+
+def _describe_vector() -> dict[str, Any]:
+    names = [f"{meaning}, {axis}" for meaning, _, _ in RACE_VECTOR_ENTRIES for axis in "xyz"]
+    scales = [(unit, divisor) for _, unit, divisor in RACE_VECTOR_ENTRIES for _ in "xyz"]
+    return {
+        "formula": "entry = physical / divisor, all vectors in the body frame",
+        "channels": [
+            {"name": name, "unit": unit, "divisor": divisor}
+            for name, (unit, divisor) in zip(names, scales, strict=True)
+        ],
     }
 
 

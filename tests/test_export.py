@@ -608,3 +608,12 @@ def test_missing_packages_are_named(run_dir: Path) -> None:
     done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent, before=before)
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "pip install 'dreamer_racing[export]'" in done.stderr and "no_such_package" in done.stderr
+
+
+def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
+    step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
+    contract = make_contract(step, QuadrotorParameters(), Camera())
+    assert contract["camera"] is None
+    channels = contract["vector"]["channels"]
+    assert len(channels) == 21
+    assert channels[4] == {"name": "body rates of the drone, y", "unit": "rad/s", "divisor": 5.0}
