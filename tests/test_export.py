@@ -612,7 +612,7 @@ def test_missing_packages_are_named(run_dir: Path) -> None:
 
 def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
     step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
-    contract = make_contract(step, QuadrotorParameters(), Camera())
+    contract = make_contract(step, PRESETS["easy"], Camera())
     assert contract["camera"] is None
     channels = contract["vector"]["channels"]
     assert len(channels) == 21
