@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule
 from dreamer_racing.acceleration import GraphedStep, Step
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossClass, find_loss
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
+from dreamer_racing.modules.layers import autocast
 from dreamer_racing.timing import Timer, untimed
 
 
@@ -316,8 +317,7 @@ class DreamerLearner:
 
     def autocast(self) -> torch.autocast:
         """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
-        kind = self.device.type if torch.amp.is_autocast_available(self.device.type) else "cpu"  # meta has none
-        return torch.autocast(kind, torch.bfloat16, enabled=self.config.mixed_precision, cache_enabled=False)
+        return autocast(self.device, self.config.mixed_precision)
 
     def _make_step(self) -> Step:
         """Return the function that computes gradients, as fast as the configuration allows."""

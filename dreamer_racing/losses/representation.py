@@ -14,7 +14,7 @@ from torch import Tensor
 from dreamer_racing.losses.world_model import WorldModelLoss
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.interface import PIXELS, PRIVILEGED, VECTOR
-from dreamer_racing.modules.layers import linear
+from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import Posterior
 from dreamer_racing.modules.world_model import WorldModel
 
@@ -206,6 +206,6 @@ class DecoderFreeLoss(WorldModelLoss):
         """Return the redundancy-reduction loss."""
         projected = self.projector(features).flatten(0, 1).float()
         target = embedding.detach().flatten(0, 1).float()
-        with torch.autocast(features.device.type, enabled=False):
+        with autocast(features.device, enabled=False):
             loss, agreement = redundancy_reduction(projected, target, self.off_diagonal_scale)
         return {"loss_barlow": self.barlow_scale * loss, "agreement": agreement}

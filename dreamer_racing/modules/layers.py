@@ -22,6 +22,15 @@ _TRUNCATED_NORMAL_STD = 0.87962566103423978
 """Standard deviation of a unit normal truncated at ±2, by which the initial weights are corrected."""
 
 
+def autocast(device: torch.device, enabled: bool) -> torch.autocast:
+    """Return the context in which a device computes in bfloat16, or float32 if not ``enabled``.
+
+    A device that knows no mixed precision (``meta``, on which FLOPs are counted) gets the context of the CPU.
+    """
+    kind = device.type if torch.amp.is_autocast_available(device.type) else "cpu"
+    return torch.autocast(kind, torch.bfloat16, enabled=enabled, cache_enabled=False)
+
+
 def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
     """Fill a weight in place from a normal truncated at two deviations, of variance ``scale² / fan_in``.
 
