@@ -32,6 +32,7 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.memory import keep_freed_memory
 from dreamer_racing.modules import SIZES, Interface, get_size
 from dreamer_racing.replay import make_replay
 
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
     parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
+    parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
     arguments = parser.parse_args()
@@ -62,8 +64,9 @@ def main() -> None:
         write_size_table(Path(arguments.table))
         return
     shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
-    jobs: list[tuple[Callable[..., dict[str, Any]], tuple]] = [
-        (measure, (size, loss, actor, backend, arguments.mixed_precision, *shared))
+    prepare = None if arguments.return_freed_memory else keep_freed_memory
+    jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
+        (measure, (size, loss, actor, backend, arguments.mixed_precision, *shared), prepare)
         for size in arguments.sizes
         for loss in arguments.losses
         for actor in arguments.actor_losses
@@ -73,10 +76,11 @@ def main() -> None:
         from stock_dreamer import measure_stock
 
         shapes = [peer.removeprefix("torchrl_") for peer in arguments.peers]
-        jobs += [(measure_stock, (*shared, shape, tuned)) for shape in shapes for tuned in (False, True)]
+        jobs += [(measure_stock, (*shared, shape, False), None) for shape in shapes]
+        jobs += [(measure_stock, (*shared, shape, True), prepare) for shape in shapes]
     records = []
-    for function, values in jobs:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+    for function, values, initializer in jobs:
+        with ProcessPoolExecutor(1, get_context("spawn"), initializer) as process:
             records.append(process.submit(function, *values).result())
             print_table(records[-1:], COLUMNS)
     print_table(records, COLUMNS)

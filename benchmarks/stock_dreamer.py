@@ -14,7 +14,8 @@ in ``large`` (38.4 M parameters, 5,108 GFLOP), and the peer shall not look slow 
 
 Each shape has two variants. As TorchRL has it, imagination records a graph that REINFORCE never uses, and products are
 at the highest float32 precision. ``tuned`` imagines without gradients, which TorchRL has no option for, sets
-``float32_matmul_precision`` to medium as ``learner.py`` does for ours, and on a GPU trains in bfloat16.
+``float32_matmul_precision`` to medium and keeps freed memory as ``learner.py`` does for ours, and on a GPU trains in
+bfloat16.
 
 Shape legend: B batch, T time, H horizon.
 

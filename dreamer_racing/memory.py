@@ -1,13 +1,30 @@
-"""Whether something fits into memory, found out before it is allocated."""
+"""Memory: whether something fits, found out before it is allocated; and freed blocks kept for the next update."""
 
 from __future__ import annotations
 
+import ctypes
 import math
 from pathlib import Path
 
 import torch
 
 GB = 1e9
+
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc, malloc.h
+
+
+def keep_freed_memory() -> bool:
+    """Let this process keep what it frees instead of returning it to the kernel.
+
+    glibc gives blocks of many megabytes back at once and asks for them anew at the next operation, and the kernel
+    fills every page with zeros each time: a third of the update of a large model on a CPU
+    (``benchmarks/learner.py --return-freed-memory`` shows it). The process stays as large as it once was.
+
+    Returns:
+        Whether the C library could be told; only glibc can.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    return mallopt is not None and bool(mallopt(_M_MMAP_MAX, 0)) and bool(mallopt(_M_TRIM_THRESHOLD, -1))
 
 
 def available_memory(device: torch.device | str) -> float:

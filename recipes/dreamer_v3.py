@@ -59,7 +59,13 @@ from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.learner import DreamerLearner, NonFiniteLossError
-from dreamer_racing.memory import available_memory, check_fits, is_out_of_memory, out_of_memory_advice
+from dreamer_racing.memory import (
+    available_memory,
+    check_fits,
+    is_out_of_memory,
+    keep_freed_memory,
+    out_of_memory_advice,
+)
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
 from dreamer_racing.modules import DreamerPolicy, Interface
 from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
@@ -160,6 +166,8 @@ def resolve(config: DictConfig) -> DictConfig:
         size = "size12m" if device.type == "cuda" else "cpu_small"
         print(f"model: {size} (model=auto on {device.type})")
     config.device, config.model.size = str(device), size
+    if device.type == "cpu" and not keep_freed_memory():
+        print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from dreamer_racing import memory
-from dreamer_racing.memory import available_memory, check_fits, out_of_memory_advice
+from dreamer_racing.memory import available_memory, check_fits, keep_freed_memory, out_of_memory_advice
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,3 +45,24 @@ def test_advice_keeps_the_first_line_of_the_error() -> None:
     assert advice.startswith("Tried to allocate 2.00 GiB. ") and "\n" not in advice and "documentation" not in advice
     for setting in ("model.batch_size", "model.imagination_starts", "replay.device=cpu", "model.mixed_precision"):
         assert setting in advice
+
+
+def test_freed_memory_is_kept() -> None:
+    code = """
+import resource, torch
+from dreamer_racing.memory import keep_freed_memory
+assert keep_freed_memory()
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+torch.ones(64_000_000)
+before = faults()
+for _ in range(5):
+    torch.ones(64_000_000)
+print(faults() - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1000, "64 million numbers are 62,500 pages"
+
+
+def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
+    assert not keep_freed_memory()
