@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
