@@ -5,7 +5,6 @@ Shape legend: B batch, T time, A action.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from dreamer_racing.acceleration import GraphedStep, Step
+from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossClass, find_loss
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
 from dreamer_racing.modules.layers import autocast
@@ -127,74 +127,6 @@ def _laprop(groups: ParameterGroups, config: LearnerConfig) -> torch.optim.Optim
 
 OPTIMIZERS: dict[str, Callable[[ParameterGroups, LearnerConfig], torch.optim.Optimizer]] = {"laprop": _laprop}
 """Optimiser factories by the name in ``LearnerConfig``; those of your own must clip gradients themselves."""
-
-
-class NonFiniteLossError(RuntimeError):
-    """The loss, its gradient or a reward became infinite or not a number.
-
-    Attributes:
-        batch: The batch that it happened with, ``[B, T]``.
-    """
-
-    def __init__(self, batch: TensorDictBase) -> None:
-        super().__init__(
-            "The loss, its gradient or a reward is not finite: the learning rate may be too high, or a reward or "
-            "observation is bad."
-        )
-        self.batch = batch
-
-
-class Flag:
-    """A truth value on its way from the device, so that reading it later waits for nothing that came after it.
-
-    Args:
-        value: bool, a scalar.
-    """
-
-    def __init__(self, value: Tensor) -> None:
-        self._value = value.to("cpu", non_blocking=True)
-        self._arrived: torch.cuda.Event | None = None
-        if value.is_cuda:
-            self._arrived = torch.cuda.Event()
-            self._arrived.record(torch.cuda.current_stream(value.device))
-
-    def __bool__(self) -> bool:
-        """Wait until it is here."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return bool(self._value)
-
-
-class FiniteGuard:
-    """Raises once an update would spoil the networks.
-
-    Args:
-        lag: Updates after which one is looked at: 0 at once, which waits for the device.
-    """
-
-    def __init__(self, lag: int) -> None:
-        self._lag = lag
-        self._pending: deque[tuple[Flag, TensorDictBase]] = deque()
-
-    def check(self, metrics: dict[str, Tensor], batch: TensorDictBase) -> None:
-        """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
-
-        The loss alone does not tell: two-hot targets are clamped, so that an infinite reward makes it merely large.
-        """
-        watched = [
-            value
-            for name, value in metrics.items()
-            if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
-        ]
-        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch))
-        self.settle(self._lag)
-
-    def settle(self, lag: int = 0) -> None:
-        """Look at all updates but the latest ``lag``; raise ``NonFiniteLossError`` at the first that was bad."""
-        while len(self._pending) > lag:
-            finite, batch = self._pending.popleft()
-            if not finite:
-                raise NonFiniteLossError(batch)
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:

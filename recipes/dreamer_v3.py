@@ -58,7 +58,8 @@ from dreamer_racing.checkpoint import (
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
-from dreamer_racing.learner import DreamerLearner, NonFiniteLossError
+from dreamer_racing.finite_guard import NonFiniteLossError
+from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.memory import (
     available_memory,
     check_fits,

@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learner import DreamerLearner, FiniteGuard, LearnerConfig, NonFiniteLossError
+from dreamer_racing.finite_guard import FiniteGuard, NonFiniteLossError
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
 from dreamer_racing.modules import SIZES, Interface
 
