@@ -31,8 +31,8 @@ def make(device: str, **settings: object) -> DreamerLearner:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile on a CPU needs a C++ compiler")
-def test_compiled_updates_are_those_of_eager_mode(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch._inductor.config, "fallback_random", True)  # the same random numbers as eager mode
+@torch._inductor.config.patch(fallback_random=True)  # the same random numbers as eager mode
+def test_compiled_updates_are_those_of_eager_mode() -> None:
     torch._dynamo.reset()
     plain, compiled = make("cpu"), make("cpu", compile=True)
     for seed in range(3):
