@@ -52,14 +52,13 @@ def test_freed_memory_is_kept() -> None:
 import resource, torch
 from dreamer_racing.memory import keep_freed_memory
 assert keep_freed_memory()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(20):
+for _ in range(40):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     torch.ones(16_000_000)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    # 16 million numbers are 15,625 pages; something small may come to lie in a freed block, but not every time
-    assert int(done.stdout) < 5 * 15_625
+    assert int(done.stdout) < 100, "16 million numbers are 15,625 pages, and the last ones need no new page"
 
 
 def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
