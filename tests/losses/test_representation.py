@@ -22,6 +22,7 @@ from dreamer_racing.losses import (
     redundancy_reduction,
 )
 from dreamer_racing.modules import SIZES, Interface, WorldModel, join_features, symlog
+from dreamer_racing.modules.layers import autocast
 
 PRIVILEGED_DIM = 5
 VECTOR_DIM = 6
@@ -109,6 +110,14 @@ def test_losses_read_what_the_agent_sees(name, sight):
             loss(lacking)
         assert type(loss).__name__ in str(error.value)
         assert repr(key) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ADDED)
+def test_flops_can_be_counted_on_the_meta_device(name):
+    loss, batch = make_loss(name).to("meta"), make_batch().to("meta")
+    with autocast(torch.device("meta"), enabled=True):
+        losses = loss(batch)
+    assert all(value.is_meta for key, value in losses.items() if key.startswith("loss_"))
 
 
 @pytest.mark.parametrize("name", ADDED)
