@@ -1,13 +1,15 @@
 """What an agent expects against what the world pays, on flights of its own policy.
 
-    python benchmarks/calibration.py runs/dreamer_v3_circle_20260101-120000 --json results/calibration.json
+    python benchmarks/calibration.py runs/circle/checkpoints/checkpoint-000000200192 runs/circle --json calibration.json
 
-The stochastic policy flies N worlds of its training environment for K steps. At every eighth step, over the learner's
-horizon H: `reward` is the sum until a crash, in the world and imagined by the policy from the same latents; `crash` the
-share that crashed; `value_end` the critic's value of where that led, 0 after a crash. `open_loop_error` is the squared
-error of the decoded race vector (symlogs, summed over its 21 entries) predicted H steps ahead from the real actions,
-beside that of the latents themselves (`filter_error`) and the vector's variance. `value` is the critic's mean on the
-first half of the flights, `monte_carlo` the mean discounted sum of what they were really paid.
+The stochastic policy flies N worlds of its training environment for K steps, at a body-rate weight b₂ of 0. At every
+eighth step, over the learner's horizon H: `reward` is the sum until a crash, in the world and imagined by the policy
+from the same latents; `crash` the share that crashed; `value_end` the critic's value of where that led, 0 after one.
+For losses that decode privileged state, `open_loop_error` is the squared error of the decoded race vector (symlogs,
+summed over its 21 entries) predicted H steps ahead from the real actions, beside that of the latents themselves
+(`filter_error`) and the vector's variance. `value` is the critic's mean on the first half of the flights, `monte_carlo`
+the mean discounted sum of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of the
+value is cut off.
 """
 
 import argparse
@@ -38,25 +40,39 @@ from dreamer_racing.modules.world_model import join_features
 def main() -> None:
     """Fly, imagine from the same latents, compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", help="run directory or checkpoint")
+    parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints, of races")
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    checkpoint = latest_checkpoint(arguments.checkpoint)
+    records = [measure(latest_checkpoint(path), arguments.num_envs, arguments.steps) for path in arguments.checkpoints]
+    for record in records:
+        print_table([{"name": name, "value": value} for name, value in record.items()], ("name", "value"))
+    write_json(records, arguments.json)
+
+
+@torch.no_grad()
+def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
+    """Return one record.
+
+    Raises:
+        ValueError: the flight would reach the time limit, which is no crash.
+    """
     saved = OmegaConf.load(checkpoint.parent.parent / "config.yaml")
     config = cast(DreamerConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(DreamerConfig), saved)))
+    if steps >= config.env.episode_steps:
+        raise ValueError(f"--steps {steps}: at most {config.env.episode_steps - 1}, so that no time runs out.")
     torch.manual_seed(0)
     learner, counters = restore_learner(config, checkpoint, torch.device("cpu"))
-    with torch.no_grad():
-        flight = fly(learner, config, arguments.num_envs, arguments.steps)
-        record = {"benchmark": "calibration", "track": config.track, **counters, **compare(learner, flight)}
-    print_table([{"name": name, "value": value} for name, value in record.items()], ("name", "value"))
-    write_json([record], arguments.json)
+    return {
+        "benchmark": "calibration", "track": config.track, "actor": config.loss.actor, **counters,
+        "num_envs": num_envs, "steps": steps, "horizon": learner.config.imagination_horizon,
+        "discount": learner.config.discount, **compare(learner, fly(learner, config, num_envs, steps)),
+    }  # fmt: skip
 
 
 def fly(learner: DreamerLearner, config: DreamerConfig, num_envs: int, steps: int) -> TensorDict:
-    """Fly the stochastic policy; return latents, actions, rewards, ends and race vectors ``[K, N]``."""
+    """Fly the stochastic policy; return latents, actions, rewards, ends and, if there, race vectors ``[K, N]``."""
     env, policy, size = make_env(config, num_envs), learner.policy(), learner.size
     observation = env.reset()
     memory = {
@@ -69,9 +85,11 @@ def fly(learner: DreamerLearner, config: DreamerConfig, num_envs: int, steps: in
         acted = policy(observation.clone(recurse=False).update({**memory, "is_init": begins}))
         memory = {name: acted["next", name] for name in memory}
         after = env.step(acted.select("action"))["next"]
-        paid = {key: after[key][:, 0] for key in ("reward", "done")}
-        vector = observation["privileged", "vector"]
-        records.append(TensorDict({**memory, **paid, "vector": vector}, [num_envs]).clone())
+        record = {"belief": memory["belief"], "state": memory["state"], "action": acted["action"]}
+        record |= {key: after[key][:, 0] for key in ("reward", "done")}
+        if ("privileged", "vector") in observation.keys(True):
+            record["vector"] = observation["privileged", "vector"]
+        records.append(TensorDict(record, [num_envs]).clone())
         begins, observation = after["done"].clone(), after.select(*env.observation_spec.keys()).clone()
         if begins.any():
             first = env.reset(TensorDict({"_reset": begins}, [num_envs]))
@@ -92,7 +110,6 @@ def compare(learner: DreamerLearner, flight: TensorDict) -> dict[str, Any]:
         goes_on = model.continue_head.probability(features).squeeze(-1)
         reached = torch.cat((torch.ones_like(goes_on[:1]), goes_on[:-1])).cumprod(0)
         row = {
-            "value": value[k],
             "reward_world": (part["reward"] * alive[:-1]).sum(0),
             "reward_imagined": (model.reward_head.mean(features).squeeze(-1) * reached).sum(0),
             "crash_world": 1 - alive[-1],
@@ -122,7 +139,7 @@ def decoded_errors(
     decoder = cast(VectorDecoder, learner.losses["world_model"].privileged_decoder)
     belief, state = flight["belief"][k], flight["state"][k]
     now = decoder(join_features(belief, state))
-    for action in flight["previous_action"][k : k + horizon]:
+    for action in flight["action"][k : k + horizon]:
         belief, state = model.rssm.imagine_step(belief, state, action)
     then, real = decoder(join_features(belief, state)), symlog(flight["vector"][[k, k + horizon]])
     return {

@@ -81,7 +81,8 @@ def main() -> None:
     records = []
     for function, values, initializer in jobs:
         with ProcessPoolExecutor(1, get_context("spawn"), initializer) as process:
-            records.append(process.submit(function, *values).result())
+            settings = {"threads": arguments.threads, "keeps_freed_memory": initializer is not None}
+            records.append(process.submit(function, *values).result() | settings)
             print_table(records[-1:], COLUMNS)
     print_table(records, COLUMNS)
     write_json(records, arguments.json)

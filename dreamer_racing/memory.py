@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import sys
 from pathlib import Path
 
 import torch
@@ -18,11 +19,14 @@ def keep_freed_memory() -> bool:
 
     glibc gives blocks of many megabytes back at once and asks for them anew at the next operation, and the kernel
     fills every page with zeros each time: a third of the update of a large model on a CPU
-    (``benchmarks/learner.py --return-freed-memory`` shows it). The process stays as large as it once was.
+    (``benchmarks/learner.py --return-freed-memory`` shows it). The process stays as large as it once was, and cannot be
+    told otherwise later. An allocator preloaded in place of glibc's does as it likes.
 
     Returns:
-        Whether the C library could be told; only glibc can.
+        Whether the C library took the setting; only glibc does.
     """
+    if sys.platform == "win32":
+        return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     return mallopt is not None and bool(mallopt(_M_MMAP_MAX, 0)) and bool(mallopt(_M_TRIM_THRESHOLD, -1))
 

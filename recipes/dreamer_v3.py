@@ -132,6 +132,8 @@ def main(config: DictConfig) -> None:
             config, overrides = resumed_config(config.resume, overrides)
         check_overrides(config, overrides)
         run = build(cast(DreamerConfig, OmegaConf.to_object(resolve(config))), overrides)
+    if run.learner.device.type == "cpu" and not keep_freed_memory():
+        print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     try:
         train(run)
     except NonFiniteLossError as error:
@@ -167,8 +169,6 @@ def resolve(config: DictConfig) -> DictConfig:
         size = "size12m" if device.type == "cuda" else "cpu_small"
         print(f"model: {size} (model=auto on {device.type})")
     config.device, config.model.size = str(device), size
-    if device.type == "cpu" and not keep_freed_memory():
-        print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):

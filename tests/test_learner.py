@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.finite_guard import FiniteGuard, NonFiniteLossError
+from dreamer_racing.finite_guard import NonFiniteLossError
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
 from dreamer_racing.modules import SIZES, Interface
@@ -238,18 +238,6 @@ def test_what_would_spoil_the_networks_is_refused(spoil):
     assert learner.updates == 0
     for name, value in learner.agent.state_dict().items():
         assert torch.equal(value, before[name]), name
-
-
-def test_a_lagging_guard_names_the_batch_that_was_bad():
-    guard, names = FiniteGuard(lag=2), ("loss", "reward_error", "gradient_norm/actor")
-    metrics = {name: torch.tensor(1.0) for name in names} | {"agreement": torch.tensor(math.nan)}
-    for number in range(4):
-        guard.check(metrics, number)
-    guard.check(metrics | {"gradient_norm/actor": torch.tensor(math.inf)}, "bad")
-    guard.check(metrics, 5)
-    with pytest.raises(NonFiniteLossError) as error:
-        guard.check(metrics, 6)
-    assert error.value.batch == "bad"
 
 
 def test_policy_shares_the_parameters():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,7 @@ def test_advice_keeps_the_first_line_of_the_error() -> None:
         assert setting in advice
 
 
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep freed memory")
 def test_freed_memory_is_kept() -> None:
     code = """
 import resource, torch
