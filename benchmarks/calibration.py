@@ -119,10 +119,9 @@ def compare(learner: DreamerLearner, flight: TensorDict) -> dict[str, Any]:
         }
         if hasattr(learner.losses["world_model"], "privileged_decoder"):
             row |= decoded_errors(learner, flight, k, horizon, alive[-1] > 0)
-        rows.append({name: numbers.mean().item() for name, numbers in row.items()})
-    means = {
-        f"mean_{name}" if name == "value" else name: sum(row[name] for row in rows) / len(rows) for name in rows[0]
-    }
+        rows.append({name: numbers.mean() for name, numbers in row.items()})
+    # Where no drone is left after H steps there is no error to take.
+    means = {name: torch.stack([row[name] for row in rows]).nanmean().item() for name in rows[0]}
     paid, half = monte_carlo(flight, learner.config.discount), len(flight) // 2
     return means | {
         "value": value[:half].mean().item(),

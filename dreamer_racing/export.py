@@ -140,7 +140,7 @@ class SampledActorStep(ActorStep):
         """Shape (L, K) of the noise of one step."""
         return self.size.latents, self.size.classes
 
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # one input more: the noise
         self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Step; arguments as in `ActorStep.forward`, and ``noise``: uniform numbers in [0, 1), ``(1, L, K)``."""

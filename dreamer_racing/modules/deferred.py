@@ -74,7 +74,7 @@ class _Collect(Function):
     @staticmethod
     def forward(ctx: FunctionCtx, weight: Tensor, bias: Tensor | None, tape: Tape) -> tuple[Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
-        ctx.tape = tape  # type: ignore[attr-defined]
+        ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
         return weight.view_as(weight), None if bias is None else bias.view_as(bias)
 
     @staticmethod
@@ -93,7 +93,7 @@ class _Product(Function):
     @staticmethod
     def forward(ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, tape: Tape) -> Tensor:
         ctx.save_for_backward(inputs, weight)
-        ctx.tape = tape  # type: ignore[attr-defined]
+        ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
         return inputs @ weight if bias is None else torch.addmm(bias, inputs, weight)
 
     @staticmethod
