@@ -10,10 +10,10 @@ The scripted pilot's actions of 2 s at racing speed on every track are replayed 
   and at 0.1 ms (`loop_vs_limit`), which is the continuous-time drone to a few µm.
 
 Variants: `plain` is an explicit step: the loop takes the rates at its beginning, the thrust is that of the motors'
-speed at its end. `+position` and `+pose` bring MuJoCo's x' = x + dt v' to the trapezoidal rule after each step
-(position only; attitude too). `midpoint` is what the package does: `Quadrotor.wrench` is of the middle of the step, and
-unless the integrator is RK4, `Flight` corrects wrench and pose. Columns in mm are the greatest position error over all
-tracks.
+speed at its end, in the direction of its middle. `+position` and `+pose` bring MuJoCo's x' = x + dt v' to the
+trapezoidal rule after each step (position only; attitude too). `midpoint` is what the package does: `Quadrotor.wrench`
+is of the middle of the step, and unless the integrator is RK4, `Flight` corrects torque and pose. Columns in mm are the
+greatest position error over all tracks.
 """
 
 import argparse
@@ -30,8 +30,7 @@ from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.pilot import ScriptedPilot
 from dreamer_racing.envs.quadrotor import PRESETS, Quadrotor
 from dreamer_racing.envs.rotation import turn
-from dreamer_racing.envs.scene import build_scene
-from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.scene import build_drone
 from dreamer_racing.envs.worlds import RaceWorlds
 
 TRACKS = ("circle", "kidney", "figure8", "split_s")
@@ -67,10 +66,10 @@ class Drones:
         self.parameters = replace(EASY, physics_dt=step, integrator=integrator)
         midpoint = variant == "midpoint"
         self.quadrotor = (Quadrotor if midpoint else PlainQuadrotor)(self.parameters, num)
-        batch = Batch(build_scene(load_track("circle"), self.parameters).compile(), num, min(2, num))
-        self.qpos, self.qvel, ctrl = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "ctrl"))
+        batch = Batch(build_drone(self.parameters).compile(), num, min(2, num))
+        self.qpos, self.qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         corrected = None if midpoint else False
-        self._flight = Flight(self.quadrotor, self.qpos, self.qvel, ctrl, batch.step, corrected)
+        self._flight = Flight(self.quadrotor, self.qpos, self.qvel, force, batch.step, corrected)
         self._variant = variant
 
     def wrench(self, index: int) -> Tensor:

@@ -10,23 +10,24 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import Quadrotor
-from dreamer_racing.envs.rotation import turn
+from dreamer_racing.envs.rotation import rotate, turn
 
 
 class Flight:
     """Quadrotors on MuJoCo's rigid bodies.
 
-    MuJoCo's Euler step is of first order: v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that
-    strays by 8 cm. Two corrections make it second order (`benchmarks/integrators.py` has the figures): the wrench is
-    turned into the one that does at the step's beginning what the given one does in its middle, and half of the
-    overshoot h·(v' − v) is taken back from the pose. RK4 needs neither.
+    The force is held in the direction it has in the step's middle. Beyond that, MuJoCo's Euler step is of first order:
+    v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that strays by 8 cm. Two corrections make it
+    second order (`benchmarks/integrators.py` has the figures): the torque is turned into the one that does with the
+    rates of the step's beginning what the given one does with those of its middle, and half of the overshoot
+    h·(v' − v) is taken back from the pose. RK4 needs neither.
 
     Args:
         quadrotor: controllers and motors.
-        qpos: (N, 7) float64 view of MuJoCo's state.
+        qpos: (N, 7) view of MuJoCo's state.
         qvel: (N, 6) likewise.
-        ctrl: (N, 6) likewise, of the actuators `scene.WRENCH_ACTUATORS`.
-        integrate: makes one physics step with the present `ctrl`.
+        qfrc_applied: (N, 6) likewise: force in the world frame, torque in the body frame.
+        integrate: makes one physics step with the present `qfrc_applied`.
         corrected: whether to correct the integrator; None for what it needs.
     """
 
@@ -35,14 +36,15 @@ class Flight:
         quadrotor: Quadrotor,
         qpos: Tensor,
         qvel: Tensor,
-        ctrl: Tensor,
+        qfrc_applied: Tensor,
         integrate: Callable[[], None],
         corrected: bool | None = None,
     ) -> None:
         self.quadrotor = quadrotor
         self.position, self.attitude = qpos[:, :3], qpos[:, 3:]
         self.linear_velocity, self.body_rates = qvel[:, :3], qvel[:, 3:]
-        self._qvel, self._ctrl, self._integrate = qvel, ctrl, integrate
+        self._qvel, self._integrate = qvel, integrate
+        self._force, self._torque = qfrc_applied[:, :3], qfrc_applied[:, 3:]
         self._corrected = quadrotor.parameters.integrator != "RK4" if corrected is None else corrected
         self._half_step = 0.5 * quadrotor.parameters.physics_dt
 
@@ -52,22 +54,18 @@ class Flight:
 
     def apply(self, wrench: Tensor) -> None:
         """Move the bodies for one physics step under a wrench (N, 6), body frame, N and N m."""
+        force, torque = wrench[:, :3], wrench[:, 3:]
+        gyroscopic = self.quadrotor.gyroscopic_torque(self.body_rates)
+        rates = self.quadrotor.rates_half_a_step_later(self.body_rates, torque, gyroscopic)
+        force = torch.add(force, torch.linalg.cross(rates, force), alpha=self._half_step)
+        self._force.copy_(rotate(self.attitude, force))
         if not self._corrected:
-            self._ctrl.copy_(wrench)
+            self._torque.copy_(torque)
             self._integrate()
             return
-        self._ctrl.copy_(self._of_the_middle(wrench))
+        torch.add(torque, gyroscopic - self.quadrotor.gyroscopic_torque(rates), out=self._torque)
         before = self._qvel.clone()
         self._integrate()
         overshoot = (before - self._qvel).mul_(self._half_step)  # (N, 6), m and rad, negative
         self.position.add_(overshoot[:, :3])
         self.attitude.copy_(turn(self.attitude, overshoot[:, 3:]))
-
-    def _of_the_middle(self, wrench: Tensor) -> Tensor:
-        """The wrench that does with the step's first attitude and rates what this one does with those of its middle."""
-        force, torque = wrench[:, :3], wrench[:, 3:]
-        gyroscopic = self.quadrotor.gyroscopic_torque(self.body_rates)
-        rates = self.quadrotor.rates_half_a_step_later(self.body_rates, torque, gyroscopic)
-        force = torch.add(force, torch.linalg.cross(rates, force), alpha=self._half_step)
-        torque = torque + gyroscopic - self.quadrotor.gyroscopic_torque(rates)
-        return torch.cat((force, torque), dim=1)

@@ -1,8 +1,9 @@
 """The quadrotor: from collective thrust and body rates (CTBR) to the wrench on the body, for N drones at once.
 
 A `Quadrotor` holds what the flight controller and the motors remember between physics steps (rotor speeds, delayed
-commands) and each drone's randomised parameters. The rigid body itself is integrated by MuJoCo: once per physics step
-the simulator asks `Quadrotor.wrench` for the body-frame force and torque and applies it.
+commands) and each drone's randomised parameters, in tensors that stay in place, so that a CUDA graph can advance them.
+The rigid body itself is integrated by MuJoCo: once per physics step the simulator asks `Quadrotor.wrench` for the
+body-frame force and torque and applies it.
 
 Shapes: N drones. SI units, body frame FLU. Sources of numbers: [paper] Romero et al., "Dream to Fly"; [rpg] public code
 of the same laboratory; [choice] this project's, because nobody published it.
@@ -203,7 +204,7 @@ class Quadrotor:
         """Spin the rotors of the masked drones (N,) bool at hover, forget their commands, draw their parameters."""
         rows = mask.unsqueeze(-1)  # (N, 1)
         self.rotor_speed.masked_fill_(rows, self._hover_speed)
-        self._setpoints = torch.where(rows, self._hover_setpoint, self._setpoints)
+        self._setpoints.copy_(torch.where(rows, self._hover_setpoint, self._setpoints))
         if self.parameters.randomisation is not None:
             self._randomise(rows, self.parameters.randomisation)
 
@@ -213,9 +214,9 @@ class Quadrotor:
         for name in RELATIVE:
             current = getattr(drones, name)
             noise = 2.0 * self._uniform(*current.shape) - 1.0
-            setattr(drones, name, torch.where(rows, 1.0 + getattr(widths, name) * noise, current))
+            current.copy_(torch.where(rows, 1.0 + getattr(widths, name) * noise, current))
         delay = (self._uniform(self.num_drones) * widths.delay_max / self.parameters.physics_dt).round().long()
-        drones.delay_steps = torch.where(rows[:, 0], delay, drones.delay_steps)
+        drones.delay_steps.copy_(torch.where(rows[:, 0], delay, drones.delay_steps))
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
@@ -225,22 +226,23 @@ class Quadrotor:
         drones = (
             None
             if self._drones is None
-            else {field.name: getattr(self._drones, field.name) for field in fields(_Drones)}
+            else {field.name: getattr(self._drones, field.name).clone() for field in fields(_Drones)}
         )
-        return {"rotor_speed": self.rotor_speed, "setpoints": self._setpoints, "drones": drones}
+        return {"rotor_speed": self.rotor_speed.clone(), "setpoints": self._setpoints.clone(), "drones": drones}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.rotor_speed = state_dict["rotor_speed"].clone()
-        self._setpoints = state_dict["setpoints"].clone()
+        self.rotor_speed.copy_(state_dict["rotor_speed"])
+        self._setpoints.copy_(state_dict["setpoints"])
         if self._drones is not None:
-            self._drones = _Drones(**state_dict["drones"])
+            for name, value in state_dict["drones"].items():
+                getattr(self._drones, name).copy_(value)
 
     def command(self, action: Tensor) -> None:
         """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
         action = action.to(self._device, self._dtype).clamp(-1.0, 1.0)
         setpoint = torch.addcmul(self._setpoint_offset, action, self._setpoint_scale)
-        self._setpoints = torch.cat((setpoint.unsqueeze(0), self._setpoints[:-1]))
+        self._setpoints.copy_(torch.cat((setpoint.unsqueeze(0), self._setpoints[:-1])))
 
     def _setpoint(self, physics_step: int) -> Tensor:
         """The setpoint (N, 4) that has arrived by this physics step of the control step."""
@@ -268,13 +270,13 @@ class Quadrotor:
         """
         setpoint = self._setpoint(physics_step)
         gyroscopic = self.gyroscopic_torque(body_rates)
-        present_torque = self.rotor_speed.square() @ self._torque_effectiveness
+        present_torque = _product(self.rotor_speed.square(), self._torque_effectiveness)
         rates = self.rates_half_a_step_later(body_rates, present_torque, gyroscopic)
         torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
         target_speed = self.mix(setpoint[:, :1], torque).sqrt()
         middle_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay_half)
-        self.rotor_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay)
-        wrench = middle_speed.square() @ self._effectiveness
+        self.rotor_speed.copy_(torch.lerp(target_speed, self.rotor_speed, self._motor_decay))
+        wrench = _product(middle_speed.square(), self._effectiveness)
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
         return wrench
@@ -294,7 +296,7 @@ class Quadrotor:
         (and those together, keeping their direction) [choice].
         """
         limit = self.parameters.rotor_thrust_max
-        roll_pitch = torque[:, :2] @ self._roll_pitch_to_rotors  # (N, 4), zero mean
+        roll_pitch = _product(torque[:, :2], self._roll_pitch_to_rotors)  # (N, 4), zero mean
         low, high = roll_pitch.aminmax(dim=1, keepdim=True)
         scale = (limit / (high - low)).clamp(max=1.0)  # x / 0 = inf → 1
         each = torch.minimum(torch.maximum(0.25 * thrust, -scale * low), limit - scale * high)
@@ -320,3 +322,8 @@ class Quadrotor:
         # J₀ J⁻¹ (τ − ω × Jω) + ω × J₀ω: Euler's equation of the own body, written for the nominal one
         torque = (torque - own_gyroscopic) / drones.inertia + gyroscopic
         return torch.cat((force, torque), dim=1)
+
+
+def _product(values: Tensor, matrix: Tensor) -> Tensor:
+    """Multiply (N, K) by (K, M) in full precision, which a matrix product on CUDA may lack (TF32)."""
+    return (values.unsqueeze(-1) * matrix).sum(1) if values.is_cuda else values @ matrix

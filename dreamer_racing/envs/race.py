@@ -100,11 +100,14 @@ class Race:
         self._gate_positions = track.gate_positions(device, dtype)
         self._dtype = dtype
 
-        zeros = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self.target_gate = zeros  # (N,) gate to pass next
-        self.gates_passed = zeros  # (N,) in this episode
-        self.step_count = zeros  # (N,) control steps of this episode
-        self.lap_start_step = zeros  # (N,) step at which the present lap began
+        def zeros() -> torch.Tensor:
+            return torch.zeros(num_envs, dtype=torch.int64, device=device)
+
+        # all stay in place, so that a CUDA graph can advance them
+        self.target_gate = zeros()  # (N,) gate to pass next
+        self.gates_passed = zeros()  # (N,) in this episode
+        self.step_count = zeros()  # (N,) control steps of this episode
+        self.lap_start_step = zeros()  # (N,) step at which the present lap began
         self.position = torch.zeros(num_envs, 3, dtype=dtype, device=device)  # (N, 3) at the last control step, m
 
     def begin(self, mask: torch.Tensor, position: torch.Tensor, target_gate: torch.Tensor) -> None:
@@ -115,11 +118,11 @@ class Race:
             position: where they begin, (N, 3), m; read only where masked.
             target_gate: the first gate to pass, (N,) int64; read only where masked.
         """
-        self.position = torch.where(mask.unsqueeze(-1), position.to(self._dtype), self.position)
-        self.target_gate = torch.where(mask, target_gate, self.target_gate)
-        self.gates_passed = self.gates_passed.masked_fill(mask, 0)
-        self.step_count = self.step_count.masked_fill(mask, 0)
-        self.lap_start_step = self.lap_start_step.masked_fill(mask, 0)
+        self.position.copy_(torch.where(mask.unsqueeze(-1), position.to(self._dtype), self.position))
+        self.target_gate.copy_(torch.where(mask, target_gate, self.target_gate))
+        self.gates_passed.masked_fill_(mask, 0)
+        self.step_count.masked_fill_(mask, 0)
+        self.lap_start_step.masked_fill_(mask, 0)
 
     def step(self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor) -> RaceStep:
         """Judge one control step and advance every episode by it.
@@ -155,22 +158,22 @@ class Race:
             terminated=crashed,
             truncated=~crashed & (finished | (self.step_count >= self.episode_steps)),
             passed=passed,
-            gates_passed=self.gates_passed,
+            gates_passed=self.gates_passed.clone(),
             gate_offset=gate_offset,
             lap_time=lap_time,
             crash=crash,
             finished=finished,
-            target_gate=self.target_gate,
+            target_gate=self.target_gate.clone(),
         )
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return where every episode stands."""
-        return {name: getattr(self, name) for name in self._EPISODE}
+        return {name: getattr(self, name).clone() for name in self._EPISODE}
 
     def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
         """Restore what `state_dict` returned."""
         for name in self._EPISODE:
-            setattr(self, name, state_dict[name].to(getattr(self, name)))
+            getattr(self, name).copy_(state_dict[name])
 
     def _judge(
         self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor
@@ -185,14 +188,14 @@ class Race:
     def _advance(self, passed: torch.Tensor, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Move every episode on by one control step; return which laps it completed and their times (N,), s."""
         num_gates = self.track.num_gates
-        self.position = position
-        self.step_count = self.step_count + 1
-        self.gates_passed = self.gates_passed + passed
-        self.target_gate = (self.target_gate + passed) % num_gates
+        self.position.copy_(position)
+        self.step_count += 1
+        self.gates_passed += passed
+        self.target_gate.add_(passed).remainder_(num_gates)
         lap_complete = passed & (self.gates_passed % num_gates == 0)
         lap_steps = self.step_count - self.lap_start_step
         lap_time = torch.where(lap_complete, lap_steps * self.control_dt, 0.0).to(self._dtype)
-        self.lap_start_step = torch.where(lap_complete, self.step_count, self.lap_start_step)
+        self.lap_start_step.copy_(torch.where(lap_complete, self.step_count, self.lap_start_step))
         return lap_complete, lap_time
 
 

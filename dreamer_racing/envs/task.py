@@ -172,8 +172,9 @@ class Physics(mujoco.Physics):
     def __init__(self, data: wrapper.MjData, quadrotor: Quadrotor) -> None:
         super().__init__(data)
         self.quadrotor = quadrotor
-        qpos, qvel, ctrl = (torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl))
-        self._flight = Flight(quadrotor, qpos, qvel, ctrl, self._integrate)
+        arrays = (data.qpos, data.qvel, data.qfrc_applied)
+        qpos, qvel, force = (torch.from_numpy(array).unsqueeze(0) for array in arrays)
+        self._flight = Flight(quadrotor, qpos, qvel, force, self._integrate)
         self._start_path()
 
     def position(self) -> np.ndarray:

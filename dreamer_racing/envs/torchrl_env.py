@@ -25,13 +25,13 @@ class DroneRacingEnv(EnvBase):
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N; the batch size is [N].
-        device: where tensors live; the simulation itself runs on CPU.
+        device: where the worlds and all tensors live, `cpu` or a CUDA device; see `RaceWorlds`.
         from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and physics randomisation.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `num_threads`.
+            `num_threads`, `backend`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.
@@ -56,7 +56,7 @@ class DroneRacingEnv(EnvBase):
         super().__init__(device=device, batch_size=[num_envs])
         self.from_pixels = from_pixels
         self.privileged = privileged
-        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, seed=seed, **worlds)
+        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **worlds)
         self.track = self.worlds.track
         self.body_rate_weight = self.worlds.race.weights.body_rate
         self._make_specs()
@@ -106,12 +106,12 @@ class DroneRacingEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         mask = tensordict.get("_reset", None) if tensordict is not None else None
-        mask = None if mask is None else mask.view(self.batch_size).cpu()
+        mask = None if mask is None else mask.view(self.batch_size)
         self.worlds.reset(mask)
         return self._observe(None, mask)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outcome = self.worlds.step(tensordict["action"].cpu())
+        outcome = self.worlds.step(tensordict["action"])
         data = self._observe(outcome, None)
         reward = outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm
         data.set("reward", self._column(reward))
@@ -121,9 +121,9 @@ class DroneRacingEnv(EnvBase):
         return data
 
     def _column(self, values: Tensor) -> Tensor:
-        """(N,) → (N, 1) on this device, floats as float32."""
+        """(N,) → (N, 1), floats as float32."""
         values = values.unsqueeze(-1)
-        return values.to(self.device, torch.float32 if values.is_floating_point() else values.dtype)
+        return values.float() if values.is_floating_point() else values
 
     def _observe(self, outcome: RaceStep | None, mask: Tensor | None) -> TensorDict:
         """Everything but reward and done; after a reset (no outcome) the race's entries are zero."""
@@ -143,15 +143,14 @@ class DroneRacingEnv(EnvBase):
                 self.batch_size,
                 device=self.device,
             )
-        vector = self.worlds.vector().to(self.device)
+        vector = self.worlds.vector()
         if not self.from_pixels:
             data.set("vector", vector)
         if self.privileged:
-            privileged = {name: value.to(self.device) for name, value in self.worlds.privileged().items()}
-            privileged["vector"] = vector
+            privileged = {**self.worlds.privileged(), "vector": vector}
             data.set("privileged", TensorDict(privileged, self.batch_size, device=self.device))
         if self.from_pixels:
-            data.set("pixels", self._pixels(mask).to(self.device))
+            data.set("pixels", self._pixels(mask))
         return data
 
     def _pixels(self, mask: Tensor | None) -> Tensor:
@@ -159,7 +158,7 @@ class DroneRacingEnv(EnvBase):
         images = self.worlds.render(mask)
         if mask is None:
             return images
-        everyone = torch.zeros((*self.batch_size, *images.shape[1:]), dtype=torch.uint8)
+        everyone = images.new_zeros((*self.batch_size, *images.shape[1:]))
         everyone[mask] = images
         return everyone
 

@@ -4,6 +4,7 @@ The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: 
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -14,7 +15,8 @@ from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import Camera
-from dreamer_racing.envs.simulator import MujocoSimulator, Simulator
+from dreamer_racing.envs.simulator import Simulator, check_device, make_simulator
+from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
 
 ACTION_SIZE = 4
@@ -31,10 +33,11 @@ class RaceWorlds:
         episode_steps: control steps until an episode is truncated; if None 1000 (20 s), in evaluation 1500 (30 s).
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
-        renderer: `auto`, `egl`, `osmesa` or `warp`.
+        renderer: `auto`, or on CPU `egl`, `osmesa` or `warp`.
         camera: the nose camera.
-        num_threads: of physics and rendering; all CPUs of the process if None.
-        device: `cpu`; the CUDA backend is not built yet.
+        num_threads: of physics and rendering on CPU; all CPUs of the process if None.
+        device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
+        backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and physics randomisation.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
 
@@ -63,13 +66,13 @@ class RaceWorlds:
         camera: Camera | None = None,
         num_threads: int | None = None,
         device: torch.device | str = "cpu",
+        backend: str = "auto",
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
-        if torch.device(device).type != "cpu":
-            raise ValueError(f"device={device!r}: only the CPU simulator exists so far; use device='cpu'.")
+        check_device(device)
         self.track = load_track(track)
         self.num_envs = num_envs
         self.evaluation = evaluation
@@ -77,7 +80,7 @@ class RaceWorlds:
         self.parameters = load_preset(preset)
         self._generator = torch.Generator(device)
         self.seed(seed)
-        self.simulator: Simulator = MujocoSimulator(
+        self.simulator: Simulator = make_simulator(
             self.track,
             self.parameters,
             num_envs,
@@ -85,6 +88,8 @@ class RaceWorlds:
             renderer if from_pixels else None,
             num_threads,
             self._generator,
+            device,
+            backend,
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = Race(
@@ -98,6 +103,9 @@ class RaceWorlds:
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = StartSampler(self.track, self._generator, self.device, self.dtype, start_beyond_gate)
+        self._from_pixels = from_pixels
+        self._graph: GraphedFunction | None = None
+        self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
 
     def seed(self, seed: int | None) -> None:
         """Seed start poses and physics randomisation; None draws a seed from the operating system."""
@@ -113,6 +121,7 @@ class RaceWorlds:
         start = self._starts.sample(self.num_envs, self.evaluation)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
+        self._images = None
 
     def step(self, action: Tensor) -> RaceStep:
         """Fly one control step.
@@ -129,22 +138,44 @@ class RaceWorlds:
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
                 f"({self.num_envs}, {ACTION_SIZE}): collective thrust and body rates x, y, z, each in [-1, 1]."
             )
+        if self.device.type != "cuda":
+            return self._fly(action)
+        if self._graph is None:
+            self._graph = self._capture(action)
+        outcome = list(self._graph(action))
+        if self._from_pixels:
+            self._images = outcome.pop()
+        return RaceStep(*outcome)
+
+    def _fly(self, action: Tensor) -> RaceStep:
+        """Fly one control step and judge it; nothing here waits for a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
         path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
         return self.race.step(path, self.simulator.state.body_rates, invalid)
 
+    def _capture(self, action: Tensor) -> GraphedFunction:
+        """Capture physics, race and images of a step as one CUDA graph, and leave the worlds as they were."""
+
+        def fly_and_draw(action: Tensor) -> list[Tensor]:
+            outcome = list(vars(self._fly(action)).values())
+            return [*outcome, self.simulator.render()] if self._from_pixels else outcome
+
+        before = self.state_dict()
+        graph = GraphedFunction(fly_and_draw, action)
+        self.load_state_dict(before)
+        return graph
+
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+        if self._images is not None:
+            return self._images if mask is None else self._images[mask]
         return self.simulator.render(mask)
 
     def privileged(self) -> dict[str, Tensor]:
         """Copies of what the pixel agent must not see; see the key table in `docs/architecture.md`."""
         state = self.simulator.state
         return {
-            "position": state.position.float(),
-            "attitude": state.attitude.float(),
-            "linear_velocity": state.linear_velocity.float(),
-            "body_rates": state.body_rates.float(),
+            **{field.name: getattr(state, field.name).to(torch.float32, copy=True) for field in fields(state)},
             "target_gate": self.race.target_gate.unsqueeze(-1).clone(),
         }
 
@@ -173,6 +204,7 @@ class RaceWorlds:
             )
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
+        self._images = None
         self._generator.set_state(state_dict["generator"])
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import GRAVITY, PRESETS, Quadrotor, QuadrotorParameters, load_preset
-from dreamer_racing.envs.scene import build_scene
+from dreamer_racing.envs.scene import build_drone
 from dreamer_racing.envs.simulator import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 
@@ -159,7 +159,7 @@ def test_randomised_drones_obey_their_own_newton_and_euler_equations() -> None:
     assert own.delay_steps.min() >= 0 and own.delay_steps.max() <= 40
     rates = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 5
     level = torch.tensor([LEVEL], dtype=torch.float64).repeat(64, 1)
-    before, decay = drone.rotor_speed, drone._motor_decay
+    before, decay = drone.rotor_speed.clone(), drone._motor_decay
     wrench = drone.wrench(0, level, torch.zeros_like(rates), rates)
     target = (drone.rotor_speed - decay * before) / (1 - decay)
     rotors = (target + decay**0.5 * (before - target)).square() @ drone._effectiveness  # of the middle of the step
@@ -185,10 +185,11 @@ class Body:
     """One drone of a preset, thrown with a spin, under given wrenches."""
 
     def __init__(self, parameters: QuadrotorParameters) -> None:
-        self.model = build_scene(load_track("circle"), parameters).compile()
+        self.model = build_drone(parameters).compile()
         self.data = mujoco.MjData(self.model)
         self.data.qvel[:] = (5.0, 0.0, 2.0, 3.0, -2.0, 1.0)
-        views = [torch.from_numpy(array).unsqueeze(0) for array in (self.data.qpos, self.data.qvel, self.data.ctrl)]
+        arrays = (self.data.qpos, self.data.qvel, self.data.qfrc_applied)
+        views = [torch.from_numpy(array).unsqueeze(0) for array in arrays]
         self.flight = Flight(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(self.model, self.data))
 
     def fly(self, wrenches: torch.Tensor, substeps: int) -> torch.Tensor:

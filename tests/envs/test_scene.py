@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.quadrotor import PRESETS, QuadrotorParameters
-from dreamer_racing.envs.scene import CAMERA_NAME, DRONE_GROUP, HALL_GROUP, WRENCH_ACTUATORS, Camera, build_scene
+from dreamer_racing.envs.scene import CAMERA_NAME, DRONE_GROUP, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, Track, load_track
 
 EASY = PRESETS["easy"]
@@ -102,21 +102,14 @@ def test_mass_properties_are_exact() -> None:
     assert model.nv == 6
 
 
-def test_actuators_apply_a_body_wrench_at_the_centre_of_mass() -> None:
+def test_applied_forces_are_of_the_world_and_torques_of_the_body() -> None:
     model, data = compiled()
     rotated = np.array([0.5, 0.5, 0.5, 0.5])  # body x → world y → z → x
     data.qpos[3:] = rotated
-    assert [model.actuator(index).name for index in range(model.nu)] == list(WRENCH_ACTUATORS)
-    for index in range(6):
-        data.ctrl[:] = 0.0
-        data.ctrl[index] = 0.3
-        mujoco.mj_forward(model, data)
-        expected = np.zeros(6)
-        if index < 3:
-            mujoco.mju_rotVecQuat(expected[:3], np.eye(3)[index] * 0.3, rotated)
-        else:
-            expected[index] = 0.3  # the torques of a free joint are in the body frame
-        np.testing.assert_allclose(data.qfrc_actuator, expected, atol=1e-12)
+    data.qfrc_applied[:] = (0.3, 0.2, 0.1 + 9.81 * EASY.mass, 0.01, 0.02, 0.03)
+    mujoco.mj_forward(model, data)
+    expected = np.concatenate((np.array((0.3, 0.2, 0.1)) / EASY.mass, np.array((0.01, 0.02, 0.03)) / EASY.inertia))
+    np.testing.assert_allclose(data.qacc, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_physics_options_are_those_of_the_parameters() -> None:

@@ -108,7 +108,7 @@ def test_batch_equals_mujocos_own_step(preset: str) -> None:
     data.qpos[:3], data.qpos[3:], data.qvel[:3] = position[0], attitude[0], velocity[0]
     quadrotor = Quadrotor(parameters, 1, generator=torch.Generator().manual_seed(0))
     quadrotor.reset(everyone(1))
-    views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.ctrl)]
+    views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.qfrc_applied)]
     flight = Flight(quadrotor, *views, lambda: mujoco.mj_step(model, data))
     for action in actions(10, 1):
         path = made.step(action)

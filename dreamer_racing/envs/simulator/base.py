@@ -1,14 +1,18 @@
-"""What the race needs of a simulator: the seam between the CPU backend and a CUDA one.
+"""What the race needs of a simulator: the seam between the CPU backend and the CUDA one.
 
 Shapes: N worlds, P physics steps per control step. SI units, attitude wxyz.
 """
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from dreamer_racing.envs.flight import Flight
+from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters
 
 
 @dataclass(frozen=True)
@@ -21,21 +25,49 @@ class DroneState:
     body_rates: Tensor  # (N, 3) rad/s, body frame
 
 
-class Simulator(Protocol):
-    """N worlds with one drone each."""
+class Simulator(ABC):
+    """N worlds with one drone each.
 
-    num_envs: int
-    device: torch.device
-    dtype: torch.dtype
+    Controllers and motors are torch code, the same for every backend; a backend gives the tensors in which its engine
+    keeps the bodies, a function that moves them by one physics step, and images.
 
-    @property
-    def state(self) -> DroneState:
-        """The present state; its tensors may be views that the next step overwrites."""
-        ...
+    Args:
+        parameters: the drone.
+        qpos: (N, 7) the engine's positions and attitudes.
+        qvel: (N, 6) its velocities (world) and body rates (body frame).
+        qfrc_applied: (N, 6) the forces (world) and torques (body frame) it takes.
+        integrate: makes one physics step.
+        generator: source of the physics randomisation, on the tensors' device.
+
+    Attributes:
+        state: the present state; views that the next step overwrites.
+    """
+
+    def __init__(
+        self,
+        parameters: QuadrotorParameters,
+        qpos: Tensor,
+        qvel: Tensor,
+        qfrc_applied: Tensor,
+        integrate: Callable[[], None],
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.parameters = parameters
+        self.num_envs = len(qpos)
+        self.device, self.dtype = qpos.device, qpos.dtype
+        self.quadrotor = Quadrotor(parameters, self.num_envs, self.device, self.dtype, generator)
+        self._qpos, self._qvel = qpos, qvel
+        self.state = DroneState(qpos[:, :3], qpos[:, 3:], qvel[:, :3], qvel[:, 3:])
+        self._flight = Flight(self.quadrotor, qpos, qvel, qfrc_applied, integrate)
 
     def reset(self, mask: Tensor, position: Tensor, attitude: Tensor, linear_velocity: Tensor) -> None:
-        """Put the masked drones (N,) bool at rest in rotation at the given poses (N, ·), rotors at hover."""
-        ...
+        """Put the masked drones (N,) bool at the given poses (N, ·), not rotating, rotors at hover."""
+        rows = mask.unsqueeze(-1)
+        pose = torch.cat((position, attitude), dim=1).to(self.dtype)
+        velocity = torch.nn.functional.pad(linear_velocity.to(self.dtype), (0, 3))
+        self._qpos.copy_(torch.where(rows, pose, self._qpos))
+        self._qvel.copy_(torch.where(rows, velocity, self._qvel))
+        self.quadrotor.reset(mask)
 
     def step(self, action: Tensor) -> Tensor:
         """Fly one control step with finite actions (N, 4).
@@ -43,20 +75,38 @@ class Simulator(Protocol):
         Returns:
             (P + 1, N, 3) positions from the start to the end of the step, one per physics step.
         """
-        ...
+        steps = self.parameters.physics_steps
+        path = torch.empty(steps + 1, self.num_envs, 3, dtype=self.dtype, device=self.device)
+        path[0] = self.state.position
+        self.quadrotor.command(action)
+        for index in range(steps):
+            self._flight.step(index)
+            path[index + 1] = self.state.position
+        return path
 
+    @abstractmethod
     def render(self, mask: Tensor | None = None) -> Tensor:
-        """Images of the nose cameras, uint8 (M, height, width, 3): of all worlds, or of the M masked ones in order."""
-        ...
+        """Images of the nose cameras, uint8 (M, height, width, 3): of all worlds, or of the M masked ones in order.
+
+        Raises:
+            RuntimeError: this simulator was made without a renderer.
+        """
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next step depends on, for `torch.save`."""
-        ...
+        return {"qpos": self._qpos.clone(), "qvel": self._qvel.clone(), "quadrotor": self.quadrotor.state_dict()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        ...
+        self._qpos.copy_(state_dict["qpos"])
+        self._qvel.copy_(state_dict["qvel"])
+        self.quadrotor.load_state_dict(state_dict["quadrotor"])
 
+    @abstractmethod
     def close(self) -> None:
         """Free contexts and threads; the simulator is unusable afterwards."""
-        ...
+
+
+def no_images() -> RuntimeError:
+    """The error of asking a simulator without a renderer for images."""
+    return RuntimeError("This simulator was made with renderer=None: it has no images to give.")

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera
+from dreamer_racing.envs.simulator.ray_caster import RayCaster
 
 logger = logging.getLogger(__name__)
 
@@ -43,10 +44,33 @@ class RendererUnavailableError(RuntimeError):
     """No image can be drawn this way on this machine; the message says why and what would help."""
 
 
+class NoseMount:
+    """Where the cameras of drones are.
+
+    Args:
+        camera: the nose camera.
+        device: where poses will be.
+        dtype: floating-point type of the poses.
+    """
+
+    def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
+        tilt = math.radians(camera.tilt)
+        cosine, sine = math.cos(tilt), math.sin(tilt)
+        self._mount = torch.tensor(camera.position, device=device, dtype=dtype)
+        self._axes = torch.tensor(  # (3, 3) rows: right, up, backwards in the body frame
+            ((0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)), device=device, dtype=dtype
+        )
+
+    def __call__(self, position: Tensor, attitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return eyes (M, 3) and axes (M, 3, 3; rows right, up, backwards) of drones at (M, 3) and (M, 4), wxyz."""
+        eye = position + rotate(attitude, self._mount.expand_as(position))
+        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), self._axes.expand(len(position), -1, -1))
+
+
 class Worker(Protocol):
     """Draws frames in one thread."""
 
-    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         ...
 
@@ -75,25 +99,18 @@ class Renderer:
         except BaseException:
             self._shutdown()
             raise
-        tilt = math.radians(camera.tilt)
-        cosine, sine = math.cos(tilt), math.sin(tilt)
-        self._mount = torch.tensor(camera.position, dtype=torch.float64)
-        self._axes = torch.tensor(  # (3, 3) rows: right, up, backwards in the body frame
-            ((0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)), dtype=torch.float64
-        )
+        self._mount = NoseMount(camera)
 
     def render(self, position: Tensor, attitude: Tensor) -> Tensor:
         """Images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
         camera = self.camera
         frames = len(position)
-        eye = (position + rotate(attitude, self._mount.expand_as(position))).numpy()
-        axes = rotate(attitude.unsqueeze(1).expand(-1, 3, -1), self._axes.expand(frames, -1, -1)).numpy()  # (M, 3, 3)
+        eye, axes = self._mount(position, attitude)
         images = torch.empty((frames, camera.height, camera.width, 3), dtype=torch.uint8)
-        out = images.numpy()
         size = max(1, -(-frames // len(self._executors)))
         slices = [slice(start, start + size) for start in range(0, frames, size)]
         jobs = [
-            executor.submit(worker.draw, eye[part], axes[part], out[part])
+            executor.submit(worker.draw, eye[part], axes[part], images[part])
             for executor, worker, part in zip(self._executors, self._workers, slices, strict=False)
         ]
         for job in jobs:
@@ -147,78 +164,25 @@ class OpenGLWorker:
         self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
         self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
 
-    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         buffer, upright = self._buffer, self._buffer[::-1]  # OpenGL's first row is the lowest
-        for index in range(len(position)):
+        positions, ups, forwards = position.numpy(), axes[:, 1].numpy(), (-axes[:, 2]).numpy()
+        images = out.numpy()
+        for index in range(len(images)):
             for eye in self._eyes:
-                eye.pos = position[index]
-                eye.up = axes[index, 1]
-                eye.forward = -axes[index, 2]
+                eye.pos = positions[index]
+                eye.up = ups[index]
+                eye.forward = forwards[index]
             mujoco.mjr_render(self._viewport, self._scene, self._context)
             mujoco.mjr_readPixels(buffer, None, self._viewport, self._context)
-            out[index] = upright
+            images[index] = upright
 
     def close(self) -> None:
         """Free the OpenGL context."""
         self._context.free()
         self._gl.free()
         atexit.unregister(self._gl.free)
-
-
-class RayCasterWorker:
-    """`mujoco_warp`'s batch renderer on warp's CPU device: needs no OpenGL library.
-
-    Args:
-        model: the compiled scene.
-        camera: the nose camera.
-        frames: the most frames drawn in one call.
-    """
-
-    def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int) -> None:
-        import warp
-
-        warp.config.log_level = warp.LOG_ERROR  # before mujoco_warp initialises warp: no CUDA is no news here
-        import mujoco_warp
-
-        self._render, self._device = mujoco_warp.render, warp.get_device("cpu")
-        with warp.ScopedDevice(self._device):
-            data = mujoco.MjData(model)
-            mujoco.mj_forward(model, data)
-            self._model = mujoco_warp.put_model(model)
-            self._data = mujoco_warp.put_data(model, data, nworld=frames)
-            self._context = mujoco_warp.create_render_context(
-                model,
-                nworld=frames,
-                cam_res=(camera.width, camera.height),
-                render_rgb=True,
-                enabled_geom_groups=[HALL_GROUP],
-                enable_specular=False,
-                enable_emission=False,
-                enable_per_light_ambient=False,
-            )
-            mujoco_warp.refit_bvh(self._model, self._data, self._context)
-            mujoco_warp.render(self._model, self._data, self._context)  # compile now, not in the first step
-        # warp arrays on CPU share their memory with these NumPy views
-        self._position = self._data.cam_xpos.numpy()[:, 0]  # (frames, 3)
-        self._axes = self._data.cam_xmat.numpy()[:, 0]  # (frames, 3, 3) columns: right, up, backwards
-        packed = self._context.rgb_data.numpy()  # (frames, H * W) uint32 of bytes B, G, R, A
-        self._packed = packed.view(np.uint8).reshape(frames, camera.height, camera.width, 4)
-
-    def draw(self, position: np.ndarray, axes: np.ndarray, out: np.ndarray) -> None:
-        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
-        count, capacity = len(position), len(self._position)
-        for start in range(0, count, capacity):
-            part = slice(start, min(start + capacity, count))
-            frames = part.stop - part.start
-            self._position[:frames] = position[part]
-            self._axes[:frames] = axes[part].transpose(0, 2, 1)
-            self._data.nworld = frames  # the renderer launches over this many worlds
-            self._render(self._model, self._data, self._context)
-            out[part] = self._packed[:frames, :, :, 2::-1]
-
-    def close(self) -> None:
-        """Nothing to free: warp's arrays go with the object."""
 
 
 def make_renderer(name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int) -> Renderer:
@@ -248,7 +212,7 @@ def _worker_factory(
     name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int
 ) -> Callable[[], Worker]:
     if name == "warp":
-        return lambda: RayCasterWorker(model, camera, -(-num_envs // num_workers))
+        return lambda: RayCaster(model, camera, -(-num_envs // num_workers), "cpu")
     _require_library(name)
     # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
     os.environ.setdefault("LP_NUM_THREADS", "0")

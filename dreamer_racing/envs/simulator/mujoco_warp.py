@@ -1,0 +1,149 @@
+"""N worlds on a CUDA device: `mujoco_warp` for the rigid bodies and for their cameras."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.scene import Camera, build_drone, build_scene
+from dreamer_racing.envs.simulator.base import Simulator, no_images
+from dreamer_racing.envs.simulator.ray_caster import RayCaster
+from dreamer_racing.envs.simulator.rendering import NoseMount
+from dreamer_racing.envs.simulator.warp_device import load_warp, scope
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.memory import GB, available_memory
+
+
+class WarpSimulator(Simulator):
+    """`mujoco_warp`'s physics, in float32, and its ray caster. It also runs on CPU, slowly: for tests.
+
+    Neither a step nor drawing all worlds waits for the device.
+
+    Args:
+        track: what stands in the hall.
+        parameters: the drone.
+        num_envs: N worlds.
+        camera: the nose camera.
+        images: whether there are any.
+        device: torch's name of the device.
+        generator: source of the physics randomisation, on the device.
+
+    Raises:
+        ValueError: the device has not the memory for so many worlds.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> simulator = WarpSimulator(load_track("kidney"), QuadrotorParameters(), 4, images=False, device="cpu")
+        >>> simulator.step(torch.zeros(4, 4)).shape
+        torch.Size([11, 4, 3])
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        parameters: QuadrotorParameters,
+        num_envs: int,
+        camera: Camera | None = None,
+        images: bool = True,
+        device: torch.device | str = "cuda",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        warp, device = load_warp(), torch.device(device)
+        _check_memory(memory_of_worlds(track, parameters, num_envs, camera, images), num_envs, device)
+        data, integrate = _make_bodies(parameters, num_envs, device)
+        qpos, qvel, force = (warp.to_torch(array) for array in (data.qpos, data.qvel, data.qfrc_applied))
+        super().__init__(parameters, qpos, qvel, force, integrate, generator)
+        self._camera = camera or Camera()
+        self._mount = NoseMount(self._camera, self.device, self.dtype)
+        self._ray_caster: RayCaster | None = None
+        if images:
+            scene = build_scene(track, parameters, self._camera).compile()
+            self._ray_caster = RayCaster(scene, self._camera, num_envs, device)
+
+    def render(self, mask: Tensor | None = None) -> Tensor:
+        """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+        if self._ray_caster is None:
+            raise no_images()
+        position, attitude = self.state.position, self.state.attitude
+        if mask is not None:
+            position, attitude = position[mask], attitude[mask]
+        eye, axes = self._mount(position, attitude)
+        shape = (len(position), self._camera.height, self._camera.width, 3)
+        images = torch.empty(shape, dtype=torch.uint8, device=self.device)
+        self._ray_caster.draw(eye, axes, images)
+        return images
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._ray_caster = None
+
+
+def _make_bodies(
+    parameters: QuadrotorParameters, num_envs: int, device: torch.device
+) -> tuple[Any, Callable[[], None]]:
+    """Make N drones in empty worlds; return their data and the function that moves them by one physics step."""
+    load_warp()
+    import mujoco_warp
+
+    drone = build_drone(parameters).compile()
+    with scope(device):
+        model, data = mujoco_warp.put_model(drone), _make_data(drone, num_envs)
+
+    def integrate() -> None:
+        with scope(device):
+            mujoco_warp.step(model, data)
+
+    return data, integrate
+
+
+def _check_memory(needed: int, num_envs: int, device: torch.device) -> None:
+    available = available_memory(device)
+    if needed > available:
+        raise ValueError(
+            f"num_envs={num_envs:,} needs about {needed / GB:.1f} GB, and {device} has {available / GB:.1f} GB left: "
+            f"at most about {int(num_envs * available / needed):,} worlds fit."
+        )
+
+
+def _make_data(model: mujoco.MjModel, num_worlds: int) -> Any:
+    """Make the data of worlds without contacts and constraints: with room for one, MuJoCo would run its solver."""
+    import mujoco_warp
+
+    return mujoco_warp.make_data(model, nworld=num_worlds, nconmax=0, njmax=0)
+
+
+def memory_of_worlds(
+    track: Track, parameters: QuadrotorParameters, num_envs: int, camera: Camera | None = None, images: bool = True
+) -> int:
+    """Estimate the device memory that a `WarpSimulator` and one observation of its N worlds take, in bytes.
+
+    Counts the arrays of one world; the nodes of the bounding volumes, which warp does not show, are taken for 64 bytes,
+    two a geom.
+    """
+    models = [build_drone(parameters).compile()]
+    per_world = 4 * 3 * (parameters.physics_steps + 1)  # the path
+    if images:
+        camera = camera or Camera()
+        hall = build_scene(track, parameters, camera).compile()
+        models.append(hall)
+        pixels = camera.width * camera.height
+        per_world += pixels * (4 + 2 * 3) + hall.ngeom * (28 + 2 * 64)  # packed; drawn and copied; bounding volumes
+    with scope(torch.device("cpu")):
+        per_world += sum(_array_bytes(_make_data(model, 2)) - _array_bytes(_make_data(model, 1)) for model in models)
+    return per_world * num_envs
+
+
+def _array_bytes(data: Any) -> int:
+    """Bytes of all warp arrays of a (nested) dataclass."""
+    total = 0
+    for field in dataclasses.fields(data):
+        value = getattr(data, field.name)
+        if dataclasses.is_dataclass(value):
+            total += _array_bytes(value)
+        else:
+            total += getattr(value, "capacity", 0)
+    return total

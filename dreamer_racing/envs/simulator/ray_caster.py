@@ -1,0 +1,74 @@
+"""`mujoco_warp`'s batch renderer: on a CUDA device thousands of cameras in one launch, on CPU without OpenGL."""
+
+import copy
+
+import mujoco
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.scene import HALL_GROUP, Camera
+from dreamer_racing.envs.simulator.warp_device import load_warp, scope
+
+
+class RayCaster:
+    """Draws a hall that stands still, so that its bounding volumes are built once, from many cameras at a time.
+
+    Args:
+        model: the compiled scene.
+        camera: the nose camera.
+        frames: the most frames drawn in one launch.
+        device: torch's name of the device.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int, device: torch.device | str) -> None:
+        warp = load_warp()
+        import mujoco_warp
+
+        self._render, self._device = mujoco_warp.render, torch.device(device)
+        with scope(self._device):
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            self._model = mujoco_warp.put_model(_blue_first(model))
+            self._data = mujoco_warp.put_data(model, data, nworld=frames)
+            self._context = mujoco_warp.create_render_context(
+                model,
+                nworld=frames,
+                cam_res=(camera.width, camera.height),
+                render_rgb=True,
+                enabled_geom_groups=[HALL_GROUP],
+                enable_specular=False,
+                enable_emission=False,
+                enable_per_light_ambient=False,
+            )
+            mujoco_warp.refit_bvh(self._model, self._data, self._context)
+            mujoco_warp.render(self._model, self._data, self._context)  # compile now, not in the first step
+        # views of warp's arrays
+        self._position = warp.to_torch(self._data.cam_xpos)[:, 0]  # (frames, 3)
+        self._axes = warp.to_torch(self._data.cam_xmat)[:, 0]  # (frames, 3, 3) columns: right, up, backwards
+        packed = warp.to_torch(self._context.rgb_data).view(torch.uint8)  # (frames, H * W * 4)
+        self._pixels = packed.unflatten(-1, (camera.height, camera.width, 4))[..., :3]
+
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
+        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        capacity = len(self._position)
+        for start in range(0, len(position), capacity):
+            part = slice(start, start + capacity)
+            frames = len(position[part])
+            self._position[:frames] = position[part]
+            self._axes[:frames] = axes[part].mT
+            self._data.nworld = frames  # the renderer launches over this many worlds
+            with scope(self._device):
+                self._render(self._model, self._data, self._context)
+            out[part] = self._pixels[:frames]
+
+    def close(self) -> None:
+        """Nothing to free: warp's arrays go with the object."""
+
+
+def _blue_first(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Swap red and blue of all colours: the renderer packs pixels as bytes B, G, R, A, and so red comes first."""
+    swapped = copy.copy(model)
+    surfaces, lights = (swapped.geom_rgba, swapped.mat_rgba), (swapped.light_ambient, swapped.light_diffuse)
+    for colors in (*surfaces, *lights, swapped.light_specular):
+        colors[:, :3] = colors[:, 2::-1].copy()
+    return swapped
