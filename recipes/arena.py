@@ -71,6 +71,8 @@ def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
             from_pixels=env.from_pixels,
             privileged=reads_privileged,
             start_beyond_gate=env.start_beyond_gate,
+            device=env.device,
+            looks=env.looks,
             seed=config.seed,
             **worlds_of(config),
         )

@@ -44,7 +44,7 @@ from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, Storage, register
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import Compose, InitTracker
 from tqdm import tqdm
 
 from dreamer_racing.checkpoint import (
@@ -58,6 +58,7 @@ from dreamer_racing.checkpoint import (
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
+from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 from dreamer_racing.finite_guard import NonFiniteLossError
 from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.memory import (
@@ -169,6 +170,9 @@ def resolve(config: DictConfig) -> DictConfig:
         size = "size12m" if device.type == "cuda" else "cpu_small"
         print(f"model: {size} (model=auto on {device.type})")
     config.device, config.model.size = str(device), size
+    if config.env.device == "auto":
+        config.env.device = worlds_device(config)
+        print(f"worlds: {config.env.device} (env.device=auto)")
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):
@@ -183,6 +187,12 @@ def resolve(config: DictConfig) -> DictConfig:
         print("held out: nothing, because there is a single world (replay.held_out=0)")
         config.replay.held_out = 0
     return config
+
+
+def worlds_device(config: DictConfig) -> str:
+    """The device for the worlds to train in: the learner's, where they have a simulator and the renderer asked for."""
+    fits = config.env.suite == "race" and config.env.renderer in ("auto", "warp")
+    return str(config.device) if fits else "cpu"
 
 
 def build(config: DreamerConfig, overrides: list[str]) -> Run:
@@ -248,15 +258,15 @@ def seed_generators(seed: int) -> None:
 
 
 def make_collector(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> Collector:
-    """Make the collector of rollouts [num_envs, rollout_steps], on the CPU."""
+    """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device."""
     return Collector(
-        TransformedEnv(env, Compose(InitTracker(), policy.make_primer())),
+        TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
         policy,
         frames_per_batch=config.env.num_envs * config.rollout_steps,
         total_frames=-1,
-        env_device="cpu",
+        env_device=env.device,
         policy_device=config.device,
-        storing_device="cpu",
+        storing_device=env.device,
         no_cuda_sync=False,
     )
 

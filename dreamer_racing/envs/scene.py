@@ -226,6 +226,12 @@ def _add_gate(spec: mujoco.MjSpec, name: str, gate: Gate, rgb: Sequence[float]) 
     )
 
 
+def gate_materials(model: mujoco.MjModel) -> list[int]:
+    """Return the materials of gates and decoys in a compiled scene."""
+    names = (model.geom(index).name for index in range(model.ngeom))
+    return sorted({int(model.geom(name).matid[0]) for name in names if name.startswith(("gate_", "decoy_"))})
+
+
 def _camera_attitude(tilt: float) -> np.ndarray:
     """Quaternion wxyz of a camera (right x, up y, backwards z) that looks along body x, tilted up by degrees."""
     cosine, sine = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from dreamer_racing.envs.partial_reset import MergesImagesByRow
 from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.race import RaceStep
@@ -19,7 +20,7 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 
 
-class DroneRacingEnv(EnvBase):
+class DroneRacingEnv(MergesImagesByRow, EnvBase):
     """N drones racing at once, in one process, without ParallelEnv.
 
     Args:
@@ -31,7 +32,7 @@ class DroneRacingEnv(EnvBase):
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and physics randomisation.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `num_threads`, `backend`.
+            `looks`, `num_threads`, `backend`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.privileged import RaceVector
 from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
@@ -35,6 +36,8 @@ class RaceWorlds:
         from_pixels: whether to have a renderer at all.
         renderer: `auto`, or on CPU `egl`, `osmesa` or `warp`.
         camera: the nose camera.
+        looks: `nominal`, or `randomised` for another light, colours, camera tilt, lens and noise in every episode, or
+            how far each varies.
         num_threads: of physics and rendering on CPU; all CPUs of the process if None.
         device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
@@ -64,6 +67,7 @@ class RaceWorlds:
         from_pixels: bool = True,
         renderer: str = "auto",
         camera: Camera | None = None,
+        looks: str | LooksRandomisation | None = None,
         num_threads: int | None = None,
         device: torch.device | str = "cpu",
         backend: str = "auto",
@@ -90,6 +94,7 @@ class RaceWorlds:
             self._generator,
             device,
             backend,
+            load_looks(looks),
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = Race(
@@ -167,9 +172,12 @@ class RaceWorlds:
 
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
-        if self._images is not None:
-            return self._images if mask is None else self._images[mask]
-        return self.simulator.render(mask)
+        if self._images is None:
+            images = self.simulator.render(mask)
+        else:
+            images = self._images if mask is None else self._images[mask]
+        looks = self.simulator.looks
+        return images if looks is None else looks.add_noise(images)
 
     def privileged(self) -> dict[str, Tensor]:
         """Copies of what the pixel agent must not see; see the key table in `docs/architecture.md`."""
@@ -205,7 +213,7 @@ class RaceWorlds:
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
         self._images = None
-        self._generator.set_state(state_dict["generator"])
+        self._generator.set_state(state_dict["generator"].cpu())
 
     def close(self) -> None:
         """Free rendering contexts and threads."""

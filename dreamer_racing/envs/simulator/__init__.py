@@ -5,6 +5,7 @@
 
 import torch
 
+from dreamer_racing.envs.looks import LooksRandomisation
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator.base import DroneState, Simulator
@@ -48,6 +49,7 @@ def make_simulator(
     generator: torch.Generator,
     device: torch.device | str,
     backend: str = "auto",
+    looks: LooksRandomisation | None = None,
 ) -> Simulator:
     """Make the simulator of a backend; `auto` chooses by the device. Arguments: `RaceWorlds`; renderer None: no images.
 
@@ -62,10 +64,10 @@ def make_simulator(
     if backend == "mujoco":
         if device.type != "cpu":
             raise ValueError(f"backend='mujoco' runs on cpu, not on {str(device)!r}: set one or the other.")
-        return MujocoSimulator(track, parameters, num_envs, camera, renderer, num_threads, generator)
+        return MujocoSimulator(track, parameters, num_envs, camera, renderer, num_threads, generator, looks)
     if renderer not in (None, "auto", "warp"):
         raise ValueError(
             f"renderer={renderer!r} is of backend 'mujoco'. The backend on {str(device)!r} is 'mujoco_warp', which "
             "draws with a renderer of its own: use renderer='auto' or 'warp'."
         )
-    return WarpSimulator(track, parameters, num_envs, camera, renderer is not None, device, generator)
+    return WarpSimulator(track, parameters, num_envs, camera, renderer is not None, device, generator, looks)

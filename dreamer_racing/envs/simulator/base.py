@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.flight import Flight
+from dreamer_racing.envs.looks import Looks, LooksSampler
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters
 
 
@@ -41,7 +42,10 @@ class Simulator(ABC):
 
     Attributes:
         state: the present state; views that the next step overwrites.
+        looks: what the hall looks like in each world; None where that does not vary.
     """
+
+    looks: LooksSampler | None = None
 
     def __init__(
         self,
@@ -68,6 +72,8 @@ class Simulator(ABC):
         self._qpos.copy_(torch.where(rows, pose, self._qpos))
         self._qvel.copy_(torch.where(rows, velocity, self._qvel))
         self.quadrotor.reset(mask)
+        if self.looks is not None:
+            self.looks.reset(mask)
 
     def step(self, action: Tensor) -> Tensor:
         """Fly one control step with finite actions (N, 4).
@@ -84,6 +90,14 @@ class Simulator(ABC):
             path[index + 1] = self.state.position
         return path
 
+    def _frames(self, mask: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
+        """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of the M masked ones in order."""
+        position, attitude = self.state.position, self.state.attitude
+        looks = None if self.looks is None else self.looks.looks
+        if mask is None:
+            return position, attitude, looks
+        return position[mask], attitude[mask], None if looks is None else looks[mask]
+
     @abstractmethod
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images of the nose cameras, uint8 (M, height, width, 3): of all worlds, or of the M masked ones in order.
@@ -94,13 +108,20 @@ class Simulator(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next step depends on, for `torch.save`."""
-        return {"qpos": self._qpos.clone(), "qvel": self._qvel.clone(), "quadrotor": self.quadrotor.state_dict()}
+        return {
+            "qpos": self._qpos.clone(),
+            "qvel": self._qvel.clone(),
+            "quadrotor": self.quadrotor.state_dict(),
+            "looks": None if self.looks is None else self.looks.state_dict(),
+        }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self._qpos.copy_(state_dict["qpos"])
         self._qvel.copy_(state_dict["qvel"])
         self.quadrotor.load_state_dict(state_dict["quadrotor"])
+        if self.looks is not None:
+            self.looks.load_state_dict(state_dict["looks"])
 
     @abstractmethod
     def close(self) -> None:

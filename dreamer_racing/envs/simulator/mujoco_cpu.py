@@ -7,6 +7,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
+from dreamer_racing.envs.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.simulator.base import Simulator, no_images
@@ -24,7 +25,8 @@ class MujocoSimulator(Simulator):
         camera: the nose camera.
         renderer: `auto`, `egl`, `osmesa`, `warp`, or None for no images.
         num_threads: physics and rendering threads; the CPUs of this process if None.
-        generator: source of the physics randomisation.
+        generator: source of the randomisation of physics and looks.
+        looks: how far looks vary; None for the same in every episode.
 
     Example:
         >>> from dreamer_racing.envs.tracks import load_track
@@ -42,6 +44,7 @@ class MujocoSimulator(Simulator):
         renderer: str | None = "auto",
         num_threads: int | None = None,
         generator: torch.Generator | None = None,
+        looks: LooksRandomisation | None = None,
     ) -> None:
         num_threads = min(num_threads or available_cpus(), num_envs)
         model = build_drone(parameters).compile()
@@ -54,17 +57,15 @@ class MujocoSimulator(Simulator):
         if renderer is not None:
             camera = camera or Camera()
             scene = build_scene(track, parameters, camera).compile()
-            self.renderer = make_renderer(renderer, scene, camera, num_envs, num_threads)
+            self.renderer = make_renderer(renderer, scene, camera, num_envs, num_threads, looks is not None)
+            if looks is not None:
+                self.looks = LooksSampler(looks, scene, camera, num_envs, self.device, self.dtype, generator)
 
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
         if self.renderer is None:
             raise no_images()
-        state = self.state
-        position, attitude = state.position, state.attitude
-        if mask is not None:
-            position, attitude = position[mask], attitude[mask]
-        return self.renderer.render(position, attitude)
+        return self.renderer.render(*self._frames(mask))
 
     def close(self) -> None:
         """Free the renderer's contexts and threads."""

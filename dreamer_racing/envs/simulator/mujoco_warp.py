@@ -8,6 +8,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.simulator.base import Simulator, no_images
@@ -30,7 +31,8 @@ class WarpSimulator(Simulator):
         camera: the nose camera.
         images: whether there are any.
         device: torch's name of the device.
-        generator: source of the physics randomisation, on the device.
+        generator: source of the randomisation of physics and looks, on the device.
+        looks: how far looks vary; None for the same in every episode.
 
     Raises:
         ValueError: the device has not the memory for so many worlds.
@@ -51,6 +53,7 @@ class WarpSimulator(Simulator):
         images: bool = True,
         device: torch.device | str = "cuda",
         generator: torch.Generator | None = None,
+        looks: LooksRandomisation | None = None,
     ) -> None:
         warp, device = load_warp(), torch.device(device)
         _check_memory(memory_of_worlds(track, parameters, num_envs, camera, images), num_envs, device)
@@ -62,19 +65,19 @@ class WarpSimulator(Simulator):
         self._ray_caster: RayCaster | None = None
         if images:
             scene = build_scene(track, parameters, self._camera).compile()
-            self._ray_caster = RayCaster(scene, self._camera, num_envs, device)
+            self._ray_caster = RayCaster(scene, self._camera, num_envs, device, looks is not None)
+            if looks is not None:
+                self.looks = LooksSampler(looks, scene, self._camera, num_envs, device, self.dtype, generator)
 
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
         if self._ray_caster is None:
             raise no_images()
-        position, attitude = self.state.position, self.state.attitude
-        if mask is not None:
-            position, attitude = position[mask], attitude[mask]
-        eye, axes = self._mount(position, attitude)
+        position, attitude, looks = self._frames(mask)
+        eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
         shape = (len(position), self._camera.height, self._camera.width, 3)
         images = torch.empty(shape, dtype=torch.uint8, device=self.device)
-        self._ray_caster.draw(eye, axes, images)
+        self._ray_caster.draw(eye, axes, images, looks)
         return images
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.looks import Looks
 from dreamer_racing.envs.scene import HALL_GROUP, Camera
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
@@ -18,9 +19,17 @@ class RayCaster:
         camera: the nose camera.
         frames: the most frames drawn in one launch.
         device: torch's name of the device.
+        varied_looks: whether frames may have looks of their own.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera, frames: int, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        camera: Camera,
+        frames: int,
+        device: torch.device | str,
+        varied_looks: bool = False,
+    ) -> None:
         warp = load_warp()
         import mujoco_warp
 
@@ -39,7 +48,10 @@ class RayCaster:
                 enable_specular=False,
                 enable_emission=False,
                 enable_per_light_ambient=False,
+                use_precomputed_rays=not varied_looks,
             )
+            if varied_looks:
+                self._colors, self._field_of_view = self._vary(frames)
             mujoco_warp.refit_bvh(self._model, self._data, self._context)
             mujoco_warp.render(self._model, self._data, self._context)  # compile now, not in the first step
         # views of warp's arrays
@@ -48,7 +60,14 @@ class RayCaster:
         packed = warp.to_torch(self._context.rgb_data).view(torch.uint8)  # (frames, H * W * 4)
         self._pixels = packed.unflatten(-1, (camera.height, camera.width, 4))[..., :3]
 
-    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
+    def _vary(self, frames: int) -> tuple[Tensor, Tensor]:
+        """Give every frame materials and a camera of its own; return views of colours and fields of view."""
+        warp, model = load_warp(), self._model
+        model.mat_rgba = warp.from_torch(warp.to_torch(model.mat_rgba)[:1].repeat(frames, 1, 1), dtype=warp.vec4)
+        model.cam_fovy = warp.from_torch(warp.to_torch(model.cam_fovy)[:1].repeat(frames, 1))
+        return warp.to_torch(model.mat_rgba)[..., :3], warp.to_torch(model.cam_fovy)[:, 0]
+
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         capacity = len(self._position)
         for start in range(0, len(position), capacity):
@@ -56,6 +75,9 @@ class RayCaster:
             frames = len(position[part])
             self._position[:frames] = position[part]
             self._axes[:frames] = axes[part].mT
+            if looks is not None:
+                self._colors[:frames] = looks.colors[part].flip(-1)  # blue first
+                self._field_of_view[:frames] = looks.field_of_view[part]
             self._data.nworld = frames  # the renderer launches over this many worlds
             with scope(self._device):
                 self._render(self._model, self._data, self._context)

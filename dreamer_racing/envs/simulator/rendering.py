@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.looks import Looks
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
@@ -54,23 +55,33 @@ class NoseMount:
     """
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
-        tilt = math.radians(camera.tilt)
-        cosine, sine = math.cos(tilt), math.sin(tilt)
         self._mount = torch.tensor(camera.position, device=device, dtype=dtype)
-        self._axes = torch.tensor(  # (3, 3) rows: right, up, backwards in the body frame
-            ((0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)), device=device, dtype=dtype
-        )
+        self._tilt = torch.tensor([camera.tilt], device=device, dtype=dtype)
 
-    def __call__(self, position: Tensor, attitude: Tensor) -> tuple[Tensor, Tensor]:
-        """Return eyes (M, 3) and axes (M, 3, 3; rows right, up, backwards) of drones at (M, 3) and (M, 4), wxyz."""
+    def __call__(self, position: Tensor, attitude: Tensor, tilt: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Place the cameras.
+
+        Args:
+            position: of the drones, (M, 3), m.
+            attitude: of the drones, (M, 4) wxyz.
+            tilt: of the cameras, (M,), degrees upwards; the camera's own if None.
+
+        Returns:
+            Eyes (M, 3), and axes (M, 3, 3) with rows right, up, backwards, in the world.
+        """
+        angle = torch.deg2rad(self._tilt if tilt is None else tilt)
+        cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        right = torch.stack((zero, zero - 1.0, zero), -1)
+        up, backwards = torch.stack((-sine, zero, cosine), -1), torch.stack((-cosine, zero, -sine), -1)
+        axes = torch.stack((right, up, backwards), 1).expand(len(position), -1, -1)  # (M, 3, 3) in the body frame
         eye = position + rotate(attitude, self._mount.expand_as(position))
-        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), self._axes.expand(len(position), -1, -1))
+        return eye, rotate(attitude.unsqueeze(1).expand(-1, 3, -1), axes)
 
 
 class Worker(Protocol):
     """Draws frames in one thread."""
 
-    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         ...
 
@@ -101,16 +112,16 @@ class Renderer:
             raise
         self._mount = NoseMount(camera)
 
-    def render(self, position: Tensor, attitude: Tensor) -> Tensor:
+    def render(self, position: Tensor, attitude: Tensor, looks: Looks | None = None) -> Tensor:
         """Images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
         camera = self.camera
         frames = len(position)
-        eye, axes = self._mount(position, attitude)
+        eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
         images = torch.empty((frames, camera.height, camera.width, 3), dtype=torch.uint8)
         size = max(1, -(-frames // len(self._executors)))
         slices = [slice(start, start + size) for start in range(0, frames, size)]
         jobs = [
-            executor.submit(worker.draw, eye[part], axes[part], images[part])
+            executor.submit(worker.draw, eye[part], axes[part], images[part], None if looks is None else looks[part])
             for executor, worker, part in zip(self._executors, self._workers, slices, strict=False)
         ]
         for job in jobs:
@@ -164,12 +175,14 @@ class OpenGLWorker:
         self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
         self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
 
-    def draw(self, position: Tensor, axes: Tensor, out: Tensor) -> None:
+    def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
         buffer, upright = self._buffer, self._buffer[::-1]  # OpenGL's first row is the lowest
         positions, ups, forwards = position.numpy(), axes[:, 1].numpy(), (-axes[:, 2]).numpy()
         images = out.numpy()
         for index in range(len(images)):
+            if looks is not None:
+                self._dress(looks.colors[index].numpy(), looks.field_of_view[index].item())
             for eye in self._eyes:
                 eye.pos = positions[index]
                 eye.up = ups[index]
@@ -178,6 +191,14 @@ class OpenGLWorker:
             mujoco.mjr_readPixels(buffer, None, self._viewport, self._context)
             images[index] = upright
 
+    def _dress(self, colors: np.ndarray, field_of_view: float) -> None:
+        """Give the scene's materials their colours (K, 3), and the camera its vertical field of view, degrees."""
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            geom.rgba[:3] = colors[geom.matid]
+        for eye in self._eyes:
+            eye.frustum_top = eye.frustum_near * math.tan(math.radians(field_of_view) / 2)
+            eye.frustum_bottom = -eye.frustum_top
+
     def close(self) -> None:
         """Free the OpenGL context."""
         self._context.free()
@@ -185,8 +206,18 @@ class OpenGLWorker:
         atexit.unregister(self._gl.free)
 
 
-def make_renderer(name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int) -> Renderer:
+def make_renderer(
+    name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int, varied_looks: bool = False
+) -> Renderer:
     """Make the renderer of that name, or the first that works for `auto`; log which and why.
+
+    Args:
+        name: `auto`, `egl`, `osmesa` or `warp`.
+        model: the compiled scene.
+        camera: the nose camera.
+        num_envs: the most frames drawn at once.
+        num_workers: threads.
+        varied_looks: whether frames may have looks of their own.
 
     Raises:
         ValueError: unknown name.
@@ -197,8 +228,8 @@ def make_renderer(name: str, model: mujoco.MjModel, camera: Camera, num_envs: in
     reasons = []
     for candidate in RENDERERS if name == "auto" else (name,):
         try:
-            renderer = Renderer(candidate, _worker_factory(candidate, model, camera, num_envs, num_workers), camera,
-                                num_workers)  # fmt: skip
+            make_worker = _worker_factory(candidate, model, camera, -(-num_envs // num_workers), varied_looks)
+            renderer = Renderer(candidate, make_worker, camera, num_workers)
         except RendererUnavailableError as error:
             reasons.append(str(error))
             continue
@@ -209,10 +240,10 @@ def make_renderer(name: str, model: mujoco.MjModel, camera: Camera, num_envs: in
 
 
 def _worker_factory(
-    name: str, model: mujoco.MjModel, camera: Camera, num_envs: int, num_workers: int
+    name: str, model: mujoco.MjModel, camera: Camera, frames: int, varied_looks: bool
 ) -> Callable[[], Worker]:
     if name == "warp":
-        return lambda: RayCaster(model, camera, -(-num_envs // num_workers), "cpu")
+        return lambda: RayCaster(model, camera, frames, "cpu", varied_looks)
     _require_library(name)
     # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
     os.environ.setdefault("LP_NUM_THREADS", "0")
