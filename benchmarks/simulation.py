@@ -1,85 +1,190 @@
-"""Environment steps per second through a TorchRL Collector with a random policy, and where the time goes.
+"""Environment steps per second: the worlds alone, through TorchRL, and what others reach in the same run.
 
-    python benchmarks/simulation.py --json results/simulation.json
-    python benchmarks/simulation.py --renderers warp --num-envs 32 64      # what a machine without OpenGL gets
+    python benchmarks/simulation.py --json results/simulation.json         # this machine's CPU
+    python benchmarks/simulation.py --device cuda --json results/simulation_cuda.json
+    python benchmarks/simulation.py --peers --json results/simulation_peers.json
+    python benchmarks/simulation.py --readme results/simulation*.json       # no measuring: README's table
 
-Columns: `steps/s` are control steps summed over the N environments. The others split the time of one batched step:
-`physics_ms` (controller, motors, MuJoCo), `race_ms` (gates, rewards, start poses), `render_ms`, and `torchrl_ms`, all
-the rest (specs, TensorDicts, resets, the collector).
+Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
+(physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
+
+* `worlds`: `RaceWorlds` stepped, drawn and reset where an episode ended: the environment without TorchRL;
+* `rollout`: `DroneRacingEnv.rollout`;
+* `collector`: a TorchRL `Collector` with a random policy;
+* `actor`: the same with a DreamerV3 policy of `--actor` size and its recurrent state.
+
+The first three are measured in turns, three times, and the medians reported; `lost` is the share of the worlds' speed
+that the collector loses. On CPU the milliseconds of a collected step are split into physics, race rules, rendering and
+TorchRL (specs, TensorDicts, resets, storing). `memory` is the process's peak resident memory, or the device's, GiB.
 """
 
 import argparse
+import json
+import resource
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
 from measuring import print_table, write_json
 from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
+from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
-PARTS = ("physics", "race", "render", "torchrl")
+PARTS = ("physics", "race", "render")
+MODES = ("worlds", "rollout", "collector", "actor")
+COLUMNS = ("images", "num_envs", *MODES, "lost", *(f"{part}_ms" for part in PARTS), "torchrl_ms", "memory_gib")
+ROLLOUT = 16  # control steps in a batch
+README = Path(__file__).parent.parent / "README.md"
+BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
+NAMES = {
+    "none": "none", "egl": "EGL (Mesa, in software)", "osmesa": "OSMesa", "warp": "ray caster, no OpenGL library",
+    "warp_cuda": "physics on CPU, ray caster on CUDA", "cuda": "all on CUDA",
+}  # fmt: skip
 
 
 def main() -> None:
-    """Measure every combination asked for."""
+    """Measure every combination asked for, or write README's table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
-    parser.add_argument("--renderers", nargs="*", default=["none", "egl", "osmesa", "warp"])
-    parser.add_argument(
-        "--num-envs", nargs="*", type=int, help="N to try; default: 64 128 256, without pixels 512 1024"
-    )
-    parser.add_argument("--seconds", type=float, default=5.0, help="least time of a measurement")
+    parser.add_argument("--images", nargs="*", help="of none egl osmesa warp warp_cuda cuda; default: the device's")
+    parser.add_argument("--looks", default="nominal", help="nominal | randomised")
+    parser.add_argument("--num-envs", nargs="*", type=int, help="N to try")
+    parser.add_argument("--actor", help="size of the DreamerV3 policy; default: cpu_small, on cuda size12m")
+    parser.add_argument("--seconds", type=float, default=3.0, help="least time of a measurement")
+    parser.add_argument("--peers", action="store_true", help="measure the peers that are installed instead")
+    parser.add_argument("--readme", nargs="*", metavar="JSON", help="write README's table from these results")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    records: list[dict[str, Any]] = []
-    for renderer in arguments.renderers:
-        for num_envs in arguments.num_envs or ([512, 1024, 2048] if renderer == "none" else [64, 128, 256]):
-            # a process of its own: PyOpenGL is bound to one platform for the life of a process
-            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-                job = process.submit(measure, arguments.track, arguments.preset, renderer, num_envs, arguments.seconds)
-                try:
-                    records.append(job.result())
-                except RendererUnavailableError as error:
-                    print(f"{renderer}: not here ({error})")
-                    break
-    print_table(records, ("renderer", "num_envs", "steps/s", *(f"{part}_ms" for part in PARTS)))
+    if arguments.readme is not None:
+        write_readme(arguments.readme)
+        return
+    records = []
+    for job, *details in peer_jobs(arguments) if arguments.peers else jobs(arguments):
+        # a process of its own: PyOpenGL is bound to one platform for the life of a process
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+            try:
+                records.append(process.submit(job, *details).result())
+            except (RendererUnavailableError, ImportError) as error:
+                print(f"{details[0]}: not here ({error})")
+    print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
 
-def measure(track: str, preset: str, renderer: str, num_envs: int, seconds: float) -> dict[str, Any]:
-    """Collect for some seconds; return one record."""
+def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
+    """The measurements asked for: a function and its arguments."""
+    on_cuda = arguments.device == "cuda"
+    actor = arguments.actor or ("size12m" if on_cuda else "cpu_small")
+    for images in arguments.images or (("none", "cuda", "warp_cuda") if on_cuda else ("none", "egl", "osmesa", "warp")):
+        state, pixels = ((1024, 16384), (64, 512, 4096)) if on_cuda else ((32, 512, 2048), (32, 64, 256))
+        for num_envs in arguments.num_envs or (state if images == "none" else pixels):
+            device = "cpu" if images == "warp_cuda" else arguments.device
+            settings = {"preset": arguments.preset, "device": device, "looks": arguments.looks}
+            yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds
+
+
+def measure(
+    images: str, num_envs: int, track: str, settings: dict[str, Any], actor: str, seconds: float
+) -> dict[str, Any]:
+    """Return one record."""
     torch.set_num_threads(1)
+    renderer = "auto" if images in ("none", "cuda") else images
     env = DroneRacingEnv(
-        track, num_envs, preset=preset, from_pixels=renderer != "none", renderer=renderer, privileged=False, seed=0
+        track, num_envs, from_pixels=images != "none", renderer=renderer, privileged=False, seed=0, **settings
     )
-    spent: defaultdict[str, float] = defaultdict(float)
-    watch(env, spent)
-    collector = Collector(env, RandomPolicy(env.action_spec), frames_per_batch=16 * num_envs, total_frames=-1)
+    batch = ROLLOUT * num_envs
+    collector = Collector(
+        env, RandomPolicy(env.action_spec), frames_per_batch=batch, total_frames=-1, no_cuda_sync=True
+    )
     rollouts = iter(collector)
-    next(rollouts)
-    spent.clear()
-    steps, start = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - start) < seconds:
-        next(rollouts)
-        steps += 16
-    collector.shutdown()
-    spent["torchrl"] = elapsed - sum(spent.values())
-    per_step = {f"{part}_ms": 1e3 * spent[part] / steps for part in PARTS}
+    modes: dict[str, Callable[[], Any]] = {
+        "worlds": lambda: fly_worlds(env, ROLLOUT),
+        "rollout": lambda: env.rollout(ROLLOUT, break_when_any_done=False),
+        "collector": lambda: next(rollouts),
+    }
+    speeds: defaultdict[str, list[float]] = defaultdict(list)
+    for _ in range(3):
+        for mode, job in modes.items():
+            speeds[mode].append(speed(job, batch, seconds, env.device))
+    split = parts_of(env, lambda: next(rollouts), seconds) if env.device.type == "cpu" else {}
+    rates = {mode: median(values) for mode, values in speeds.items()}
+    collector.shutdown(close_env=False)
+    rates["actor"] = speed(acting(env, actor, batch), batch, seconds, env.device)
     return {
-        "benchmark": "simulation", "track": track, "preset": preset, "renderer": renderer, "num_envs": num_envs,
-        "steps/s": num_envs * steps / elapsed, **per_step,
+        "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
+        "actor_size": actor, **rates, "lost": 1 - rates["collector"] / rates["worlds"], **split, "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
 
-def watch(env: DroneRacingEnv, spent: dict[str, float]) -> None:
+def fly_worlds(env: DroneRacingEnv, steps: int) -> None:
+    """Step the worlds with random actions, observe, and reset where an episode ended."""
+    worlds = env.worlds
+    observe = worlds.render if env.from_pixels else worlds.vector
+    for _ in range(steps):
+        outcome = worlds.step(env.action_spec.rand())
+        observe()
+        ended = outcome.terminated | outcome.truncated
+        if ended.any():
+            worlds.reset(ended)
+            if env.from_pixels:
+                worlds.render(ended)
+
+
+def acting(env: DroneRacingEnv, size: str, batch: int) -> Callable[[], Any]:
+    """Collect with a DreamerV3 policy that carries its recurrent state, as the recipe does."""
+    from dreamer_racing.learner import DreamerLearner, LearnerConfig
+    from dreamer_racing.modules import Interface
+
+    learner = DreamerLearner(size, Interface.of(env), LearnerConfig(), str(env.device))
+    policy = learner.policy()
+    flying = TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer()))
+    rollouts = iter(Collector(flying, policy, frames_per_batch=batch, total_frames=-1, no_cuda_sync=True))
+    return lambda: next(rollouts)
+
+
+def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.device | None = None) -> float:
+    """Steps per second of a job of so many, run for some seconds after once."""
+    job()
+    done, start = 0, now(device)
+    while (elapsed := now(device) - start) < seconds:
+        job()
+        done += steps
+    return done / elapsed
+
+
+def now(device: torch.device | None) -> float:
+    """The time, s, when the device has done all it was given."""
+    if device is not None and device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def parts_of(env: DroneRacingEnv, job: Callable[[], Any], seconds: float) -> dict[str, float]:
+    """Split a collected step of an environment on CPU, ms."""
+    spent: defaultdict[str, float] = defaultdict(float)
+    with watched(env, spent):
+        steps, start = 0, time.perf_counter()
+        while (elapsed := time.perf_counter() - start) < seconds:
+            job()
+            steps += ROLLOUT
+    spent["torchrl"] = elapsed - sum(spent.values())
+    return {f"{part}_ms": 1e3 * spent[part] / steps for part in (*PARTS, "torchrl")}
+
+
+@contextmanager
+def watched(env: DroneRacingEnv, spent: dict[str, float]) -> Iterator[None]:
     """Count the time spent in the parts of an environment."""
     simulator, race = env.worlds.simulator, env.worlds.race
 
@@ -93,15 +198,130 @@ def watch(env: DroneRacingEnv, spent: dict[str, float]) -> None:
 
         return call
 
-    for owner, name, part in (
+    methods = (
         (simulator, "step", "physics"),
         (simulator, "reset", "physics"),
         (simulator, "render", "render"),
         (race, "step", "race"),
         (race, "begin", "race"),
         (env.worlds._starts, "sample", "race"),
-    ):
+    )
+    for owner, name, part in methods:
         setattr(owner, name, timed(part, getattr(owner, name)))
+    try:
+        yield
+    finally:
+        for owner, name, _ in methods:
+            delattr(owner, name)
+
+
+def peak_gib(device: torch.device | None) -> float:
+    """Peak memory of this process, resident or on a CUDA device (warp's too, which torch does not count), GiB."""
+    if device is not None and device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        return (total - free) / 2**30
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+# --- peers ---
+
+
+def peer_jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
+    """The peers, and ours in the same run."""
+    yield measure, "none", 512, arguments.track, {"preset": arguments.preset}, "cpu_small", arguments.seconds
+    yield measure, "egl", 256, arguments.track, {"preset": arguments.preset}, "cpu_small", arguments.seconds
+    for name, peer in (
+        ("dm_control, state", dm_control),
+        ("dm_control, EGL", dm_control),
+        ("Gymnasium SyncVectorEnv, state", sync_vector),
+        ("Gymnasium SyncVectorEnv, pixels", sync_vector),
+        ("Crazyflow, state", crazyflow),
+    ):
+        yield peer, name, arguments.track, arguments.preset, arguments.seconds
+
+
+def peer_record(name: str, num_envs: int, steps_per_s: float) -> dict[str, Any]:
+    """A record of a peer that steps its worlds in its own loop."""
+    record = {"benchmark": "simulation", "images": name, "num_envs": num_envs, "worlds": steps_per_s}
+    return {**record, "memory_gib": peak_gib(None)}
+
+
+def dm_control(name: str, track: str, preset: str, seconds: float) -> dict[str, Any]:
+    """The same race as one dm_control task, stepped in Python."""
+    from dreamer_racing.envs.task import load
+
+    env = load(track, preset, random=0, from_pixels=name.endswith("EGL"))
+    action = env.action_spec().generate_value() * 0.0
+
+    def steps() -> None:
+        for _ in range(ROLLOUT):
+            if env.step(action).last():
+                env.reset()
+
+    env.reset()
+    return peer_record(name, 1, speed(steps, ROLLOUT, seconds))
+
+
+def sync_vector(name: str, track: str, preset: str, seconds: float, num_envs: int = 8) -> dict[str, Any]:
+    """Eight of our single Gymnasium environments in Gymnasium's own vector environment."""
+    import gymnasium
+
+    from dreamer_racing.envs.gym_env import DroneRaceGymEnv
+
+    torch.set_num_threads(1)
+    observation = "pixels" if name.endswith("pixels") else "state"
+    make = [lambda: DroneRaceGymEnv(track, preset=preset, observation=observation) for _ in range(num_envs)]
+    env = gymnasium.vector.SyncVectorEnv(make)
+    env.reset(seed=0)
+
+    def steps() -> None:
+        for _ in range(ROLLOUT):
+            env.step(env.action_space.sample())
+
+    return peer_record(name, num_envs, speed(steps, ROLLOUT * num_envs, seconds))
+
+
+def crazyflow(name: str, track: str, preset: str, seconds: float, num_envs: int = 512) -> dict[str, Any]:
+    """Crazyflow's vectorised simulation at 500 Hz and 50 Hz control: no race, no images."""
+    import numpy as np
+    from crazyflow.sim import Sim  # type: ignore[import-not-found]  # an optional peer
+
+    sim = Sim(n_worlds=num_envs, n_drones=1, control="attitude", freq=500, attitude_freq=50)
+    sim.reset()
+    command = np.zeros((num_envs, 1, 4), np.float32)
+
+    def steps() -> None:
+        for _ in range(ROLLOUT):
+            sim.attitude_control(command)
+            sim.step(sim.freq // sim.control_freq)
+        np.asarray(sim.data.states.pos)  # wait for it
+
+    return peer_record(name, num_envs, speed(steps, ROLLOUT * num_envs, seconds))
+
+
+# --- README ---
+
+
+def write_readme(paths: list[str]) -> None:
+    """Replace README's table by the best N of each kind of images, from stored results."""
+    records = [record for path in paths for record in json.loads(Path(path).read_text())]
+    best: dict[str, dict[str, Any]] = {}
+    for record in records:
+        if "collector" in record and record["collector"] > best.get(record["images"], {}).get("collector", 0.0):
+            best[record["images"]] = record
+    lines = [
+        "| images | drones | steps/s | worlds alone | with actor | physics | race rules | render | TorchRL |",
+        "|" + "---|" * 9,
+    ]
+    for images, record in best.items():
+        parts = " | ".join(
+            f"{record[f'{part}_ms']:.1f}" if f"{part}_ms" in record else "" for part in (*PARTS, "torchrl")
+        )
+        speeds = f"**{record['collector']:,.0f}** | {record['worlds']:,.0f} | {record['actor']:,.0f}"
+        lines.append(f"| {NAMES.get(images, images)} | {record['num_envs']} | {speeds} | {parts} |")
+    before, _, rest = README.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    README.write_text("\n".join((before + BEGIN, *lines, END + after)))
 
 
 if __name__ == "__main__":

@@ -74,6 +74,10 @@ class GymWorlds:
             raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
+        if torch.device(worlds.get("device", "cpu")).type != "cpu":
+            raise ValueError(
+                f"device={worlds['device']!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
+            )
         self.observation = observation
         self.privileged = privileged
         self.renderer_name = worlds.get("renderer", "auto")

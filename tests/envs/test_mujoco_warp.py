@@ -13,6 +13,7 @@ from dreamer_racing.envs.race import StartSampler
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator import MujocoSimulator, WarpSimulator, mujoco_warp
 from dreamer_racing.envs.simulator.mujoco_warp import memory_of_worlds
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
@@ -223,3 +224,19 @@ def test_memory_grows_with_worlds_and_images() -> None:
     assert one > 64 * 64 * (4 + 3)  # the frame as it is drawn, and as it is given
     assert memory_of_worlds(KIDNEY, easy, 1, images=False) < one / 10
     assert memory_of_worlds(KIDNEY, easy, 1, Camera(width=128, height=128)) > 3 * one
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_the_hybrid_renderer_needs_cuda() -> None:
+    with pytest.raises(RendererUnavailableError, match="warp_cuda needs a CUDA device"):
+        RaceWorlds("circle", renderer="warp_cuda")
+
+
+@pytest.mark.gpu
+def test_the_hybrid_renderer_draws_the_same() -> None:
+    drawn = {}
+    for renderer in ("warp", "warp_cuda"):
+        simulator = on_mujoco(renderer=renderer)
+        drawn[renderer] = simulator.render().float()
+        simulator.close()
+    assert (drawn["warp"] - drawn["warp_cuda"]).abs().mean() < 0.5

@@ -341,7 +341,7 @@ def test_opengl_that_does_not_start_is_a_reason_too(monkeypatch: pytest.MonkeyPa
 
 
 def test_unknown_renderer_is_refused() -> None:
-    with pytest.raises(ValueError, match="Unknown renderer 'vulkan': use auto, egl, osmesa, warp, or None"):
+    with pytest.raises(ValueError, match="Unknown renderer 'vulkan': use auto, egl, osmesa, warp, warp_cuda, or None"):
         simulator(1, "vulkan")
 
 

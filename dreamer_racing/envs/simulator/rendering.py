@@ -11,6 +11,8 @@ Workers, in the order in which `renderer="auto"` tries them:
 | `osmesa` | OSMesa | the same, slower |
 | `warp` | nothing | `mujoco_warp`'s ray caster, compiled for the CPU |
 
+`warp_cuda`, which `auto` does not try, casts the rays on a CUDA device in one launch: poses go there, images come back.
+
 Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
 
@@ -39,6 +41,7 @@ logger = logging.getLogger(__name__)
 MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
 GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
 RENDERERS = ("egl", "osmesa", "warp")
+HYBRID = "warp_cuda"
 
 
 class RendererUnavailableError(RuntimeError):
@@ -212,7 +215,7 @@ def make_renderer(
     """Make the renderer of that name, or the first that works for `auto`; log which and why.
 
     Args:
-        name: `auto`, `egl`, `osmesa` or `warp`.
+        name: `auto`, `egl`, `osmesa`, `warp` or `warp_cuda`.
         model: the compiled scene.
         camera: the nose camera.
         num_envs: the most frames drawn at once.
@@ -223,8 +226,11 @@ def make_renderer(
         ValueError: unknown name.
         RendererUnavailableError: the renderer asked for does not work here.
     """
-    if name not in ("auto", *RENDERERS):
-        raise ValueError(f"Unknown renderer {name!r}: use auto, {', '.join(RENDERERS)}, or None for no images.")
+    if name not in ("auto", *RENDERERS, HYBRID):
+        known = ", ".join(("auto", *RENDERERS, HYBRID))
+        raise ValueError(f"Unknown renderer {name!r}: use {known}, or None for no images.")
+    if name == HYBRID:
+        num_workers = 1
     reasons = []
     for candidate in RENDERERS if name == "auto" else (name,):
         try:
@@ -242,8 +248,11 @@ def make_renderer(
 def _worker_factory(
     name: str, model: mujoco.MjModel, camera: Camera, frames: int, varied_looks: bool
 ) -> Callable[[], Worker]:
-    if name == "warp":
-        return lambda: RayCaster(model, camera, frames, "cpu", varied_looks)
+    if name in ("warp", HYBRID):
+        device = "cpu" if name == "warp" else "cuda"
+        if device == "cuda" and not torch.cuda.is_available():
+            raise RendererUnavailableError(f"{name} needs a CUDA device, and torch {torch.__version__} finds none.")
+        return lambda: RayCaster(model, camera, frames, device, varied_looks)
     _require_library(name)
     # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
     os.environ.setdefault("LP_NUM_THREADS", "0")
