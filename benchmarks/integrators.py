@@ -131,7 +131,7 @@ def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -
     """Replay the actions; return positions (T·10, N, 3) every `HOLD`, and the wrenches (T·10, N, 6) applied then."""
     drones = Drones(variant, integrator, step, len(TRACKS))
     drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
-    drones.quadrotor.rotor_speed = recording.rotor_speed
+    drones.quadrotor.rotor_speed.copy_(recording.rotor_speed)
     every = round(HOLD / step)
     positions, wrenches = [], []
     for action in recording.actions:

@@ -124,7 +124,8 @@ def measure(
     rates["actor"] = speed(acting(env, actor, batch), batch, seconds, env.device)
     return {
         "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
-        "actor_size": actor, **rates, "lost": 1 - rates["collector"] / rates["worlds"], **split, "memory_gib": peak_gib(env.device),
+        "actor_size": actor, **rates, "lost": 1 - rates["collector"] / rates["worlds"], **split,
+        "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
 
