@@ -48,7 +48,7 @@ class PlainQuadrotor(Quadrotor):
         gyroscopic = self.gyroscopic_torque(body_rates)
         torque = torch.addcmul(gyroscopic, self._rate_gain, setpoint[:, 1:] - body_rates)
         target = self.mix(setpoint[:, :1], torque).sqrt()
-        self.rotor_speed = torch.lerp(target, self.rotor_speed, self._motor_decay)
+        self.rotor_speed = torch.lerp(target, self.rotor_speed, self.motor_decay)
         return self.rotor_speed.square() @ self._effectiveness
 
 

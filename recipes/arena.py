@@ -130,6 +130,7 @@ def restore_learner(
     config: DreamerConfig, checkpoint: Path, device: torch.device
 ) -> tuple[DreamerLearner, dict[str, int]]:
     """Bring back the learner of a checkpoint of a run, and the run's counters."""
+    config.env.device = "cpu"  # wherever it was trained
     env = make_env(config, num_envs=1)
     interface = Interface.of(env)
     env.close()

@@ -1,5 +1,8 @@
 """One physics step of N drones: controller and motors give a wrench, MuJoCo moves the rigid bodies.
 
+This is the statement of the physics in torch, an operation at a time: what `simulator.fused_flight` is tested against,
+and what `benchmarks/integrators.py` varies. The simulators fly the fused kernels.
+
 Shapes: N drones. SI units, attitude wxyz, `qpos` (N, 7) is position and attitude, `qvel` (N, 6) is the velocity in the
 world and the body rates in the body frame, as MuJoCo has them for a free joint.
 """
@@ -17,7 +20,7 @@ class Flight:
     """Quadrotors on MuJoCo's rigid bodies.
 
     The force is held in the direction it has in the step's middle. Beyond that, MuJoCo's Euler step is of first order:
-    v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that strays by 8 cm. Two corrections make it
+    v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that strays by 7 cm. Two corrections make it
     second order (`benchmarks/integrators.py` has the figures): the torque is turned into the one that does with the
     rates of the step's beginning what the given one does with those of its middle, and half of the overshoot
     h·(v' − v) is taken back from the pose. RK4 needs neither.

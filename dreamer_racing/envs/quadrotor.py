@@ -177,11 +177,12 @@ class Quadrotor:
         # rotor thrusts (N, 4) @ effectiveness (4, 6) = wrench (fx fy fz tx ty tz)
         rows = zip(p.rotor_positions, ROTOR_SPINS, strict=True)
         self._effectiveness = tensor([[0, 0, 1, y, -x, s * p.torque_constant] for (x, y), s in rows])  # (4, 6)
-        allocation = torch.linalg.inv(self._effectiveness[:, 2:])  # (thrust tx ty tz) (N, 4) @ (4, 4) = rotor thrusts
-        self._roll_pitch_to_rotors, self._yaw_to_rotors = allocation[1:3].contiguous(), allocation[3:].contiguous()
+        # (thrust tx ty tz) (N, 4) @ (4, 4) = rotor thrusts; the first row is a quarter each
+        self.allocation = torch.linalg.inv(self._effectiveness[:, 2:])[1:]  # (3, 4): rotor thrusts of torque x, y, z
+        self._roll_pitch_to_rotors, self._yaw_to_rotors = self.allocation[:2], self.allocation[2:]
         self._torque_effectiveness = self._effectiveness[:, 3:].contiguous()  # (4, 3)
-        self._motor_decay = math.exp(-p.physics_dt / p.motor_time_constant)
-        self._motor_decay_half = math.sqrt(self._motor_decay)
+        self.motor_decay = math.exp(-p.physics_dt / p.motor_time_constant)
+        self._motor_decay_half = math.sqrt(self.motor_decay)
         self._half_step_per_inertia = 0.5 * p.physics_dt / self._inertia  # (3,)
 
         hover_speed = math.sqrt(p.mass * GRAVITY / 4.0)
@@ -191,7 +192,7 @@ class Quadrotor:
         self._nominal_delay_steps = round(p.command_delay / p.physics_dt)
         history = math.ceil(round(delay_max / p.physics_dt) / p.physics_steps)
         self._hover_setpoint = tensor((p.mass * GRAVITY, 0.0, 0.0, 0.0))
-        self._setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
+        self.setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
         self._drones = self._nominal_drones() if p.randomisation or history else None
         self._everyone = torch.arange(num_drones, device=device)
 
@@ -200,11 +201,21 @@ class Quadrotor:
         delay = torch.full((self.num_drones,), self._nominal_delay_steps, device=self._device)
         return _Drones(one, one.repeat(1, 3), one.clone(), one.clone(), one.clone(), delay)
 
+    def own_parameters(self) -> tuple[Tensor, ...]:
+        """Each drone's own parameters, in tensors that stay in place.
+
+        Returns:
+            Mass (N, 1), inertia (N, 3), drag, thrust and torque (N, 1) relative to nominal, and the command's delay
+            (N,), int64 physics steps.
+        """
+        drones = self._drones or self._nominal_drones()
+        return tuple(getattr(drones, field.name) for field in fields(_Drones))
+
     def reset(self, mask: Tensor) -> None:
         """Spin the rotors of the masked drones (N,) bool at hover, forget their commands, draw their parameters."""
         rows = mask.unsqueeze(-1)  # (N, 1)
         self.rotor_speed.masked_fill_(rows, self._hover_speed)
-        self._setpoints.copy_(torch.where(rows, self._hover_setpoint, self._setpoints))
+        self.setpoints.copy_(torch.where(rows, self._hover_setpoint, self.setpoints))
         if self.parameters.randomisation is not None:
             self._randomise(rows, self.parameters.randomisation)
 
@@ -228,12 +239,12 @@ class Quadrotor:
             if self._drones is None
             else {field.name: getattr(self._drones, field.name).clone() for field in fields(_Drones)}
         )
-        return {"rotor_speed": self.rotor_speed.clone(), "setpoints": self._setpoints.clone(), "drones": drones}
+        return {"rotor_speed": self.rotor_speed.clone(), "setpoints": self.setpoints.clone(), "drones": drones}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.rotor_speed.copy_(state_dict["rotor_speed"])
-        self._setpoints.copy_(state_dict["setpoints"])
+        self.setpoints.copy_(state_dict["setpoints"])
         if self._drones is not None:
             for name, value in state_dict["drones"].items():
                 getattr(self._drones, name).copy_(value)
@@ -242,15 +253,15 @@ class Quadrotor:
         """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
         action = action.to(self._device, self._dtype).clamp(-1.0, 1.0)
         setpoint = torch.addcmul(self._setpoint_offset, action, self._setpoint_scale)
-        self._setpoints.copy_(torch.cat((setpoint.unsqueeze(0), self._setpoints[:-1])))
+        self.setpoints.copy_(torch.cat((setpoint.unsqueeze(0), self.setpoints[:-1])))
 
     def _setpoint(self, physics_step: int) -> Tensor:
         """The setpoint (N, 4) that has arrived by this physics step of the control step."""
         if self._drones is None:
-            return self._setpoints[0]
+            return self.setpoints[0]
         late = self._drones.delay_steps - physics_step  # (N,) physics steps still to wait for the newest command
         age = torch.div(late + self.parameters.physics_steps - 1, self.parameters.physics_steps, rounding_mode="floor")
-        return self._setpoints[age.clamp(0, len(self._setpoints) - 1), self._everyone]
+        return self.setpoints[age.clamp(0, len(self.setpoints) - 1), self._everyone]
 
     def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
         """Advance controller and motors by one physics step and return the wrench on the body in its middle.
@@ -275,7 +286,7 @@ class Quadrotor:
         torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
         target_speed = self.mix(setpoint[:, :1], torque).sqrt()
         middle_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay_half)
-        self.rotor_speed.copy_(torch.lerp(target_speed, self.rotor_speed, self._motor_decay))
+        self.rotor_speed.copy_(torch.lerp(target_speed, self.rotor_speed, self.motor_decay))
         wrench = _product(middle_speed.square(), self._effectiveness)
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)

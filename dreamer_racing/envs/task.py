@@ -29,11 +29,11 @@ import torch
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
 from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.rendering import GL_LIBRARIES, RendererUnavailableError
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
@@ -174,7 +174,7 @@ class Physics(mujoco.Physics):
         self.quadrotor = quadrotor
         arrays = (data.qpos, data.qvel, data.qfrc_applied)
         qpos, qvel, force = (torch.from_numpy(array).unsqueeze(0) for array in arrays)
-        self._flight = Flight(quadrotor, qpos, qvel, force, self._integrate)
+        self._flight = FusedFlight(quadrotor, qpos, qvel, force, self._integrate)
         self._start_path()
 
     def position(self) -> np.ndarray:

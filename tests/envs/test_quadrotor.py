@@ -159,7 +159,7 @@ def test_randomised_drones_obey_their_own_newton_and_euler_equations() -> None:
     assert own.delay_steps.min() >= 0 and own.delay_steps.max() <= 40
     rates = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 5
     level = torch.tensor([LEVEL], dtype=torch.float64).repeat(64, 1)
-    before, decay = drone.rotor_speed.clone(), drone._motor_decay
+    before, decay = drone.rotor_speed.clone(), drone.motor_decay
     wrench = drone.wrench(0, level, torch.zeros_like(rates), rates)
     target = (drone.rotor_speed - decay * before) / (1 - decay)
     rotors = (target + decay**0.5 * (before - target)).square() @ drone._effectiveness  # of the middle of the step

@@ -99,7 +99,7 @@ def test_path_holds_every_physics_step(preset: str) -> None:
 
 
 @pytest.mark.parametrize("preset", ["easy", "faithful"])
-def test_batch_equals_mujocos_own_step(preset: str) -> None:
+def test_kernels_fly_what_torch_and_mujocos_own_step_fly(preset: str) -> None:
     made = simulator(1, preset=preset)
     parameters = PRESETS[preset]
     model = build_scene(KIDNEY, parameters).compile()
@@ -115,7 +115,8 @@ def test_batch_equals_mujocos_own_step(preset: str) -> None:
         quadrotor.command(action)
         for index in range(parameters.physics_steps):
             flight.step(index)
-        np.testing.assert_allclose(path[-1, 0].numpy(), data.qpos[:3], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(path[-1, 0].numpy(), data.qpos[:3], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(made.quadrotor.rotor_speed, quadrotor.rotor_speed, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("preset", ["easy", "faithful"])

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.flight import Flight
 from dreamer_racing.envs.looks import Looks, LooksSampler
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class DroneState:
 class Simulator(ABC):
     """N worlds with one drone each.
 
-    Controllers and motors are torch code, the same for every backend; a backend gives the tensors in which its engine
-    keeps the bodies, a function that moves them by one physics step, and images.
+    Controllers and motors are the same for every backend. A backend gives the tensors in which its engine keeps the
+    bodies, a function that moves them by one physics step, and images.
 
     Args:
         parameters: the drone.
@@ -62,7 +62,7 @@ class Simulator(ABC):
         self.quadrotor = Quadrotor(parameters, self.num_envs, self.device, self.dtype, generator)
         self._qpos, self._qvel = qpos, qvel
         self.state = DroneState(qpos[:, :3], qpos[:, 3:], qvel[:, :3], qvel[:, 3:])
-        self._flight = Flight(self.quadrotor, qpos, qvel, qfrc_applied, integrate)
+        self._flight = FusedFlight(self.quadrotor, qpos, qvel, qfrc_applied, integrate)
 
     def reset(self, mask: Tensor, position: Tensor, attitude: Tensor, linear_velocity: Tensor) -> None:
         """Put the masked drones (N,) bool at the given poses (N, ·), not rotating, rotors at hover."""
@@ -81,14 +81,8 @@ class Simulator(ABC):
         Returns:
             (P + 1, N, 3) positions from the start to the end of the step, one per physics step.
         """
-        steps = self.parameters.physics_steps
-        path = torch.empty(steps + 1, self.num_envs, 3, dtype=self.dtype, device=self.device)
-        path[0] = self.state.position
         self.quadrotor.command(action)
-        for index in range(steps):
-            self._flight.step(index)
-            path[index + 1] = self.state.position
-        return path
+        return self._flight.fly()
 
     def _frames(self, mask: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
         """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of the M masked ones in order."""
