@@ -267,6 +267,7 @@ def make_collector(config: DreamerConfig, env: Environment, policy: DreamerPolic
         env_device=env.device,
         policy_device=config.device,
         storing_device=env.device,
+        track_traj_ids=False,
         no_cuda_sync=False,
     )
 

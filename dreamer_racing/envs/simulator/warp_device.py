@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 
+@cache
 def load_warp() -> Any:
     """Return the package `warp`, initialised so that it reports errors only: no CUDA is no news."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
-    warp.init()
+    with nullcontext() if torch.cuda.is_available() else _silent():
+        warp.init()
     return warp
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Drop what compiled code writes to the standard error stream: warp warns of an absent driver there."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def scope(device: torch.device) -> Any:
