@@ -57,7 +57,7 @@ def main() -> None:
 def compare(track: str, preset: str, device: str) -> tuple[dict[str, Any], np.ndarray]:
     """Return one record, and three pairs of images side by side."""
     parameters = without_randomisation(load_preset(preset))
-    worlds = RaceWorlds(track, 1, parameters, evaluation=True, renderer="egl")
+    worlds = RaceWorlds(track, 1, parameters, evaluation=True, from_pixels=False)
     worlds.reset()
     other = WarpSimulator(worlds.track, parameters, 1, device=device)
     other.load_state_dict(worlds.simulator.state_dict())

@@ -16,7 +16,7 @@ Every row is a process of its own. `images` is `none` (state only, `vector`), a 
 The first three are measured in turns, five times, and the best reported, because other load on the machine only ever
 slows; `lost` is the share of the worlds' speed that the collector loses. On CPU the milliseconds of a collected step
 are split into physics, race rules, rendering and TorchRL (specs, TensorDicts, resets, storing). `memory` is the
-process's peak resident memory, or the device's, GiB.
+process's peak resident memory, or what is in use on the GPU, GiB.
 """
 
 import argparse
@@ -217,7 +217,7 @@ def watched(env: DroneRacingEnv, spent: dict[str, float]) -> Iterator[None]:
 
 
 def peak_gib(device: torch.device | None) -> float:
-    """Peak memory of this process, resident or on a CUDA device (warp's too, which torch does not count), GiB."""
+    """Peak resident memory of this process, or what is in use on a CUDA device now (warp's too), GiB."""
     if device is not None and device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         return (total - free) / 2**30
@@ -306,20 +306,24 @@ def crazyflow(name: str, track: str, preset: str, seconds: float, num_envs: int 
 def write_readme(paths: list[str]) -> None:
     """Replace README's table by the best N of each kind of images, from stored results."""
     records = [record for path in paths for record in json.loads(Path(path).read_text())]
-    best: dict[str, dict[str, Any]] = {}
+    best: dict[tuple[str, ...], dict[str, Any]] = {}
     for record in records:
-        if "collector" in record and record["collector"] > best.get(record["images"], {}).get("collector", 0.0):
-            best[record["images"]] = record
+        if "device" not in record:
+            continue  # a peer
+        key = (record["images"], record["device"], record["machine"])
+        if key not in best or record["collector"] > best[key]["collector"]:
+            best[key] = record
     lines = [
         "| images | drones | steps/s | worlds alone | with actor | physics | race rules | render | TorchRL |",
         "|" + "---|" * 9,
     ]
-    for images, record in best.items():
+    for (images, device, _), record in best.items():
         parts = " | ".join(
             f"{record[f'{part}_ms']:.1f}" if f"{part}_ms" in record else "" for part in (*PARTS, "torchrl")
         )
         speeds = f"**{record['collector']:,.0f}** | {record['worlds']:,.0f} | {record['actor']:,.0f}"
-        lines.append(f"| {NAMES.get(images, images)} | {record['num_envs']} | {speeds} | {parts} |")
+        name = NAMES.get(images, images) + (", CUDA" if images == "none" and device == "cuda" else "")
+        lines.append(f"| {name} | {record['num_envs']} | {speeds} | {parts} |")
     before, _, rest = README.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
     README.write_text("\n".join((before + BEGIN, *lines, END + after)))

@@ -137,6 +137,18 @@ def check(config: DreamerConfig) -> None:
             f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
             "thread that made them. Use collection=sync."
         )
+    on_cuda = config.env.device.partition(":")[0] == "cuda"
+    if not on_cuda and config.env.device != "cpu":
+        raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
+    if on_cuda and not is_race(config):
+        raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
+    if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
+        raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
+    if config.collection is Collection.overlapped and on_cuda:
+        raise ValueError(
+            "collection=overlapped steps worlds in a thread, and evaluation steps others on cpu meanwhile, which warp "
+            "cannot do on two devices: use env.device=cpu, or collection=sync."
+        )
     if config.collection is Collection.overlapped and model.cuda_graph:
         raise ValueError(
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "

@@ -191,8 +191,9 @@ def resolve(config: DictConfig) -> DictConfig:
 
 def worlds_device(config: DictConfig) -> str:
     """The device for the worlds to train in: the learner's, where they have a simulator and the renderer asked for."""
+    on_cuda = torch.device(config.device).type == "cuda"
     fits = config.env.suite == "race" and config.env.renderer in ("auto", "warp")
-    return str(config.device) if fits else "cpu"
+    return str(config.device) if on_cuda and fits else "cpu"
 
 
 def build(config: DreamerConfig, overrides: list[str]) -> Run:

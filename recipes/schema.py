@@ -16,8 +16,8 @@ class EnvConfig:
     num_envs: int = 32  # worlds flown side by side
     episode_steps: int = 1000  # control steps of 20 ms
     start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
-    device: str = "auto"  # of the worlds to train in: auto | cpu | cuda; auto takes the learner's
-    renderer: str = "auto"  # auto | egl | osmesa | warp; on cuda auto | warp
+    device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
+    renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
     from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
     camera_tilt: float = 25.0  # degrees upwards

@@ -30,7 +30,7 @@ class DroneRacingEnv(MergesImagesByRow, EnvBase):
         from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        seed: of start poses and physics randomisation.
+        seed: of start poses and of the randomisation of physics and looks.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
             `looks`, `num_threads`, `backend`.
 

@@ -34,14 +34,14 @@ class RaceWorlds:
         episode_steps: control steps until an episode is truncated; if None 1000 (20 s), in evaluation 1500 (30 s).
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
-        renderer: `auto`, or on CPU `egl`, `osmesa` or `warp`.
+        renderer: `auto`, or on CPU `egl`, `osmesa`, `warp`, or `warp_cuda`: drawn on a CUDA device.
         camera: the nose camera.
         looks: `nominal`, or `randomised` for another light, colours, camera tilt, lens and noise in every episode, or
             how far each varies.
         num_threads: of physics and rendering on CPU; all CPUs of the process if None.
         device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
-        seed: of start poses and physics randomisation.
+        seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
 
     Raises:
@@ -132,11 +132,11 @@ class RaceWorlds:
         """Fly one control step.
 
         Args:
-            action: (N, 4); values beyond [-1, 1] are clipped. A drone with a non-finite action has crashed: its episode
-                ends and the others fly on.
+            action: (N, 4), on the worlds' device; values beyond [-1, 1] are clipped. A drone with a non-finite action
+                has crashed: its episode ends and the others fly on.
 
         Raises:
-            ValueError: wrong shape.
+            ValueError: wrong shape or device.
         """
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
@@ -145,6 +145,8 @@ class RaceWorlds:
             )
         if self.device.type != "cuda":
             return self._fly(action)
+        if action.device.type != "cuda":
+            raise ValueError(f"Action on {action.device}: these worlds live on {self.device}, and so must it.")
         if self._graph is None:
             self._graph = self._capture(action)
         outcome = list(self._graph(action))
@@ -159,7 +161,10 @@ class RaceWorlds:
         return self.race.step(path, self.simulator.state.body_rates, invalid)
 
     def _capture(self, action: Tensor) -> GraphedFunction:
-        """Capture physics, race and images of a step as one CUDA graph, and leave the worlds as they were."""
+        """Capture physics, race and images of a step as one CUDA graph, and leave the worlds as they were.
+
+        The graph keeps the race's rules (laps, episode_steps, weights) as they are now.
+        """
 
         def fly_and_draw(action: Tensor) -> list[Tensor]:
             outcome = list(vars(self._fly(action)).values())
@@ -174,8 +179,10 @@ class RaceWorlds:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
         if self._images is None:
             images = self.simulator.render(mask)
+        elif mask is None:
+            images, self._images = self._images, None  # the caller's from now on
         else:
-            images = self._images if mask is None else self._images[mask]
+            images = self._images[mask]
         looks = self.simulator.looks
         return images if looks is None else looks.add_noise(images)
 
@@ -210,11 +217,19 @@ class RaceWorlds:
             raise ValueError(
                 f"The saved state is of {saved} worlds, these are {self.num_envs}: resume with num_envs={saved}."
             )
+        generator = state_dict["generator"].cpu()
+        if generator.shape != self._generator.get_state().shape:
+            saved_on = "cpu" if self.device.type == "cuda" else "cuda"
+            raise ValueError(
+                f"The saved state is of worlds on {saved_on}, these are on {self.device.type}, whose random numbers "
+                f"differ: resume with device={saved_on} (of the worlds; in recipes env.device={saved_on})."
+            )
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
         self._images = None
-        self._generator.set_state(state_dict["generator"].cpu())
+        self._generator.set_state(generator)
 
     def close(self) -> None:
         """Free rendering contexts and threads."""
+        self._graph = self._images = None  # the graph draws into the simulator's buffers
         self.simulator.close()

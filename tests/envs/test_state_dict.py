@@ -43,3 +43,11 @@ def test_a_state_of_another_number_of_worlds_is_refused() -> None:
     env, other = (DroneRacingEnv("circle", n, from_pixels=False, seed=0) for n in (2, 3))
     with pytest.raises(ValueError, match="2 worlds, these are 3: resume with num_envs=2"):
         other.load_state_dict(env.state_dict())
+
+
+def test_a_state_of_another_device_is_refused() -> None:
+    env = DroneRacingEnv("circle", 2, from_pixels=False, seed=0)
+    state = env.state_dict()
+    state["worlds"]["generator"] = torch.zeros(16, dtype=torch.uint8)  # as a CUDA generator's
+    with pytest.raises(ValueError, match="worlds on cuda, these are on cpu.*env.device=cuda"):
+        env.load_state_dict(state)

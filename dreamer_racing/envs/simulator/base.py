@@ -114,8 +114,12 @@ class Simulator(ABC):
         self._qpos.copy_(state_dict["qpos"])
         self._qvel.copy_(state_dict["qvel"])
         self.quadrotor.load_state_dict(state_dict["quadrotor"])
-        if self.looks is not None:
-            self.looks.load_state_dict(state_dict["looks"])
+        looks = state_dict.get("looks")
+        if (looks is None) != (self.looks is None):
+            saved, present = ("nominal" if missing else "randomised" for missing in (looks is None, self.looks is None))
+            raise ValueError(f"The saved worlds have {saved} looks, these {present}: resume with looks={saved}.")
+        if self.looks is not None and looks is not None:
+            self.looks.load_state_dict(looks)
 
     @abstractmethod
     def close(self) -> None:

@@ -38,7 +38,7 @@ class RayCaster:
             data = mujoco.MjData(model)
             mujoco.mj_forward(model, data)
             self._model = mujoco_warp.put_model(_blue_first(model))
-            self._data = mujoco_warp.put_data(model, data, nworld=frames)
+            self._data = mujoco_warp.put_data(model, data, nworld=frames, nconmax=0, njmax=0)
             self._context = mujoco_warp.create_render_context(
                 model,
                 nworld=frames,

@@ -39,7 +39,10 @@ def _silent() -> Iterator[None]:
 
 
 def scope(device: torch.device) -> Any:
-    """Let warp work on a device, on CUDA in torch's present stream, so that all is in order: a context manager."""
+    """Let warp work on a device, on CUDA in torch's present stream, so that all is in order: a context manager.
+
+    It sets what is current for the whole process: two threads must not step worlds of different devices.
+    """
     warp = load_warp()
     if device.type != "cuda":
         return warp.ScopedDevice(str(device))
@@ -50,12 +53,13 @@ def scope(device: torch.device) -> Any:
 def _stream(warp: Any, device: torch.device) -> Any:
     """Return the one warp stream of torch's present stream: captures are booked by the object."""
     stream = torch.cuda.current_stream(device)
-    if stream.cuda_stream not in _STREAMS:
-        _STREAMS[stream.cuda_stream] = warp.stream_from_torch(stream)
-    return _STREAMS[stream.cuda_stream]
+    key = (stream.device, stream.cuda_stream)  # every device's default stream has the handle 0
+    if key not in _STREAMS:
+        _STREAMS[key] = warp.stream_from_torch(stream)
+    return _STREAMS[key]
 
 
-_STREAMS: dict[int, Any] = {}
+_STREAMS: dict[tuple[torch.device, int], Any] = {}
 
 
 class GraphedFunction:
@@ -84,7 +88,7 @@ class GraphedFunction:
             with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
                 warp.capture_begin(stream=warp_stream, external=True)
                 self._outputs = tuple(function(self._input))
-                # warp's own view of the graph keeps what was allocated during the capture
+                # keeps the kernels' modules loaded; what was allocated belongs to torch's graph
                 self._warp_graph = warp.capture_end(stream=warp_stream)
         torch.cuda.current_stream(device).wait_stream(stream)
 
