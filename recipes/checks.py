@@ -124,7 +124,10 @@ def check(config: DreamerConfig) -> None:
             raise ValueError(f"{name}={value}: must be {allowed}.")
     model = config.model
     if config.total_env_steps <= config.prefill:
-        raise ValueError(f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}.")
+        raise ValueError(
+            f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
+            "first update: raise the one, or lower the other."
+        )
     prefilled = config.prefill // config.env.num_envs
     if prefilled < model.batch_length:
         raise ValueError(

@@ -133,6 +133,6 @@ def load_looks(looks: str | LooksRandomisation | None) -> LooksRandomisation | N
     if looks is None or isinstance(looks, LooksRandomisation):
         return looks
     names = {"nominal": None, "randomised": LooksRandomisation()}
-    if looks not in names:
-        raise ValueError(f"Unknown looks {looks!r}: use {', '.join(names)}.")
+    if not isinstance(looks, str) or looks not in names:
+        raise ValueError(f"looks={looks!r}: use {', '.join(names)}, or a LooksRandomisation.")
     return names[looks]

@@ -16,6 +16,7 @@ from dreamer_racing.envs.partial_reset import MergesImagesByRow
 from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.race import RaceStep
+from dreamer_racing.envs.simulator import check_device
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 
@@ -54,6 +55,7 @@ class DroneRacingEnv(MergesImagesByRow, EnvBase):
         seed: int | None = None,
         **worlds: Any,
     ) -> None:
+        check_device(device)  # before TorchRL, which would fail with torch's own words
         super().__init__(device=device, batch_size=[num_envs])
         self.from_pixels = from_pixels
         self.privileged = privileged

@@ -135,8 +135,10 @@ def test_a_state_with_other_looks_is_refused(saved: str | None, present: str | N
 
 
 def test_bad_looks_are_refused() -> None:
-    with pytest.raises(ValueError, match="Unknown looks 'pretty': use nominal, randomised"):
+    with pytest.raises(ValueError, match="looks='pretty': use nominal, randomised"):
         load_looks("pretty")
+    with pytest.raises(ValueError, match="or a LooksRandomisation"):
+        load_looks({"noise": 0.1})
     with pytest.raises(ValueError, match="noise=-1.0 must not be negative"):
         LooksRandomisation(noise=-1.0)
     with pytest.raises(ValueError, match="below 1"):

@@ -188,14 +188,17 @@ def test_memory_is_estimated() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_absent_cuda_is_named() -> None:
-    with pytest.raises(ValueError, match=r"device='cuda:1': torch .*finds no CUDA device here.*device='cpu'"):
-        RaceWorlds("circle", device="cuda:1")
+@pytest.mark.parametrize("device", ["cuda", "cuda:1"])
+@pytest.mark.parametrize("make", [RaceWorlds, DroneRacingEnv])
+def test_absent_cuda_is_named(make: type, device: str) -> None:
+    with pytest.raises(ValueError, match=rf"device='{device}': torch .*finds no CUDA device here.*device='cpu'"):
+        make("circle", device=device)
 
 
 def test_other_devices_are_refused() -> None:
-    with pytest.raises(ValueError, match="device='meta': worlds live on cpu or cuda"):
-        RaceWorlds("circle", device="meta")
+    for device in ("meta", "gpu"):
+        with pytest.raises(ValueError, match=f"device='{device}': worlds live on cpu or cuda"):
+            DroneRacingEnv("circle", device=device)
 
 
 def test_unknown_backend_is_refused_with_the_known_ones() -> None:

@@ -24,9 +24,9 @@ def check_device(device: torch.device | str) -> None:
     Raises:
         ValueError: the message says what is there instead.
     """
-    device = torch.device(device)
-    if device.type not in ("cpu", "cuda"):
+    if str(device).partition(":")[0] not in ("cpu", "cuda"):
         raise ValueError(f"device={str(device)!r}: worlds live on cpu or cuda.")
+    device = torch.device(device)
     if device.type == "cpu":
         return
     if not torch.cuda.is_available():
