@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -88,6 +88,29 @@ class LearnerConfig:
     world_model_loss: str = "reconstruction"
     actor_loss: str = "reinforce"
     critic_loss: str = "two_hot"
+
+
+class Learner(Protocol):
+    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do."""
+
+    device: torch.device
+    updates: int
+
+    def policy(self, deterministic: bool = False) -> Any:
+        """Return the acting step, which shares the learner's parameters."""
+        ...
+
+    def check_finite(self) -> None:
+        """Raise ``NonFiniteLossError`` if an update was not finite."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned."""
+        ...
 
 
 class Agent(nn.Module):

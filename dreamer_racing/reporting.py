@@ -14,7 +14,7 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
-from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.learner import DreamerLearner, Learner
 from dreamer_racing.plotting import plot_top_down
 from dreamer_racing.recording import side_by_side, write_video
 
@@ -26,7 +26,7 @@ class EvaluationReport:
 
     Args:
         directory: of the run; files go to its `plots`, `videos` and `evaluations` folders.
-        learner: whose policy flies and whose world model dreams.
+        learner: whose policy flies, and whose world model dreams if it has one.
         worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
         episodes: episodes of an evaluation.
         video_steps: control steps K that the video shows at most.
@@ -37,7 +37,7 @@ class EvaluationReport:
     def __init__(
         self,
         directory: str | Path,
-        learner: DreamerLearner,
+        learner: Learner,
         worlds: dict[str, Any],
         episodes: int,
         video_steps: int = 500,
@@ -87,7 +87,9 @@ class EvaluationReport:
         plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
         if trajectory.pixels is None:
             return
-        frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
+        frames = trajectory.pixels[: self.video_steps]
+        if isinstance(self._learner, DreamerLearner):
+            frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
         write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
     def close(self) -> None:
@@ -107,7 +109,7 @@ class ReturnReport:
     """
 
     def __init__(
-        self, directory: str | Path, learner: DreamerLearner, env: EnvBase, episodes: int, video_steps: int = 500
+        self, directory: str | Path, learner: Learner, env: EnvBase, episodes: int, video_steps: int = 500
     ) -> None:
         self.directory = Path(directory)
         self.episodes = episodes

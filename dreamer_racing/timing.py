@@ -26,12 +26,22 @@ class RunClock:
         >>> with clock.timed("update"):
         ...     counters["updates"] += 1
         >>> sorted(clock.read())
-        ['rate/updates', 'time/update']
+        ['rate/updates', 'time/update', 'wall_clock']
     """
 
     def __init__(self, counters: Mapping[str, int]) -> None:
         self._counters = counters
+        self._born = time.perf_counter()
         self._restart()
+
+    @property
+    def total(self) -> float:
+        """Seconds since this clock was made, and those that a continued run had taken before; settable."""
+        return time.perf_counter() - self._born
+
+    @total.setter
+    def total(self, seconds: float) -> None:
+        self._born = time.perf_counter() - seconds
 
     def _restart(self) -> None:
         self._since = time.perf_counter()
@@ -48,10 +58,10 @@ class RunClock:
             self._seconds[activity] += time.perf_counter() - start
 
     def read(self) -> dict[str, float]:
-        """Shares `time/<activity>` in [0, 1] and rates `rate/<counter>` in 1/s; starts the next interval."""
+        """Shares `time/<activity>`, rates `rate/<counter>` in 1/s and `wall_clock` in s; starts the next interval."""
         elapsed = time.perf_counter() - self._since
         readings = {f"time/{activity}": seconds / elapsed for activity, seconds in self._seconds.items()}
         for name, value in self._counters.items():
             readings[f"rate/{name}"] = (value - self._start.get(name, 0)) / elapsed
         self._restart()
-        return readings
+        return {**readings, "wall_clock": self.total}

@@ -1,17 +1,19 @@
 """Where a run acts: the environment that its configuration names, and what comes with it."""
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
-from schema import DreamerConfig
+from omegaconf import OmegaConf
+from schema import DreamerConfig, PPORunConfig, RunConfig
 
+from dreamer_racing.baselines import NetworkSize, PPOLearner
 from dreamer_racing.checkpoint import load_components
 from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.learner import DreamerLearner, Learner, LearnerConfig
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface
 from dreamer_racing.reporting import EvaluationReport, ReturnReport
@@ -32,7 +34,7 @@ class Report(Protocol):
         ...
 
 
-def is_race(config: DreamerConfig) -> bool:
+def is_race(config: RunConfig) -> bool:
     """Whether the run races drones, rather than being tested on the Control Suite.
 
     Raises:
@@ -43,12 +45,12 @@ def is_race(config: DreamerConfig) -> bool:
     return config.env.suite == "race"
 
 
-def scene_name(config: DreamerConfig) -> str:
+def scene_name(config: RunConfig) -> str:
     """The track or the task."""
     return config.track if is_race(config) else config.task
 
 
-def worlds_of(config: DreamerConfig) -> dict[str, Any]:
+def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run."""
     env = config.env
     return {
@@ -59,11 +61,12 @@ def worlds_of(config: DreamerConfig) -> dict[str, Any]:
     }
 
 
-def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
+def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
     """Make the environment to train in, with `env.num_envs` worlds or another number."""
     env = config.env
     num_envs = num_envs or env.num_envs
-    reads_privileged = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).reads_privileged
+    loss = config.loss.world_model if isinstance(config, DreamerConfig) else None
+    reads_privileged = loss is not None and find_loss(WORLD_MODEL_LOSSES, loss).reads_privileged
     if is_race(config):
         return DroneRacingEnv(
             num_envs=num_envs,
@@ -78,14 +81,14 @@ def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
         )
     if reads_privileged:
         raise ValueError(
-            f"loss.world_model={config.loss.world_model} decodes the race's privileged state, which env=dmc does not "
+            f"loss.world_model={loss} decodes the race's privileged state, which env=dmc does not "
             "have: choose another loss, e.g. loss=reconstruction."
         )
     return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, seed=config.seed)
 
 
 def make_report(
-    config: DreamerConfig, directory: Path, learner: DreamerLearner, episodes: int, video_steps: int, **options: Any
+    config: RunConfig, directory: Path, learner: Learner, episodes: int, video_steps: int, **options: Any
 ) -> Report:
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
@@ -95,7 +98,7 @@ def make_report(
     return ReturnReport(directory, learner, env, episodes, video_steps)
 
 
-def crash_causes(config: DreamerConfig) -> type[CrashCause] | None:
+def crash_causes(config: RunConfig) -> type[CrashCause] | None:
     """How episodes may end badly, for the metrics."""
     return CrashCause if is_race(config) else None
 
@@ -126,17 +129,42 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
     )
 
 
-def restore_learner(
-    config: DreamerConfig, checkpoint: Path, device: torch.device
-) -> tuple[DreamerLearner, dict[str, int]]:
+def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
+    """Make the learner of a recipe's configuration."""
+    if isinstance(config, DreamerConfig):
+        return DreamerLearner(config.model.size, interface, learner_config(config), device, config.seed)
+    assert isinstance(config, PPORunConfig)
+    return PPOLearner(network_size(config), interface, config.ppo, device, config.seed)
+
+
+def network_size(config: PPORunConfig) -> NetworkSize:
+    """The baselines' hidden layers."""
+    return NetworkSize(config.network.layers, config.network.units)
+
+
+def trained_config(run_dir: Path) -> RunConfig:
+    """Read back the configuration that a run was trained with.
+
+    Raises:
+        ValueError: by an unknown algorithm.
+    """
+    saved = OmegaConf.load(run_dir / "config.yaml")
+    algorithm = saved.get("algorithm", DreamerConfig.algorithm)
+    schemas = {schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig)}
+    if algorithm not in schemas:
+        raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(schemas)}.")
+    return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schemas[algorithm]), saved)))
+
+
+def restore_learner(config: RunConfig, checkpoint: Path, device: torch.device) -> tuple[Learner, dict[str, int]]:
     """Bring back the learner of a checkpoint of a run, and the run's counters."""
     config.env.device = "cpu"  # wherever it was trained
+    if isinstance(config, DreamerConfig):
+        config.model.compile = config.model.cuda_graph = False
     env = make_env(config, num_envs=1)
     interface = Interface.of(env)
     env.close()
-    settings = learner_config(config)
-    settings = LearnerConfig(**{**vars(settings), "compile": False, "cuda_graph": False})
-    learner = DreamerLearner(config.model.size, interface, settings, device)
+    learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
     load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
     return learner, counters

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from arena import is_race
 from omegaconf import DictConfig, OmegaConf
-from schema import Collection, DreamerConfig
+from schema import Collection, DreamerConfig, RunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 
@@ -35,6 +35,7 @@ class Range(NamedTuple):
 
 POSITIVE, SHARE, NOT_NEGATIVE = Range(0, open_below=True), Range(0, 1), Range(0)
 RANGES = {
+    "total_env_steps": Range(1),
     "prefill": NOT_NEGATIVE,
     "rollout_steps": Range(1),
     "seed": Range(0, 2**32 - 1),
@@ -58,6 +59,19 @@ RANGES = {
     "loss.privileged_scale": NOT_NEGATIVE,
     "loss.barlow_scale": NOT_NEGATIVE,
     "loss.replay_value_scale": NOT_NEGATIVE,
+    "network.layers": NOT_NEGATIVE,
+    "network.units": Range(1),
+    "ppo.learning_rate": POSITIVE,
+    "ppo.epochs": Range(1),
+    "ppo.minibatches": Range(1),
+    "ppo.clip_epsilon": POSITIVE,
+    "ppo.discount": SHARE,
+    "ppo.lambda_": SHARE,
+    "ppo.entropy_scale": NOT_NEGATIVE,
+    "ppo.critic_scale": NOT_NEGATIVE,
+    "ppo.reward_scale": POSITIVE,
+    "ppo.gradient_clip": POSITIVE,
+    "ppo.initial_std": POSITIVE,
     "replay.capacity": Range(1),
     "replay.recent_share": SHARE,
     "replay.recent_records": Range(1),
@@ -69,7 +83,7 @@ RANGES = {
     "checkpoint.keep": Range(1),
     "logger.every": NOT_NEGATIVE,
 }
-"""Allowed values by setting; null is allowed where the schema allows it."""
+"""Allowed values by setting, of those that a recipe has; null is allowed where the schema allows it."""
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -86,7 +100,7 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
         raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
 
 
-def refuse_to_replace(config: DreamerConfig) -> None:
+def refuse_to_replace(config: RunConfig) -> None:
     """Refuse to begin a run where another has left checkpoints.
 
     Raises:
@@ -111,8 +125,8 @@ def updates_in(config: DreamerConfig, env_steps: int) -> int:
     return max(0, int((env_steps - config.prefill) * model.replay_ratio / (model.batch_size * model.batch_length)))
 
 
-def check(config: DreamerConfig) -> None:
-    """Refuse settings with which a run could not learn.
+def check(config: RunConfig) -> None:
+    """Refuse settings that no recipe could run with.
 
     Raises:
         ValueError: the message gives the numbers and the setting to change.
@@ -122,6 +136,22 @@ def check(config: DreamerConfig) -> None:
         value = OmegaConf.select(values, name)
         if value is not None and value not in allowed:
             raise ValueError(f"{name}={value}: must be {allowed}.")
+    on_cuda = config.env.device.partition(":")[0] == "cuda"
+    if not on_cuda and config.env.device != "cpu":
+        raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
+    if on_cuda and not is_race(config):
+        raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
+    if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
+        raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
+
+
+def check_dreamer(config: DreamerConfig) -> None:
+    """Refuse settings with which a world model could not learn.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    check(config)
     model = config.model
     if config.total_env_steps <= config.prefill:
         raise ValueError(
@@ -140,14 +170,7 @@ def check(config: DreamerConfig) -> None:
             f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
             "thread that made them. Use collection=sync."
         )
-    on_cuda = config.env.device.partition(":")[0] == "cuda"
-    if not on_cuda and config.env.device != "cpu":
-        raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
-    if on_cuda and not is_race(config):
-        raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
-    if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
-        raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
-    if config.collection is Collection.overlapped and on_cuda:
+    if config.collection is Collection.overlapped and config.env.device != "cpu":
         raise ValueError(
             "collection=overlapped steps worlds in a thread, and evaluation steps others on cpu meanwhile, which warp "
             "cannot do on two devices: use env.device=cpu, or collection=sync."

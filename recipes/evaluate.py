@@ -12,10 +12,10 @@ from typing import Any, cast
 
 import hydra
 import torch
-from arena import is_race, make_report, restore_learner
+from arena import is_race, make_report, restore_learner, trained_config
 from command_line import choose_device, plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
-from schema import DreamerConfig, EvaluateConfig, register
+from schema import EvaluateConfig, register
 
 from dreamer_racing.checkpoint import ensure_writable, latest_checkpoint
 from dreamer_racing.reporting import EvaluationReport
@@ -45,8 +45,7 @@ def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
     device = choose_device(config.device)
     checkpoint = latest_checkpoint(config.checkpoint)
     run_dir = checkpoint.parent.parent
-    saved = OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
-    trained = cast(DreamerConfig, OmegaConf.to_object(saved))
+    trained = trained_config(run_dir)
     torch.manual_seed(config.seed)
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
@@ -54,7 +53,7 @@ def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
     trained.env.renderer = config.renderer
     learner, counters = restore_learner(trained, checkpoint, device)
     directory = ensure_writable(config.run_dir or run_dir / "evaluation")
-    print(f"checkpoint: {checkpoint} ({trained.model.size}, {counters['env_steps']:,} env_steps)")
+    print(f"checkpoint: {checkpoint} ({trained.algorithm}, {counters['env_steps']:,} env_steps)")
     print(f"race: {trained.track}, {trained.env.preset}, {config.episodes} episodes")
     options = {"num_envs": config.num_envs, "seed": config.seed}
     report = make_report(trained, directory, learner, config.episodes, config.video_steps, **options)

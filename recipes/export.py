@@ -13,7 +13,7 @@ from typing import cast
 
 import hydra
 import torch
-from arena import is_race
+from arena import is_race, trained_config
 from command_line import plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
 from schema import DreamerConfig, ExportConfig, register
@@ -59,8 +59,9 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = latest_checkpoint(config.checkpoint)
     run_dir = checkpoint.parent.parent
-    saved = OmegaConf.merge(OmegaConf.structured(DreamerConfig), OmegaConf.load(run_dir / "config.yaml"))
-    trained = cast(DreamerConfig, OmegaConf.to_object(saved))
+    trained = trained_config(run_dir)
+    if not isinstance(trained, DreamerConfig):
+        raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; this recipe exports actors of dreamer_v3.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
     output = check_output(config.output or run_dir / "export" / "actor.onnx")

@@ -6,6 +6,8 @@ from enum import Enum
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
+from dreamer_racing.baselines import PPOConfig
+
 
 @dataclass
 class EnvConfig:
@@ -13,7 +15,7 @@ class EnvConfig:
 
     suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful
-    num_envs: int = 32  # worlds flown side by side
+    num_envs: int = MISSING  # worlds flown side by side; missing: the recipe's own number
     episode_steps: int = 1000  # control steps of 20 ms
     start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
@@ -127,27 +129,55 @@ class Collection(Enum):
 
 
 @dataclass
-class DreamerConfig:
-    """`recipes/dreamer_v3.py`."""
+class RunConfig:
+    """What all training recipes have in common."""
 
+    algorithm: str = MISSING  # the recipe
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     total_env_steps: int = 1_000_000  # control steps summed over environments
-    prefill: int = 4_000  # env_steps collected before the first update
-    rollout_steps: int = 8  # control steps of every environment between updates
-    collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
+    rollout_steps: int = MISSING  # control steps of every environment between updates
     seed: int = 0
     device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
-    run_dir: str | None = None  # null: runs/dreamer_v3_<track>_<time>
+    run_dir: str | None = None  # null: runs/<algorithm>_<track>_<time>
     resume: str | None = None  # run directory or checkpoint to continue
     env: EnvConfig = field(default_factory=EnvConfig)
-    model: ModelConfig = field(default_factory=ModelConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+
+@dataclass
+class DreamerConfig(RunConfig):
+    """`recipes/dreamer_v3.py`."""
+
+    algorithm: str = "dreamer_v3"
+    prefill: int = 4_000  # env_steps collected before the first update
+    rollout_steps: int = 8
+    collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+@dataclass
+class NetworkConfig:
+    """Hidden layers of the baselines' actor and critic: `auto` chooses by what they see."""
+
+    size: str = MISSING  # auto | paper | small
+    layers: int = MISSING
+    units: int = MISSING
+
+
+@dataclass
+class PPORunConfig(RunConfig):
+    """`recipes/ppo.py`."""
+
+    algorithm: str = "ppo"
+    rollout_steps: int = 32
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
 
 
 @dataclass
@@ -182,12 +212,14 @@ def register() -> None:
     """Make the schemas known to hydra."""
     store = ConfigStore.instance()
     store.store(name="dreamer_v3_schema", node=DreamerConfig)
+    store.store(name="ppo_schema", node=PPORunConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="export_schema", node=ExportConfig)
     for group, node in (
         ("env", EnvConfig),
         ("model", ModelConfig),
         ("loss", LossConfig),
+        ("network", NetworkConfig),
         ("curriculum", CurriculumConfig),
         ("logger", LoggerConfig),
     ):

@@ -1,0 +1,156 @@
+"""Networks of the model-free baselines: a CNN on images, numbers as they are, then one MLP.
+
+Shape legend: N any batch, A action, O outputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from dreamer_racing.modules import Interface
+from dreamer_racing.modules.encoder import IMAGE_SIZE
+from dreamer_racing.modules.interface import PIXELS
+
+
+@dataclass
+class NetworkSize:
+    """Hidden layers of actor and critic.
+
+    Attributes:
+        layers: How many. Reference: paper, Section IV: four-layer MLPs.
+        units: Their width. Reference: paper, Section IV: 768.
+    """
+
+    layers: int = 4
+    units: int = 768
+
+
+class ImageTrunk(nn.Module):
+    """Three convolutions and a linear layer.
+
+    The paper says no more than "a CNN"; this is the one of Stable-Baselines3, on which its code builds.
+
+    Example:
+        >>> ImageTrunk()(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
+        torch.Size([2, 512])
+
+    Reference: Mnih et al. 2015, "Human-level control through deep reinforcement learning", Methods.
+    """
+
+    features = 512
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU(), nn.Conv2d(64, 64, 3, 1), nn.ReLU()
+        ).to(memory_format=torch.channels_last)
+        with torch.no_grad():
+            flat = self.convolutions(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE)).numel()
+        self.linear = nn.Linear(flat, self.features)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Map images uint8 ``(..., H, W, 3)`` to ``(..., 512)``."""
+        batch = pixels.shape[:-3]
+        maps = self.convolutions(pixels.flatten(0, -4).permute(0, 3, 1, 2).float().div_(255.0))
+        return self.linear(maps.flatten(1)).relu().view(*batch, self.features)
+
+
+class ObservationNetwork(nn.Module):
+    """What the agent sees (and does, for an action's value) to some outputs.
+
+    Args:
+        interface: What the agent sees and does.
+        outputs: O.
+        size: Of the MLP.
+        with_action: Whether an action is a further input.
+        output_scale: Factor on the initial weights of the last layer.
+
+    Attributes:
+        in_keys: What ``forward`` takes, in this order.
+
+    Example:
+        >>> network = ObservationNetwork(Interface(pixels=False, vector_dim=21), 1, NetworkSize(2, 32))
+        >>> network(torch.zeros(5, 21)).shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        interface: Interface,
+        outputs: int,
+        size: NetworkSize,
+        with_action: bool = False,
+        output_scale: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [*interface.observation_keys, *(["action"] if with_action else [])]
+        self.trunk = ImageTrunk() if interface.pixels else None
+        inputs = (ImageTrunk.features if interface.pixels else 0) + interface.vector_dim
+        inputs += interface.action_dim if with_action else 0
+        layers: list[nn.Module] = []
+        for _ in range(size.layers):
+            layers += [nn.Linear(inputs, size.units), nn.ELU()]
+            inputs = size.units
+        last = nn.Linear(inputs, outputs)
+        last.weight.data *= output_scale
+        last.bias.data.zero_()
+        self.mlp = nn.Sequential(*layers, last)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map the tensors under ``in_keys`` to ``(..., O)``."""
+        if self.trunk is not None:
+            position = self.in_keys.index(PIXELS)
+            inputs = (*inputs[:position], self.trunk(inputs[position]), *inputs[position + 1 :])
+        return self.mlp(inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1))
+
+
+class BaselinePolicy(TensorDictModuleBase):
+    """The acting step of an actor without memory.
+
+    Args:
+        actor: Shared, not copied.
+        deterministic: Take the mode instead of a sample; may be set at any time.
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential, deterministic: bool = False) -> None:
+        super().__init__()
+        self.in_keys = list(actor.in_keys)
+        self.out_keys = list(actor.out_keys)
+        self.actor = actor
+        self.deterministic = deterministic
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` ``(..., A)`` and what else the actor writes."""
+        kind = ExplorationType.DETERMINISTIC if self.deterministic else ExplorationType.RANDOM
+        with set_exploration_type(kind):
+            return self.actor(tensordict)
+
+    def make_primer(self) -> Transform:
+        """Make the transform that adds what this policy remembers: nothing."""
+        return Compose()
+
+
+def check_size(saved: dict[str, Any], size: NetworkSize) -> None:
+    """Refuse the state of networks of another size.
+
+    Args:
+        saved: ``state_dict()["size"]`` of a learner.
+        size: Of the learner that loads it.
+
+    Raises:
+        ValueError: If they differ.
+    """
+    if saved != asdict(size):
+        raise ValueError(
+            f"The checkpoint holds networks of {saved['layers']} × {saved['units']} units, this learner's have "
+            f"{size.layers} × {size.units}: set network.layers={saved['layers']} network.units={saved['units']}."
+        )

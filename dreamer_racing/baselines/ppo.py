@@ -1,0 +1,231 @@
+"""The PPO learner: networks, TorchRL's clipped loss, and the gradient steps on one rollout.
+
+Shape legend: N environments, T steps of a rollout, M records of a minibatch, A action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size
+from dreamer_racing.finite_guard import FiniteGuard
+from dreamer_racing.metrics import RunningMean
+from dreamer_racing.modules import Interface
+from dreamer_racing.timing import Timer, untimed
+
+
+@dataclass
+class PPOConfig:
+    """Numbers of the learner.
+
+    Attributes:
+        learning_rate: Of Adam.
+        epochs: Times that every record of a rollout is trained on.
+        minibatches: Gradient steps of an epoch.
+        clip_epsilon: ε of the clipped ratio.
+        discount: γ.
+        lambda_: λ of the advantages.
+        entropy_scale: Weight of the policy's entropy.
+        critic_scale: Weight of the critic's squared error.
+        reward_scale: Factor on rewards before the critic sees them, so that its errors are of order one.
+        gradient_clip: Largest norm of a network's gradient; actor and critic are clipped apart.
+        initial_std: Of the actions, which later is learned, one number for each dimension.
+
+    Reference: Schulman et al. 2017, "Proximal policy optimization algorithms". Clipping, discount, λ and the weights of
+    the losses are the defaults of Stable-Baselines3; learning rate, epochs, minibatches, scale of rewards and initial
+    deviation are [choice].
+    """
+
+    learning_rate: float = 1e-3
+    epochs: int = 5
+    minibatches: int = 8
+    clip_epsilon: float = 0.2
+    discount: float = 0.99
+    lambda_: float = 0.95
+    entropy_scale: float = 0.0
+    critic_scale: float = 0.5
+    reward_scale: float = 0.1
+    gradient_clip: float = 0.5
+    initial_std: float = 0.6
+
+
+class PPOLearner:
+    """Actor and critic with TorchRL's ``ClipPPOLoss``, and one optimiser.
+
+    Actions are drawn from a normal that is not bounded: the environment clips them to [−1, 1].
+
+    Args:
+        size: Of both networks.
+        interface: What the agent sees and does.
+        config: Numbers of the learner.
+        device: Where the networks live and updates run.
+        seed: Of the initial weights; None takes them from the global generator.
+
+    Example:
+        >>> learner = PPOLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
+        >>> learner.policy().in_keys
+        ['vector']
+    """
+
+    def __init__(
+        self,
+        size: NetworkSize,
+        interface: Interface,
+        config: PPOConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        self.size = size
+        self.config = config or PPOConfig()
+        self.device = torch.device(device)
+        self._keys = interface.observation_keys
+        with torch.random.fork_rng(devices=[], enabled=seed is not None):
+            if seed is not None:
+                torch.manual_seed(seed)
+            self.actor = _make_actor(interface, size, self.config.initial_std).to(self.device)
+            critic = ObservationNetwork(interface, 1, size)
+            self.critic = TensorDictModule(critic, critic.in_keys, ["state_value"]).to(self.device)
+        self._loss = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=self.config.clip_epsilon,
+            entropy_coeff=self.config.entropy_scale,
+            entropy_bonus=self.config.entropy_scale > 0,
+            critic_coeff=self.config.critic_scale,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self._networks = {"actor": list(self.actor.parameters()), "critic": list(self.critic.parameters())}
+        self.optimizer = torch.optim.Adam(
+            [p for group in self._networks.values() for p in group],
+            lr=self.config.learning_rate,
+            eps=1e-5,
+            fused=True,
+        )
+        self.updates = 0
+        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
+
+    def policy(self, deterministic: bool = False) -> BaselinePolicy:
+        """Return the acting step, which shares this learner's parameters."""
+        return BaselinePolicy(self.actor, deterministic)
+
+    def update(self, rollout: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Make ``epochs`` passes of gradient steps over a rollout.
+
+        Args:
+            rollout: Batch ``[N, T]`` as a collector returns it.
+            timed: Context manager by activity (``advantages``, ``optimise``).
+
+        Returns:
+            Losses and diagnostics, scalar tensors on the device, averaged over the gradient steps.
+
+        Raises:
+            NonFiniteLossError: If a loss or gradient is not finite.
+        """
+        with timed("advantages"):
+            records = self.with_advantages(rollout)
+        mean = RunningMean()
+        with timed("optimise"):
+            for _ in range(self.config.epochs):
+                order = torch.randperm(len(records), device=self.device)
+                for indices in order.chunk(self.config.minibatches):
+                    mean.push(self._step(records[indices]))
+        return {name: torch.tensor(value) for name, value in mean.pop().items()}
+
+    @torch.no_grad()
+    def with_advantages(self, rollout: TensorDictBase) -> TensorDict:
+        """Return the records of a rollout ``[N T]`` with ``advantage`` and ``value_target`` ``(N T, 1)``."""
+        keys = [*self._keys, "action", "action_log_prob"]
+        records = rollout.select(*keys).to(self.device)
+        following = rollout["next"].to(self.device)
+        reward = following["reward"] * self.config.reward_scale
+        value, next_value = self._values(records, following)
+        advantage, target = vec_generalized_advantage_estimate(
+            self.config.discount,
+            self.config.lambda_,
+            value,
+            next_value,
+            reward,
+            following["done"],
+            following["terminated"],
+        )
+        return records.update({"advantage": advantage, "value_target": target}).flatten()
+
+    def _values(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the values of what was seen and of what came next, ``(N, T, 1)`` each.
+
+        What comes next is what is seen in the next step, but for the last step and where an episode was cut off.
+        """
+        value = self.critic(records.select(*self._keys))["state_value"]
+        next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
+        apart = following["done"].squeeze(-1).clone()
+        apart[:, -1] = True
+        apart &= ~following["terminated"].squeeze(-1)  # (N, T)
+        next_value[apart] = self.critic(following.select(*self._keys)[apart])["state_value"]
+        return value, next_value
+
+    def _step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step on a minibatch ``[M]``."""
+        outputs = self._loss(batch)
+        total = torch.stack([value for name, value in outputs.items() if name.startswith("loss_")]).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norms = {
+            f"gradient_norm/{name}": nn.utils.clip_grad_norm_(parameters, self.config.gradient_clip)
+            for name, parameters in self._networks.items()
+        }
+        metrics = {name: value.detach() for name, value in ({**outputs} | norms | {"loss": total}).items()}
+        self._guard.check(metrics, batch)
+        self.optimizer.step()
+        self.updates += 1
+        return metrics
+
+    def check_finite(self) -> None:
+        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
+        self._guard.settle()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        return {
+            "size": asdict(self.size),
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned.
+
+        Raises:
+            ValueError: If it is that of networks of another size; nothing is changed then.
+        """
+        check_size(state_dict["size"], self.size)
+        self.actor.load_state_dict(state_dict["actor"])
+        self.critic.load_state_dict(state_dict["critic"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate  # a setting of this learner, not state
+        self.updates = state_dict["updates"]
+
+
+def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
+    """Make a normal whose mean depends on what is seen, and whose deviation does not."""
+    network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
+    deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=torch.tensor(initial_std).log().item())
+    return ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(network, network.in_keys, ["loc"]), TensorDictModule(deviation, ["loc"], ["loc", "scale"])
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )

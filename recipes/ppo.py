@@ -1,0 +1,80 @@
+"""PPO on the drone race, the paper's first baseline: collect a rollout → advantages → epochs of gradient steps.
+
+    python recipes/ppo.py track=kidney
+    python recipes/ppo.py track=circle env.from_pixels=false
+    python recipes/ppo.py resume=runs/ppo_kidney_20260101-120000
+
+Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import hydra
+from arena import make_env, make_learner
+from checks import check
+from omegaconf import DictConfig
+from schema import PPORunConfig, register
+from tensordict import TensorDictBase
+from training import (
+    Run,
+    assemble,
+    launch,
+    make_collector,
+    make_curriculum,
+    resolve_common,
+    resolve_network,
+    seed_generators,
+)
+
+from dreamer_racing.baselines import PPOLearner
+from dreamer_racing.checkpoint import GracefulExit
+from dreamer_racing.modules import Interface
+
+NUM_ENVS = {"pixels": 64, "state": 1024}
+
+register()
+
+
+@dataclass(kw_only=True)
+class PPORun(Run):
+    """A run that learns from every rollout once, and forgets it."""
+
+    config: PPORunConfig
+    learner: PPOLearner
+
+    remedy: ClassVar[str] = "ppo.learning_rate"
+
+    def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
+        """Make the epochs of a rollout."""
+        if rollout is None:
+            return
+        self.metrics.push(self.learner.update(rollout, self.clock.timed))
+        self.counters["updates"] = self.learner.updates
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="ppo")
+def main(config: DictConfig) -> None:
+    """Compose the configuration, build the run, train."""
+    launch(config, resolve, build)
+
+
+def resolve(config: DictConfig) -> DictConfig:
+    """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
+    resolve_common(config, NUM_ENVS["pixels" if config.env.from_pixels else "state"])
+    resolve_network(config)
+    return config
+
+
+def build(config: PPORunConfig, overrides: list[str]) -> PPORun:
+    """Make all parts of the run, restored from a checkpoint if it continues one."""
+    check(config)
+    env = make_env(config)
+    learner = make_learner(config, Interface.of(env), config.device)
+    seed_generators(config.seed)
+    collector = make_collector(config, env, learner.policy())
+    return assemble(PPORun, config, overrides, env, learner, collector, make_curriculum(config))
+
+
+if __name__ == "__main__":
+    main()
