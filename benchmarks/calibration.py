@@ -19,13 +19,12 @@ from typing import Any, cast
 
 import torch
 from measuring import print_table, write_json
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from arena import make_env, restore_learner
+from arena import make_env, restore_learner, trained_config
 from schema import DreamerConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
@@ -56,14 +55,16 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
     """Return one record.
 
     Raises:
-        ValueError: the flight would reach the time limit, which is no crash.
+        ValueError: the checkpoint is of another algorithm, or the flight would reach the time limit, which is no crash.
     """
-    saved = OmegaConf.load(checkpoint.parent.parent / "config.yaml")
-    config = cast(DreamerConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(DreamerConfig), saved)))
+    config = trained_config(checkpoint.parent.parent)
+    if not isinstance(config, DreamerConfig):
+        raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which imagines nothing.")
     if steps >= config.env.episode_steps:
         raise ValueError(f"--steps {steps}: at most {config.env.episode_steps - 1}, so that no time runs out.")
     torch.manual_seed(0)
-    learner, counters = restore_learner(config, checkpoint, torch.device("cpu"))
+    restored, counters = restore_learner(config, checkpoint, torch.device("cpu"))
+    learner = cast(DreamerLearner, restored)
     return {
         "benchmark": "calibration", "track": config.track, "actor": config.loss.actor, **counters,
         "num_envs": num_envs, "steps": steps, "horizon": learner.config.imagination_horizon,

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import torch
-from omegaconf import OmegaConf
-from schema import DreamerConfig, PPORunConfig, RunConfig
+from omegaconf import DictConfig, OmegaConf
+from schema import DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
 
-from dreamer_racing.baselines import NetworkSize, PPOLearner
+from dreamer_racing.baselines import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.checkpoint import load_components
 from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.gates import CrashCause
@@ -133,13 +133,11 @@ def make_learner(config: RunConfig, interface: Interface, device: torch.device |
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
         return DreamerLearner(config.model.size, interface, learner_config(config), device, config.seed)
-    assert isinstance(config, PPORunConfig)
-    return PPOLearner(network_size(config), interface, config.ppo, device, config.seed)
-
-
-def network_size(config: PPORunConfig) -> NetworkSize:
-    """The baselines' hidden layers."""
-    return NetworkSize(config.network.layers, config.network.units)
+    assert isinstance(config, (PPORunConfig, SACRunConfig))
+    size = NetworkSize(config.network.layers, config.network.units)
+    if isinstance(config, SACRunConfig):
+        return SACLearner(size, interface, config.sac, device, config.seed)
+    return PPOLearner(size, interface, config.ppo, device, config.seed)
 
 
 def trained_config(run_dir: Path) -> RunConfig:
@@ -148,9 +146,9 @@ def trained_config(run_dir: Path) -> RunConfig:
     Raises:
         ValueError: by an unknown algorithm.
     """
-    saved = OmegaConf.load(run_dir / "config.yaml")
+    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
     algorithm = saved.get("algorithm", DreamerConfig.algorithm)
-    schemas = {schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig)}
+    schemas = {schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)}
     if algorithm not in schemas:
         raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(schemas)}.")
     return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schemas[algorithm]), saved)))

@@ -3,6 +3,8 @@
 Every message names the setting as the user writes it, its value, and what would be right.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import NamedTuple
 
 from arena import is_race
 from omegaconf import DictConfig, OmegaConf
-from schema import Collection, DreamerConfig, RunConfig
+from schema import Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 
@@ -72,6 +74,13 @@ RANGES = {
     "ppo.reward_scale": POSITIVE,
     "ppo.gradient_clip": POSITIVE,
     "ppo.initial_std": POSITIVE,
+    "sac.learning_rate": POSITIVE,
+    "sac.batch_size": Range(1),
+    "sac.replay_ratio": POSITIVE,
+    "sac.discount": SHARE,
+    "sac.target_rate": SHARE,
+    "sac.initial_alpha": POSITIVE,
+    "sac.reward_scale": POSITIVE,
     "replay.capacity": Range(1),
     "replay.recent_share": SHARE,
     "replay.recent_records": Range(1),
@@ -119,10 +128,32 @@ def refuse_to_replace(config: RunConfig) -> None:
     )
 
 
-def updates_in(config: DreamerConfig, env_steps: int) -> int:
-    """Updates that the replay ratio asks for in a run of so many env_steps."""
-    model = config.model
-    return max(0, int((env_steps - config.prefill) * model.replay_ratio / (model.batch_size * model.batch_length)))
+class ReplayRatio(NamedTuple):
+    """How much a learner with a replay trains: so many records on per environment step made since the prefill.
+
+    Args:
+        ratio: records trained on per environment step.
+        records: that an update trains on.
+        prefill: env_steps collected before the first update.
+        setting: name of the ratio in the configuration.
+    """
+
+    ratio: float
+    records: int
+    prefill: int
+    setting: str
+
+    @classmethod
+    def of(cls, config: DreamerConfig | SACRunConfig) -> ReplayRatio:
+        """Read it off a configuration."""
+        if isinstance(config, SACRunConfig):
+            return cls(config.sac.replay_ratio, config.sac.batch_size, config.prefill, "sac.replay_ratio")
+        model = config.model
+        return cls(model.replay_ratio, model.batch_size * model.batch_length, config.prefill, "model.replay_ratio")
+
+    def updates(self, env_steps: int) -> int:
+        """Updates in a run of so many env_steps."""
+        return max(0, int((env_steps - self.prefill) * self.ratio / self.records))
 
 
 def check(config: RunConfig) -> None:
@@ -145,6 +176,26 @@ def check(config: RunConfig) -> None:
         raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
 
 
+def check_replay(config: DreamerConfig | SACRunConfig) -> None:
+    """Refuse settings with which there would be no update.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    if config.total_env_steps <= config.prefill:
+        raise ValueError(
+            f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
+            "first update: raise the one, or lower the other."
+        )
+    replay = ReplayRatio.of(config)
+    if not replay.updates(config.total_env_steps):
+        raise ValueError(
+            f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
+            f"prefill={config.prefill:,} asks for no whole update of {replay.records} records. "
+            "Raise total_env_steps or the ratio, or lower the prefill."
+        )
+
+
 def check_dreamer(config: DreamerConfig) -> None:
     """Refuse settings with which a world model could not learn.
 
@@ -152,12 +203,8 @@ def check_dreamer(config: DreamerConfig) -> None:
         ValueError: the message gives the numbers and the setting to change.
     """
     check(config)
+    check_replay(config)
     model = config.model
-    if config.total_env_steps <= config.prefill:
-        raise ValueError(
-            f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
-            "first update: raise the one, or lower the other."
-        )
     prefilled = config.prefill // config.env.num_envs
     if prefilled < model.batch_length:
         raise ValueError(
@@ -180,9 +227,20 @@ def check_dreamer(config: DreamerConfig) -> None:
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
         )
-    if not updates_in(config, config.total_env_steps):
-        raise ValueError(
-            f"model.replay_ratio={model.replay_ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
-            f"prefill={config.prefill:,} asks for no whole update of {model.batch_size * model.batch_length} records. "
-            "Raise total_env_steps or the ratio, or lower the prefill."
-        )
+
+
+ALGORITHMS = ("dreamer_v3", "ppo", "sac")
+
+
+def check_variant(config: ExperimentConfig) -> None:
+    """Refuse a run of an experiment that names nothing.
+
+    Raises:
+        ValueError: the message lists what there is.
+    """
+    for name, value, allowed in (
+        ("algorithm", config.algorithm, ALGORITHMS),
+        ("variant", config.variant, tuple(config.variants)),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")

@@ -75,11 +75,12 @@ def new_run_dir(recipe: str, track: str) -> Path:
     return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"
 
 
+def override_key(override: str) -> str:
+    """The setting that an override is of."""
+    return override.partition("=")[0].lstrip("+~")
+
+
 def merge_overrides(saved: Sequence[str], given: Sequence[str]) -> list[str]:
     """Overrides of a run that is continued: those it was started with, replaced by the ones given now."""
-
-    def key(override: str) -> str:
-        return override.partition("=")[0].lstrip("+~")
-
-    replaced = {key(override) for override in given}
-    return [override for override in saved if key(override) not in replaced] + list(given)
+    replaced = {override_key(override) for override in given}
+    return [override for override in saved if override_key(override) not in replaced] + list(given)

@@ -6,7 +6,7 @@ from enum import Enum
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from dreamer_racing.baselines import PPOConfig
+from dreamer_racing.baselines import PPOConfig, SACConfig
 
 
 @dataclass
@@ -98,6 +98,12 @@ class ReplayConfig:
     capacity: int = 250_000  # records, 12.3 KB each
     storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
     device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
+
+
+@dataclass
+class SequenceReplayConfig(ReplayConfig):
+    """The replay buffer of a world model."""
+
     held_out: int = 1  # worlds whose records are never trained on, to measure the model; 0 of a single world
     recent_share: float = 0.0  # of a batch's windows, drawn from the newest records
     recent_records: int = 20_000  # how many those are
@@ -135,6 +141,7 @@ class RunConfig:
     algorithm: str = MISSING  # the recipe
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
+    budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
     total_env_steps: int = 1_000_000  # control steps summed over environments
     rollout_steps: int = MISSING  # control steps of every environment between updates
     seed: int = 0
@@ -158,7 +165,7 @@ class DreamerConfig(RunConfig):
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
 
 
 @dataclass
@@ -178,6 +185,33 @@ class PPORunConfig(RunConfig):
     rollout_steps: int = 32
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+
+
+@dataclass
+class SACRunConfig(RunConfig):
+    """`recipes/sac.py`."""
+
+    algorithm: str = "sac"
+    prefill: int = 10_000  # env_steps collected before the first update
+    rollout_steps: int = 1
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+@dataclass
+class ExperimentConfig(RunConfig):
+    """`recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.
+
+    What all recipes have in common is set as with them: `track=`, `seed=`, `budget=`, `env.from_pixels=` ...
+    """
+
+    name: str = MISSING  # of the experiment
+    algorithm: str = "dreamer_v3"  # dreamer_v3 | ppo | sac
+    variant: str = "default"  # one of the following
+    variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the algorithm's recipe by name
+    overrides: list[str] = field(default_factory=list)  # of every run, e.g. "overrides=['loss.entropy_scale=1e-4']"
+    directory: str = "runs"
 
 
 @dataclass
@@ -213,6 +247,8 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(name="dreamer_v3_schema", node=DreamerConfig)
     store.store(name="ppo_schema", node=PPORunConfig)
+    store.store(name="sac_schema", node=SACRunConfig)
+    store.store(name="experiment_schema", node=ExperimentConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="export_schema", node=ExportConfig)
     for group, node in (

@@ -10,12 +10,12 @@ from typing import Any, ClassVar, TypeVar, cast
 import hydra
 import numpy as np
 import torch
-from arena import Environment, Report, crash_causes, is_race, make_report, scene_name
-from checks import check_overrides, refuse_to_replace
+from arena import Environment, Report, crash_causes, is_race, make_report, reward_terms, scene_name
+from checks import ReplayRatio, check_overrides, refuse_to_replace
 from command_line import CONFIG_DIR, choose_device, merge_overrides, new_run_dir, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from schema import RunConfig
+from schema import DreamerConfig, RunConfig, SACRunConfig, Storage
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -30,12 +30,20 @@ from dreamer_racing.checkpoint import (
     ensure_writable,
     latest_checkpoint,
 )
-from dreamer_racing.envs.curriculum import BodyRateCurriculum
+from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 from dreamer_racing.finite_guard import NonFiniteLossError
 from dreamer_racing.learner import Learner
-from dreamer_racing.memory import is_out_of_memory, keep_freed_memory, out_of_memory_advice
+from dreamer_racing.memory import (
+    available_memory,
+    check_fits,
+    is_out_of_memory,
+    keep_freed_memory,
+    out_of_memory_advice,
+)
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
+from dreamer_racing.modules import Interface
+from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.run_lock import RunLock
 from dreamer_racing.timing import RunClock
 
@@ -115,6 +123,33 @@ class Run:
         self.lock.release()
 
 
+@dataclass(kw_only=True)
+class ReplayRun(Run):
+    """A run whose learner makes updates by the replay ratio, from a replay of what was collected."""
+
+    replay: StreamReplay
+
+    @property
+    def updates_due(self) -> int:
+        """Updates that the replay ratio still owes for the environment steps made since the prefill."""
+        return max(0, ReplayRatio.of(self.config).updates(self.counters["env_steps"]) - self.counters["updates"])
+
+    def take_in(self, rollout: TensorDictBase) -> None:
+        """Store a rollout too."""
+        self.replay.extend(rollout)
+        super().take_in(rollout)
+
+    def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
+        """Make the updates that are due."""
+        for _ in range(self.updates_due):
+            if stop.requested:
+                return
+            with self.clock.timed("sample"):
+                batch = self.replay.sample()
+            self.metrics.push(self.learner.update(batch, self.clock.timed))
+            self.counters["updates"] += 1
+
+
 def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
     """Compose the configuration of a recipe, build its run, train it to its end.
 
@@ -154,7 +189,7 @@ def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
     """The configuration of the run to continue, with the overrides given now on top."""
     run_dir = latest_checkpoint(resume).parent.parent
-    saved = OmegaConf.load(run_dir / "config.yaml")
+    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
@@ -181,9 +216,10 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
 def resolve_network(config: DictConfig) -> None:
     """Choose the size of a baseline's networks by what they see."""
     if config.network.size == "auto":
-        config.network.size, sees = ("paper", "images") if config.env.from_pixels else ("small", "numbers")
-        print(f"network: {config.network.size} (network=auto, seeing {sees})")
-    numbers = OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml")
+        sees = "images" if config.env.from_pixels else "numbers"
+        config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
+        print(f"network: {config.network.size} (network=auto, seeing {sees}, budget={config.budget})")
+    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml"))
     for name in ("layers", "units"):
         if OmegaConf.is_missing(config.network, name):
             config.network[name] = numbers[name]
@@ -224,6 +260,53 @@ def make_collector(config: RunConfig, env: Environment, policy: TensorDictModule
         storing_device=env.device,
         track_traj_ids=False,
         no_cuda_sync=False,
+    )
+
+
+def make_run_replay(
+    config: DreamerConfig | SACRunConfig,
+    env: Environment,
+    curriculum: BodyRateCurriculum | None,
+    batch_size: int,
+    batch_length: int,
+    **windows: Any,
+) -> StreamReplay:
+    """Make the replay, on the learner's device if it has room there; say where and how large.
+
+    Args:
+        config: resolved.
+        env: whose records it is to hold.
+        curriculum: by which old rewards are relabelled, if they are.
+        batch_size: windows in a batch.
+        batch_length: records in a window.
+        windows: further arguments of `make_replay` on which windows are drawn.
+    """
+    settings, interface = config.replay, Interface.of(env)
+    numbers = interface.vector_dim + interface.privileged_dim
+    image = (64, 64, 3) if interface.pixels else (0,)
+    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers)
+    storage_device = settings.device
+    if storage_device == "auto":
+        on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
+        storage_device = config.device if on_learner else "cpu"
+    where = storage_device if settings.storage is Storage.tensor else "files"
+    if settings.storage is Storage.tensor:
+        check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
+    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
+    return make_replay(
+        settings.capacity,
+        config.env.num_envs,
+        batch_size,
+        batch_length,
+        config.device,
+        storage=settings.storage.value,
+        storage_device=storage_device,
+        seed=config.seed,
+        transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
+        observation_keys=interface.replay_keys,
+        reward_keys=reward_terms(env),
+        prefetch=2 if config.device != "cpu" and storage_device == "cpu" else None,
+        **windows,
     )
 
 

@@ -2,5 +2,6 @@
 
 from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize
 from dreamer_racing.baselines.ppo import PPOConfig, PPOLearner
+from dreamer_racing.baselines.sac import SACConfig, SACLearner
 
-__all__ = ["BaselinePolicy", "NetworkSize", "PPOConfig", "PPOLearner"]
+__all__ = ["BaselinePolicy", "NetworkSize", "PPOConfig", "PPOLearner", "SACConfig", "SACLearner"]

@@ -51,7 +51,7 @@ class ImageTrunk(nn.Module):
         super().__init__()
         self.convolutions = nn.Sequential(
             nn.Conv2d(3, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU(), nn.Conv2d(64, 64, 3, 1), nn.ReLU()
-        ).to(memory_format=torch.channels_last)
+        )
         with torch.no_grad():
             flat = self.convolutions(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE)).numel()
         self.linear = nn.Linear(flat, self.features)

@@ -1,0 +1,194 @@
+"""The SAC learner: networks, TorchRL's loss, and one gradient step on replayed transitions.
+
+Shape legend: B batch, A action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size
+from dreamer_racing.finite_guard import FiniteGuard
+from dreamer_racing.modules import Interface
+from dreamer_racing.timing import Timer, untimed
+
+
+@dataclass
+class SACConfig:
+    """Numbers of the learner.
+
+    Attributes:
+        learning_rate: Of Adam, for actor, critics and temperature.
+        batch_size: B, transitions.
+        replay_ratio: Transitions trained on per environment step.
+        discount: γ.
+        target_rate: Fraction by which the target critics move at each update.
+        initial_alpha: Temperature at the start; it is learned, towards an entropy of −A nats.
+        reward_scale: Factor on rewards.
+
+    Reference: Haarnoja et al. 2018, "Soft actor-critic algorithms and applications"; numbers of Stable-Baselines3, but
+    for the replay ratio, temperature and scale of rewards [choice].
+    """
+
+    learning_rate: float = 3e-4
+    batch_size: int = 256
+    replay_ratio: float = 4.0
+    discount: float = 0.99
+    target_rate: float = 0.005
+    initial_alpha: float = 0.1
+    reward_scale: float = 0.1
+
+
+class SACLearner:
+    """Actor and two critics with TorchRL's ``SACLoss``, and one optimiser.
+
+    Args:
+        size: Of all networks.
+        interface: What the agent sees and does.
+        config: Numbers of the learner.
+        device: Where the networks live and updates run.
+        seed: Of the initial weights; None takes them from the global generator.
+
+    Example:
+        >>> learner = SACLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
+        >>> learner.policy().in_keys
+        ['vector']
+    """
+
+    def __init__(
+        self,
+        size: NetworkSize,
+        interface: Interface,
+        config: SACConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        self.size = size
+        self.config = config or SACConfig()
+        self.device = torch.device(device)
+        self._keys = interface.observation_keys
+        with torch.random.fork_rng(devices=[], enabled=seed is not None):
+            if seed is not None:
+                torch.manual_seed(seed)
+            self.actor = _make_actor(interface, size).to(self.device)
+            critic = ObservationNetwork(interface, 1, size, with_action=True)
+            self._loss = SACLoss(
+                self.actor,
+                TensorDictModule(critic, critic.in_keys, ["state_action_value"]),
+                alpha_init=self.config.initial_alpha,
+                target_entropy=-float(interface.action_dim),
+                loss_function="l2",
+                deactivate_vmap=True,
+            ).to(self.device)
+        self._loss.make_value_estimator(gamma=self.config.discount)
+        self._targets = SoftUpdate(self._loss, tau=self.config.target_rate)
+        self._networks = {
+            "actor": list(self.actor.parameters()),
+            "critic": list(self._loss.qvalue_network_params.values(True, True)),
+        }
+        trained = [*self._networks["actor"], *self._networks["critic"], self._loss.log_alpha]
+        self.optimizer = torch.optim.Adam(trained, lr=self.config.learning_rate, fused=True)
+        self.updates = 0
+        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
+
+    def policy(self, deterministic: bool = False) -> BaselinePolicy:
+        """Return the acting step, which shares this learner's parameters."""
+        return BaselinePolicy(self.actor, deterministic)
+
+    def update(self, windows: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Make one gradient step.
+
+        Args:
+            windows: Replay records ``[B, 2]``, see `transitions`.
+            timed: Context manager by activity (``optimise``).
+
+        Returns:
+            Losses and diagnostics, scalar tensors on the device.
+
+        Raises:
+            NonFiniteLossError: If a loss or gradient is not finite.
+        """
+        with timed("optimise"):
+            batch = self.transitions(windows.to(self.device, non_blocking=True))
+            outputs = self._loss(batch)
+            total = outputs["loss_actor"] + outputs["loss_qvalue"] + outputs["loss_alpha"]
+            self.optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            norms = {
+                f"gradient_norm/{name}": nn.utils.get_total_norm([p.grad for p in parameters])
+                for name, parameters in self._networks.items()
+            }
+            metrics = {name: value.detach() for name, value in ({**outputs} | norms | {"loss": total}).items()}
+            self._guard.check(metrics, batch)
+            self.optimizer.step()
+            self._targets.step()
+        self.updates += 1
+        return metrics
+
+    def transitions(self, windows: TensorDictBase) -> TensorDict:
+        """Make transitions ``[B]`` of windows of two records.
+
+        Where the second record begins an episode there was no transition from the first: its weight is 0.
+        """
+        before, after = windows[:, 0], windows[:, 1]
+        following = {key: after.get(key) for key in self._keys}
+        following |= {key: after.get(key) for key in ("terminated", "truncated")}
+        following["done"] = following["terminated"] | following["truncated"]
+        following["reward"] = after.get("reward") * self.config.reward_scale
+        observation = {key: before.get(key) for key in self._keys}
+        return TensorDict(
+            {
+                **observation,
+                "action": after.get("previous_action"),
+                "next": following,
+                "priority_weight": (~after.get("is_init").squeeze(-1)).float(),
+            },
+            windows.batch_size[:1],
+        )
+
+    def check_finite(self) -> None:
+        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
+        self._guard.settle()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        return {
+            "size": asdict(self.size),
+            "loss": self._loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned.
+
+        Raises:
+            ValueError: If it is that of networks of another size; nothing is changed then.
+        """
+        check_size(state_dict["size"], self.size)
+        self._loss.load_state_dict(state_dict["loss"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate  # a setting of this learner, not state
+        self.updates = state_dict["updates"]
+
+
+def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
+    """Make a normal whose mean and deviation depend on what is seen, squashed into [−1, 1]."""
+    network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
+    return ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(network, network.in_keys, ["parameters"]),
+            TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )

@@ -1,0 +1,76 @@
+"""SAC on the drone race, the paper's second baseline: collect → replay → update.
+
+    python recipes/sac.py track=kidney
+    python recipes/sac.py track=circle env.from_pixels=false
+    python recipes/sac.py resume=runs/sac_kidney_20260101-120000
+
+Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import hydra
+from arena import make_env, make_learner
+from checks import check, check_replay
+from omegaconf import DictConfig
+from schema import SACRunConfig, register
+from training import (
+    ReplayRun,
+    assemble,
+    launch,
+    make_collector,
+    make_curriculum,
+    make_run_replay,
+    resolve_common,
+    resolve_network,
+    seed_generators,
+)
+
+from dreamer_racing.baselines import SACLearner
+from dreamer_racing.modules import Interface
+
+NUM_ENVS = {"pixels": 64, "state": 256}
+TRANSITION = 2  # records of a window: what was seen before an action, and after it
+
+register()
+
+
+@dataclass(kw_only=True)
+class SACRun(ReplayRun):
+    """A run with a replay of transitions."""
+
+    config: SACRunConfig
+    learner: SACLearner
+
+    remedy: ClassVar[str] = "sac.learning_rate"
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="sac")
+def main(config: DictConfig) -> None:
+    """Compose the configuration, build the run, train."""
+    launch(config, resolve, build)
+
+
+def resolve(config: DictConfig) -> DictConfig:
+    """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
+    resolve_common(config, NUM_ENVS["pixels" if config.env.from_pixels else "state"])
+    resolve_network(config)
+    return config
+
+
+def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
+    """Make all parts of the run, restored from a checkpoint if it continues one."""
+    check(config)
+    check_replay(config)
+    env = make_env(config)
+    learner = make_learner(config, Interface.of(env), config.device)
+    seed_generators(config.seed)
+    collector = make_collector(config, env, learner.policy())
+    curriculum = make_curriculum(config)
+    replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
+    return assemble(SACRun, config, overrides, env, learner, collector, curriculum, replay=replay)
+
+
+if __name__ == "__main__":
+    main()
