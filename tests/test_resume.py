@@ -22,8 +22,15 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-def train(directory: Path, steps: int, *overrides: str) -> None:
-    command = [sys.executable, str(ROOT / "recipes" / "dreamer_v3.py"), *overrides, f"total_env_steps={steps}"]
+BASELINE = [
+    "env.from_pixels=false", "network.units=16", "env.num_envs=4", "env.episode_steps=40", "evaluation.every=500",
+    "evaluation.episodes=1", "checkpoint.every=0", "logger.every=400", "logger=csv", "device=cpu",
+    "curriculum.threshold=-100", "curriculum.cooldown=3",
+]  # fmt: skip
+
+
+def train(directory: Path, steps: int, *overrides: str, recipe: str = "dreamer_v3") -> None:
+    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *overrides, f"total_env_steps={steps}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         command, cwd=directory, env=environment, capture_output=True, text=True, timeout=300, check=False
@@ -73,4 +80,24 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     assert learner_updates(whole) - learner_updates(before) >= 200
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {"learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "random_state"}
+    assert_same(whole, parted, "checkpoint")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("recipe", "overrides"),
+    [
+        ("ppo", ["rollout_steps=16", "ppo.epochs=2"]),
+        ("sac", ["prefill=64", "replay.capacity=1200", "sac.batch_size=16"]),
+    ],
+    ids=["ppo", "sac"],
+)
+def test_a_resumed_baseline_equals_an_uninterrupted_one(recipe: str, overrides: list[str], tmp_path: Path) -> None:
+    settings = [*BASELINE, *overrides, "track=circle", "env=faithful"]
+    train(tmp_path, 2048, *settings, "run_dir=whole", recipe=recipe)
+    train(tmp_path, 1024, *settings, "run_dir=parted", recipe=recipe)
+    before = parts(tmp_path / "parted")
+    train(tmp_path, 2048, "resume=parted", recipe=recipe)
+    whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
+    assert learner_updates(whole) - learner_updates(before) >= 200
     assert_same(whole, parted, "checkpoint")
