@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
-from test_recipes import ROOT, compose, recipe_module, rows
+
+from tests.running_recipes import ROOT, compose, recipe_module, rows
 
 
 def settings(directory: Path, *overrides: str) -> DictConfig:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import importlib
 import json
 import math
 import signal
@@ -11,9 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
-import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -21,9 +17,8 @@ from omegaconf import OmegaConf
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
-ROOT = Path(__file__).parents[1]
-CONFIG = ROOT / "recipes" / "config"
 SMALL = [
     "track=circle", "model=debug", "env.num_envs=4", "prefill=400", "total_env_steps=800", "replay.capacity=4000",
     "evaluation.every=400", "evaluation.episodes=2", "evaluation.video_steps=60", "checkpoint.every=400",
@@ -41,22 +36,6 @@ TINY = [
 AT_THE_END = "evaluation.every=1000000"
 
 
-def recipe(
-    name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
-) -> subprocess.CompletedProcess[str]:
-    """Run a recipe as a user does, or after some lines of Python."""
-    path = str(ROOT / "recipes" / f"{name}.py")
-    start = f"import runpy, sys\nsys.path.insert(0, {str(Path(path).parent)!r})\n{before}\nsys.argv[0] = {path!r}\n"
-    program = ["-c", f"{start}runpy.run_path({path!r}, run_name='__main__')"] if before else [path]
-    command = [sys.executable, *program, *overrides]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
-
-
-def rows(run_dir: Path) -> list[dict[str, str]]:
-    with (run_dir / "metrics.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run."""
@@ -65,21 +44,6 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "device: cpu (device=auto)" in done.stdout and "renderer: " in done.stdout and "GB when full" in done.stdout
     return directory
-
-
-def recipe_module(name: str) -> ModuleType:
-    """A module of the recipes' folder, which is no package."""
-    sys.path.insert(0, str(ROOT / "recipes"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.pop(0)
-
-
-def compose(recipe_name: str, *overrides: str) -> OmegaConf:
-    recipe_module("schema").register()
-    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
-        return hydra.compose(recipe_name, overrides=list(overrides))
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")

@@ -19,7 +19,11 @@ def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> N
 
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
-    code = f"from dreamer_racing.run_lock import RunLock; lock = RunLock({str(tmp_path)!r}); print('held', flush=True); input()"
+    code = f"""if True:
+        from dreamer_racing.run_lock import RunLock
+        lock = RunLock({str(tmp_path)!r})
+        print("held", flush=True)
+        input()"""
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"held\n"
         with pytest.raises(ValueError, match=f"process {process.pid} "):
