@@ -48,6 +48,12 @@ def scene_name(config: DreamerConfig) -> str:
     return config.track if is_race(config) else config.task
 
 
+def camera_of(config: DreamerConfig) -> Camera:
+    """The nose camera."""
+    side = config.env.image_size
+    return Camera(width=side, height=side, tilt=config.env.camera_tilt)
+
+
 def worlds_of(config: DreamerConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run."""
     env = config.env
@@ -55,7 +61,7 @@ def worlds_of(config: DreamerConfig) -> dict[str, Any]:
         "track": config.track,
         "preset": env.preset,
         "renderer": env.renderer,
-        "camera": Camera(tilt=env.camera_tilt),
+        "camera": camera_of(config),
     }
 
 
@@ -81,7 +87,9 @@ def make_env(config: DreamerConfig, num_envs: int | None = None) -> Environment:
             f"loss.world_model={config.loss.world_model} decodes the race's privileged state, which env=dmc does not "
             "have: choose another loss, e.g. loss=reconstruction."
         )
-    return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, seed=config.seed)
+    return ControlSuiteEnv(
+        config.task, num_envs, from_pixels=env.from_pixels, image_size=env.image_size, seed=config.seed
+    )
 
 
 def make_report(
@@ -91,7 +99,8 @@ def make_report(
     if is_race(config):
         worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels}
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
-    env = ControlSuiteEnv(config.task, min(8, episodes), from_pixels=config.env.from_pixels, seed=config.seed + 1)
+    sight = {"from_pixels": config.env.from_pixels, "image_size": config.env.image_size}
+    env = ControlSuiteEnv(config.task, min(8, episodes), seed=config.seed + 1, **sight)
     return ReturnReport(directory, learner, env, episodes, video_steps)
 
 

@@ -13,6 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
+from dreamer_racing.modules import get_size
+from dreamer_racing.modules.encoder import smallest_map
 
 
 class Range(NamedTuple):
@@ -123,6 +125,7 @@ def check(config: DreamerConfig) -> None:
         if value is not None and value not in allowed:
             raise ValueError(f"{name}={value}: must be {allowed}.")
     model = config.model
+    check_image_size(config.env.image_size, model.size)
     if config.total_env_steps <= config.prefill:
         raise ValueError(
             f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
@@ -163,3 +166,16 @@ def check(config: DreamerConfig) -> None:
             f"prefill={config.prefill:,} asks for no whole update of {model.batch_size * model.batch_length} records. "
             "Raise total_env_steps or the ratio, or lower the prefill."
         )
+
+
+def check_image_size(image_size: int, size: str) -> None:
+    """Refuse images that networks of that size cannot halve.
+
+    Raises:
+        ValueError: the message says which they can.
+    """
+    shape = get_size(size)
+    try:
+        smallest_map(image_size, shape.cnn_patch, len(shape.cnn_multipliers))
+    except ValueError as error:
+        raise ValueError(f"env.{error}") from error
