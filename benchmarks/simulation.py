@@ -109,12 +109,16 @@ def measure(
 ) -> dict[str, Any]:
     """Return one record."""
     torch.set_num_threads(1)
-    sight = {
-        "from_pixels": images != "none",
-        "renderer": "auto" if images in ("none", "cuda") else images,
-        "camera": Camera(width=image_size, height=image_size),
-    }
-    env = DroneRacingEnv(track, num_envs, privileged=False, seed=0, **sight, **settings)
+    env = DroneRacingEnv(
+        track,
+        num_envs,
+        from_pixels=images != "none",
+        renderer="auto" if images in ("none", "cuda") else images,
+        camera=Camera(width=image_size, height=image_size),
+        privileged=False,
+        seed=0,
+        **settings,
+    )
     batch = ROLLOUT * num_envs
     options = {"frames_per_batch": batch, "total_frames": -1, "track_traj_ids": False, "no_cuda_sync": True}
     collector = Collector(env, RandomPolicy(env.action_spec), **options)

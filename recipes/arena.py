@@ -99,8 +99,13 @@ def make_report(
     if is_race(config):
         worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels}
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
-    sight = {"from_pixels": config.env.from_pixels, "image_size": config.env.image_size}
-    env = ControlSuiteEnv(config.task, min(8, episodes), seed=config.seed + 1, **sight)
+    env = ControlSuiteEnv(
+        config.task,
+        min(8, episodes),
+        from_pixels=config.env.from_pixels,
+        image_size=config.env.image_size,
+        seed=config.seed + 1,
+    )
     return ReturnReport(directory, learner, env, episodes, video_steps)
 
 
