@@ -51,6 +51,7 @@ def main() -> None:
     parser.add_argument("--backends", nargs="*", default=["eager"], help="eager | compile | graph | compile+graph")
     parser.add_argument("--batch", nargs=2, type=int, default=(8, 32), metavar=("B", "T"))
     parser.add_argument("--horizon", type=int, default=15)
+    parser.add_argument("--image-size", type=int, default=64, help="pixels; peers keep to 64")
     parser.add_argument("--mixed-precision", action="store_true", help="bfloat16 autocast")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
@@ -66,7 +67,7 @@ def main() -> None:
     shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
     prepare = None if arguments.return_freed_memory else keep_freed_memory
     jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
-        (measure, (size, loss, actor, backend, arguments.mixed_precision, *shared), prepare)
+        (measure, (size, loss, actor, backend, arguments.mixed_precision, arguments.image_size, *shared), prepare)
         for size in arguments.sizes
         for loss in arguments.losses
         for actor in arguments.actor_losses
@@ -94,6 +95,7 @@ def measure(
     actor: str,
     backend: str,
     mixed_precision: bool,
+    image_size: int,
     batch: tuple[int, int],
     horizon: int,
     device: str,
@@ -112,8 +114,8 @@ def measure(
         compile="compile" in backend,
         cuda_graph="graph" in backend,
     )
-    learner = DreamerLearner(size, Interface(privileged_dim=PRIVILEGED_DIM), config, device, seed=0)
-    replay = filled_replay(batch, device)
+    learner = DreamerLearner(size, interface_of(image_size), config, device, seed=0)
+    replay = filled_replay(batch, device, image_size)
     samples = [seconds(replay.sample, device) for _ in range(5)]
     data = replay.sample()
     start = time.perf_counter()
@@ -126,27 +128,33 @@ def measure(
     median = statistics.median(times)
     memory = peak_memory(device)
     limit = matmul_speed(device, torch.bfloat16 if mixed_precision else torch.float32)
-    flops = count_flops(size, loss, actor, batch, horizon)
+    flops = dry_update(size, loss, actor, batch, horizon, image_size)[0]
     return {
         "benchmark": "learner", "size": size, "loss": loss, "actor": actor,
         "backend": backend + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
-        "horizon": horizon, "parameters": parameters(learner), "s": median, "s_min": min(times), "s_first": first,
+        "horizon": horizon, "image_size": image_size, "parameters": parameters(learner),
+        "s": median, "s_min": min(times), "s_first": first,
         "calls": count_calls(learner, data) if backend == "eager" else None, "GFLOP": flops / 1e9,
         "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
         "sample_share": statistics.median(samples) / median, "memory": memory,
     }  # fmt: skip
 
 
-def filled_replay(batch: tuple[int, int], device: str, streams: int = 8) -> Any:
+def interface_of(image_size: int) -> Interface:
+    """Return what the agent sees and does here."""
+    return Interface(image_size=image_size, privileged_dim=PRIVILEGED_DIM)
+
+
+def filled_replay(batch: tuple[int, int], device: str, image_size: int = 64, streams: int = 8) -> Any:
     """Return a replay of random records that delivers batches [B, T] on a device."""
     replay = make_replay(
         streams * batch[1] * 2, streams, *batch, device, observation_keys=["pixels", ("privileged", "vector")]
     )
-    replay.extend(random_rollout(streams, batch[1] * 2))
+    replay.extend(random_rollout(streams, batch[1] * 2, image_size))
     return replay
 
 
-def random_rollout(streams: int, steps: int) -> TensorDict:
+def random_rollout(streams: int, steps: int, image_size: int = 64) -> TensorDict:
     """Return what a collector would yield, [streams, steps], with an episode's end in 50 steps or so."""
     generator = torch.Generator().manual_seed(0)
     shape = (streams, steps)
@@ -155,7 +163,7 @@ def random_rollout(streams: int, steps: int) -> TensorDict:
         return torch.randn(*shape, *sizes, generator=generator)
 
     def image() -> Tensor:
-        return torch.randint(0, 256, (*shape, 64, 64, 3), dtype=torch.uint8, generator=generator)
+        return torch.randint(0, 256, (*shape, image_size, image_size, 3), dtype=torch.uint8, generator=generator)
 
     done = torch.rand(*shape, 1, generator=generator) < 0.02
     arrived = TensorDict(
@@ -209,18 +217,15 @@ def matmul_speed(device: str, dtype: torch.dtype) -> float:
     return 2 * side**3 / min(seconds(lambda: left @ right, device) for _ in range(5))
 
 
-def count_flops(size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int) -> int:
-    """Count the FLOPs of the losses and their gradients, on the meta device: nothing is computed."""
-    return dry_update(size, loss, actor, batch, horizon)[0]
-
-
-def dry_update(size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int) -> tuple[int, int, int]:
+def dry_update(
+    size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, image_size: int = 64
+) -> tuple[int, int, int]:
     """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
     config = LearnerConfig(*batch, horizon, world_model_loss=loss, actor_loss=actor)
     with torch.device("meta"):
-        learner = DreamerLearner(get_size(size), Interface(privileged_dim=PRIVILEGED_DIM), config, "meta")
+        learner = DreamerLearner(get_size(size), interface_of(image_size), config, "meta")
         records: dict[Any, Tensor] = {
-            "pixels": torch.empty(*batch, 64, 64, 3, dtype=torch.uint8),
+            "pixels": torch.empty(*batch, image_size, image_size, 3, dtype=torch.uint8),
             ("privileged", "vector"): torch.empty(*batch, PRIVILEGED_DIM),
             "previous_action": torch.empty(*batch, 4),
             "reward": torch.empty(*batch, 1),

@@ -38,6 +38,7 @@ from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
 from dreamer_racing.envs.partial_reset import TransformedPixelEnv
+from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
@@ -62,6 +63,7 @@ def main() -> None:
     parser.add_argument("--preset", default="easy")
     parser.add_argument("--images", nargs="*", help="of none egl osmesa warp warp_cuda cuda; default: the device's")
     parser.add_argument("--looks", default="nominal", help="nominal | randomised")
+    parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--num-envs", nargs="*", type=int, help="N to try")
     parser.add_argument("--actor", help="size of the DreamerV3 policy; default: cpu_small, on cuda size12m")
     parser.add_argument("--seconds", type=float, default=1.5, help="least time of a measurement")
@@ -93,17 +95,29 @@ def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
         for num_envs in arguments.num_envs or (state if images == "none" else pixels):
             device = "cpu" if images == "warp_cuda" else arguments.device
             settings = {"preset": arguments.preset, "device": device, "looks": arguments.looks}
-            yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds
+            yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds, arguments.image_size
 
 
 def measure(
-    images: str, num_envs: int, track: str, settings: dict[str, Any], actor: str, seconds: float
+    images: str,
+    num_envs: int,
+    track: str,
+    settings: dict[str, Any],
+    actor: str,
+    seconds: float,
+    image_size: int = 64,
 ) -> dict[str, Any]:
     """Return one record."""
     torch.set_num_threads(1)
-    renderer = "auto" if images in ("none", "cuda") else images
     env = DroneRacingEnv(
-        track, num_envs, from_pixels=images != "none", renderer=renderer, privileged=False, seed=0, **settings
+        track,
+        num_envs,
+        from_pixels=images != "none",
+        renderer="auto" if images in ("none", "cuda") else images,
+        camera=Camera(width=image_size, height=image_size),
+        privileged=False,
+        seed=0,
+        **settings,
     )
     batch = ROLLOUT * num_envs
     options = {"frames_per_batch": batch, "total_frames": -1, "track_traj_ids": False, "no_cuda_sync": True}
@@ -124,8 +138,8 @@ def measure(
     rates["actor"] = speed(acting(env, actor, options), batch, seconds, env.device)
     return {
         "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
-        "actor_size": actor, **rates, "lost": 1 - rates["collector"] / rates["worlds"], **split,
-        "memory_gib": peak_gib(env.device),
+        "image_size": image_size, "actor_size": actor, **rates,
+        "lost": 1 - rates["collector"] / rates["worlds"], **split, "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
 

@@ -25,7 +25,6 @@ from dreamer_racing.checkpoint import ensure_writable, load_components
 from dreamer_racing.export_parity import ACTION_TOLERANCE, Flight, TorchActor, check_parity, check_steps
 from dreamer_racing.learner import Agent
 from dreamer_racing.modules import Interface, ModelSize, join_features
-from dreamer_racing.modules.encoder import IMAGE_SIZE
 from dreamer_racing.modules.rssm import mix_uniform
 from dreamer_racing.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
 
@@ -87,7 +86,7 @@ class ActorStep(nn.Module):
         """Step.
 
         Args:
-            observation: uint8 ``(1, 64, 64, 3)``, or float32 ``(1, V)``.
+            observation: uint8 ``(1, height, width, 3)``, or float32 ``(1, V)``.
             h: Belief after the last step, ``(1, D)``; like the next two ignored where ``is_init``.
             z: State after the last step, ``(1, S)``.
             previous_action: ``(1, A)``.
@@ -103,7 +102,7 @@ class ActorStep(nn.Module):
         """Return inputs by name, in the order of ``forward``."""
         size, interface = self.size, self.interface
         seen = (
-            {"image_u8": torch.zeros(1, IMAGE_SIZE, IMAGE_SIZE, 3, dtype=torch.uint8)}
+            {"image_u8": torch.zeros(1, *interface.image_shape, dtype=torch.uint8)}
             if interface.pixels
             else {"vector": torch.zeros(1, interface.vector_dim)}
         )

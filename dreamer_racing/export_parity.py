@@ -37,7 +37,7 @@ class Flight:
     """A recorded flight of T steps.
 
     Attributes:
-        observations: uint8 ``(T, 64, 64, 3)`` or float32 ``(T, V)``.
+        observations: uint8 ``(T, height, width, 3)`` or float32 ``(T, V)``.
         is_init: Whether each step is its episode's first, bool ``(T,)``.
         actions: What the policy did, ``(T, A)``.
     """

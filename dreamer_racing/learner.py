@@ -323,7 +323,7 @@ class DreamerLearner:
         """Reconstruct the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
 
         Returns:
-            Images uint8 ``(B, T, 64, 64, 3)``.
+            Images uint8 ``(B, T, height, width, 3)``.
 
         Raises:
             ValueError: If the world model has no image decoder.
@@ -337,6 +337,7 @@ class DreamerLearner:
         """Return everything that the next update depends on, but for the global random generators."""
         return {
             "size": asdict(self.size),
+            "image_size": self.agent.interface.image_size,
             "agent": self.agent.state_dict(),
             "losses": {name: _own_state(loss) for name, loss in self.losses.items()},
             "optimizer": self.optimizer.state_dict(),
@@ -369,6 +370,13 @@ class DreamerLearner:
 
     def _check_parts(self, saved: dict[str, Any]) -> None:
         """Refuse networks or losses of other parameters than these."""
+        # Older checkpoints do not say: their images were of the default size.
+        there, here = saved.get("image_size", Interface.image_size), self.agent.interface.image_size
+        where = (
+            "in an environment of other observations or actions"
+            if there == here
+            else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
+        )
         parts = {"networks": (self.agent.state_dict(), saved["agent"])}
         parts |= {f"{name} loss": (_own_state(loss), saved["losses"][name]) for name, loss in self.losses.items()}
         for part, (wanted, found) in parts.items():
@@ -383,7 +391,7 @@ class DreamerLearner:
                 if value.shape != found[key].shape:
                     raise ValueError(
                         f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
-                        f"{list(value.shape)}: it was trained in an environment of other observations or actions."
+                        f"{list(value.shape)}: it was trained {where}."
                     )
 
     def _trained_parameters(self) -> dict[str, list[nn.Parameter]]:

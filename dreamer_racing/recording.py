@@ -175,26 +175,25 @@ def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, ga
 
     Args:
         track: the track.
-        trajectory: a recorded episode of K steps with images, whose height and width divide `size`.
-        size: side of either picture, pixels.
+        trajectory: a recorded episode of K steps with square images.
+        size: least side of either picture, pixels: images are enlarged to it, or just beyond, by a whole factor.
         gap: between them, pixels.
 
     Returns:
-        (K + 1, size, 2 size + gap, 3) uint8.
+        (K + 1, side, 2 side + gap, 3) uint8.
 
     Raises:
-        ValueError: no images, or of a size that cannot be enlarged to this one.
+        ValueError: no images, or images that are not square.
     """
     if trajectory.pixels is None:
         raise ValueError("the trajectory has no images: record it in an environment with from_pixels=True.")
     height, width = trajectory.pixels.shape[1:3]
-    if height != width or size % height:
-        raise ValueError(
-            f"images of {height} × {width} pixels cannot be enlarged to {size} × {size} by a whole factor."
-        )
-    view = _enlarge(trajectory.pixels.numpy(), size // height)
-    between = np.full((len(view), size, gap, 3), 255, dtype=np.uint8)
-    return np.concatenate((view, between, top_down_frames(track, trajectory, size)), axis=2)
+    if height != width:
+        raise ValueError(f"images of {height} × {width} pixels do not fit beside a square map.")
+    view = _enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
+    side = view.shape[1]
+    between = np.full((len(view), side, gap, 3), 255, dtype=np.uint8)
+    return np.concatenate((view, between, top_down_frames(track, trajectory, side)), axis=2)
 
 
 def _map_of(track: Track, size: int, positions: np.ndarray) -> tuple[Image.Image, np.ndarray]:

@@ -50,6 +50,12 @@ def scene_name(config: RunConfig) -> str:
     return config.track if is_race(config) else config.task
 
 
+def camera_of(config: RunConfig) -> Camera:
+    """The nose camera."""
+    side = config.env.image_size
+    return Camera(width=side, height=side, tilt=config.env.camera_tilt)
+
+
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run."""
     env = config.env
@@ -57,7 +63,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "track": config.track,
         "preset": env.preset,
         "renderer": env.renderer,
-        "camera": Camera(tilt=env.camera_tilt),
+        "camera": camera_of(config),
     }
 
 
@@ -84,7 +90,9 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             f"loss.world_model={loss} decodes the race's privileged state, which env=dmc does not "
             "have: choose another loss, e.g. loss=reconstruction."
         )
-    return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, seed=config.seed)
+    return ControlSuiteEnv(
+        config.task, num_envs, from_pixels=env.from_pixels, image_size=env.image_size, seed=config.seed
+    )
 
 
 def make_report(

@@ -15,6 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
+from dreamer_racing.modules import get_size
+from dreamer_racing.modules.encoder import smallest_map
 
 
 class Range(NamedTuple):
@@ -204,6 +206,7 @@ def check_dreamer(config: DreamerConfig) -> None:
     """
     check(config)
     check_replay(config)
+    check_image_size(config.env.image_size, config.model.size)
     model = config.model
     prefilled = config.prefill // config.env.num_envs
     if prefilled < model.batch_length:
@@ -227,6 +230,19 @@ def check_dreamer(config: DreamerConfig) -> None:
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
         )
+
+
+def check_image_size(image_size: int, size: str) -> None:
+    """Refuse images that networks of that size cannot halve.
+
+    Raises:
+        ValueError: the message says which they can.
+    """
+    shape = get_size(size)
+    try:
+        smallest_map(image_size, shape.cnn_patch, len(shape.cnn_multipliers))
+    except ValueError as error:
+        raise ValueError(f"env.{error}") from error
 
 
 ALGORITHMS = ("dreamer_v3", "ppo", "sac")

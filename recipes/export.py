@@ -13,13 +13,12 @@ from typing import cast
 
 import hydra
 import torch
-from arena import is_race, trained_config
+from arena import camera_of, is_race, trained_config
 from command_line import plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
 from schema import DreamerConfig, ExportConfig, register
 
 from dreamer_racing.checkpoint import latest_checkpoint
-from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import (
     LATENTS,
@@ -86,7 +85,7 @@ def prepare(
         preset=trained.env.preset,
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
-        camera=Camera(tilt=trained.env.camera_tilt),
+        camera=camera_of(trained),
         renderer=config.renderer,
         num_threads=1,
     )

@@ -22,6 +22,7 @@ class EnvConfig:
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
     from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
+    image_size: int = 64  # pixels, side of the images: a multiple of 16, by which the networks divide it
     camera_tilt: float = 25.0  # degrees upwards
 
 
@@ -95,7 +96,7 @@ class Storage(Enum):
 class ReplayConfig:
     """The replay buffer."""
 
-    capacity: int = 250_000  # records, 12.3 KB each
+    capacity: int = 250_000  # records, 12.3 KB each at image_size 64
     storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
     device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
 

@@ -283,7 +283,7 @@ def make_run_replay(
     """
     settings, interface = config.replay, Interface.of(env)
     numbers = interface.vector_dim + interface.privileged_dim
-    image = (64, 64, 3) if interface.pixels else (0,)
+    image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers)
     storage_device = settings.device
     if storage_device == "auto":

@@ -524,10 +524,11 @@ def recipe(name: str, *overrides: str, cwd: Path, before: str = "") -> subproces
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished debug run, of a loss that has no image decoder."""
+    """A finished debug run on small images, of a loss that has no image decoder."""
     directory = tmp_path_factory.mktemp("runs") / "first run"
     done = recipe(
         "dreamer_v3", "track=circle", "model=debug", "loss=privileged", "env.preset=faithful", "env.camera_tilt=30",
+        "env.image_size=32",
         "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000", "evaluation.every=0",
         f"run_dir='{directory}'", cwd=directory.parent,
     )  # fmt: skip
@@ -550,9 +551,11 @@ def test_the_recipe_exports_a_run(run_dir: Path) -> None:
     contract = json.loads((folder / "contract.json").read_text())
     assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == 0.02
     assert contract["source"]["env_steps"] == 160 and contract["verification"]["episodes"] >= 4
-    agent, _ = load_agent(run_dir, Interface())
+    assert (contract["camera"]["width_px"], contract["camera"]["height_px"]) == (32, 32)
+    assert contract["camera"]["focal_length_px"] == pytest.approx(16.0)  # 90° of view: half the height
+    agent, _ = load_agent(run_dir, Interface(image_size=32))
     assert contract["weights_sha256"] == hash_weights(ActorStep(agent))
-    assert onnx_actor.OnnxActor(folder / "actor.onnx").step(np.zeros((64, 64, 3), np.uint8)).shape == (4,)
+    assert onnx_actor.OnnxActor(folder / "actor.onnx").step(np.zeros((32, 32, 3), np.uint8)).shape == (4,)
     assert OmegaConf.load(run_dir / "config.yaml").env.camera_tilt == 30.0
 
 

@@ -177,6 +177,52 @@ def test_state_of_another_environment_is_refused(there, here):
     assert_refused(learner_of("reconstruction", 1, **there), learner_of("reconstruction", 2, **here), "environment")
 
 
+def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
+    """Names and shapes of all that depends on the images' size, as checkpoints have them since the first."""
+    learner = DreamerLearner("debug", config=CONFIG, seed=1)
+    saved = learner.state_dict()
+    shapes = {key: list(value.shape) for key, value in saved["agent"].items() if value.ndim > 1}
+    expected = {
+        "encoder.encoders.pixels.convolutions.0.weight": [2, 12, 4, 4],
+        "encoder.encoders.pixels.convolutions.1.weight": [4, 2, 4, 4],
+        "encoder.encoders.pixels.convolutions.2.weight": [8, 4, 4, 4],
+        "rssm.posterior_hidden.second.weight": [16, 128],
+        "decoder.projection.linear.weight": [128, 48],
+        "decoder.convolutions.0.weight": [8, 4, 4, 4],
+        "decoder.convolutions.1.weight": [4, 2, 4, 4],
+        "decoder.convolutions.2.weight": [2, 12, 4, 4],
+    }
+    for key, shape in expected.items():
+        assert shapes[f"world_model.{key}"] == shape, key
+    assert not [key for key in shapes if ".encoder." in key or ".decoder." in key if key[12:] not in expected]
+    del saved["image_size"]  # which older checkpoints do not have
+    resumed = DreamerLearner("debug", config=CONFIG, seed=2)
+    resumed.load_state_dict(saved)
+    for key, value in resumed.agent.state_dict().items():
+        assert torch.equal(value, saved["agent"][key]), key
+
+
+@pytest.mark.parametrize("loss", ["reconstruction", "decoder_free"])
+def test_state_of_another_image_size_is_refused(loss):
+    small, large = learner_of(loss, 1, image_size=32), learner_of(loss, 2, image_size=96)
+    assert_refused(small, large, "images of 32 × 32 pixels, not 96 × 96: choose env.image_size=32")
+    older = small.state_dict() | {"agent": learner_of(loss, 3).agent.state_dict()}
+    del older["image_size"]
+    with pytest.raises(ValueError, match="64 × 64 pixels, not 96 × 96"):
+        large.load_state_dict(older)
+
+
+@pytest.mark.parametrize("image_size", [32, 96])
+def test_every_image_size_updates(image_size):
+    learner = learner_of("reconstruction", 0, image_size=image_size)
+    batch = make_batch()
+    batch["pixels"] = batch["pixels"].repeat(1, 1, 2, 2, 1)[:, :, :image_size, :image_size]
+    metrics = learner.update(batch)
+    assert metrics["loss"].isfinite()
+    torch.testing.assert_close(metrics["loss_image"], metrics["image_error"] * image_size**2 * 3)
+    assert learner.open_loop(batch, context=2).shape == (3, 6, image_size, image_size, 3)
+
+
 def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
     torch.manual_seed(3)
     expected = torch.rand(1)

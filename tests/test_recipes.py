@@ -165,6 +165,7 @@ REFUSED = [
     (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
     (["model.batch_length=1"], ["model.batch_length=1", "at least 2"]),
     (["model.learning_rate=-1"], ["model.learning_rate=-1", "above 0"]),
+    (["env.image_size=40"], ["env.image_size=40", "multiple of 16", "32, 64 or 96"]),
     (["loss.discount=1.5"], ["loss.discount=1.5", "at least 0 and at most 1"]),
     (["checkpoint.keep=0"], ["checkpoint.keep=0", "at least 1"]),
     (["loss.world_model=nowhere:Loss"], ["nowhere:Loss", "cannot be imported"]),
@@ -278,6 +279,17 @@ def test_a_run_without_images(tmp_path: Path) -> None:
     done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
     assert "environment of other observations" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_run_on_small_images(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "env.image_size=32", AT_THE_END, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    last = [row for row in rows(tmp_path / "run") if row["loss_image"]][-1]
+    assert float(last["loss_image"]) == pytest.approx(float(last["image_error"]) * 32 * 32 * 3, rel=1e-3)
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", "video_steps=20", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

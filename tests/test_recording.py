@@ -127,8 +127,11 @@ def test_onboard_beside_map():
     assert frames.shape == (11, 64, 64 + 6 + 64, 3)
     np.testing.assert_array_equal(frames[:, ::4, :64:4], blocks(11))
     assert (frames[:, :, 64:70] == 255).all()
-    with pytest.raises(ValueError, match="60 × 60"):
-        onboard_beside_map(track, flight(), size=60)
+    # A size that is no multiple of the images' grows to the next.
+    np.testing.assert_array_equal(onboard_beside_map(track, flight(), size=60, gap=6), frames)
+    assert onboard_beside_map(track, flight(), size=8, gap=6).shape == (11, 16, 16 + 6 + 16, 3)
+    with pytest.raises(ValueError, match="16 × 12 pixels"):
+        onboard_beside_map(track, replace(flight(), pixels=flight().pixels[:, :, :12]))
     with pytest.raises(ValueError, match="from_pixels=True"):
         onboard_beside_map(track, replace(flight(), pixels=None))
 

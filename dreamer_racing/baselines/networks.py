@@ -16,7 +16,6 @@ from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dreamer_racing.modules import Interface
-from dreamer_racing.modules.encoder import IMAGE_SIZE
 from dreamer_racing.modules.interface import PIXELS
 
 
@@ -38,6 +37,12 @@ class ImageTrunk(nn.Module):
 
     The paper says no more than "a CNN"; this is the one of Stable-Baselines3, on which its code builds.
 
+    Args:
+        image_size: Height and width of the images, pixels; at least 36.
+
+    Raises:
+        ValueError: The images are too small.
+
     Example:
         >>> ImageTrunk()(torch.zeros(2, 64, 64, 3, dtype=torch.uint8)).shape
         torch.Size([2, 512])
@@ -46,14 +51,20 @@ class ImageTrunk(nn.Module):
     """
 
     features = 512
+    smallest_image = 36
 
-    def __init__(self) -> None:
+    def __init__(self, image_size: int = 64) -> None:
         super().__init__()
+        if image_size < self.smallest_image:
+            raise ValueError(
+                f"image_size={image_size}: the CNN of the baselines needs images of at least {self.smallest_image} × "
+                f"{self.smallest_image} pixels."
+            )
         self.convolutions = nn.Sequential(
             nn.Conv2d(3, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU(), nn.Conv2d(64, 64, 3, 1), nn.ReLU()
         )
         with torch.no_grad():
-            flat = self.convolutions(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE)).numel()
+            flat = self.convolutions(torch.zeros(1, 3, image_size, image_size)).numel()
         self.linear = nn.Linear(flat, self.features)
 
     def forward(self, pixels: Tensor) -> Tensor:
@@ -92,7 +103,7 @@ class ObservationNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.in_keys = [*interface.observation_keys, *(["action"] if with_action else [])]
-        self.trunk = ImageTrunk() if interface.pixels else None
+        self.trunk = ImageTrunk(interface.image_size) if interface.pixels else None
         inputs = (ImageTrunk.features if interface.pixels else 0) + interface.vector_dim
         inputs += interface.action_dim if with_action else 0
         layers: list[nn.Module] = []
@@ -139,18 +150,25 @@ class BaselinePolicy(TensorDictModuleBase):
         return Compose()
 
 
-def check_size(saved: dict[str, Any], size: NetworkSize) -> None:
-    """Refuse the state of networks of another size.
+def size_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
+    """Return what a checkpoint says of its networks: their hidden layers, and the images that they see."""
+    return {**asdict(size), "image_size": interface.image_size if interface.pixels else None}
+
+
+def check_size(saved: dict[str, Any], present: dict[str, Any]) -> None:
+    """Refuse the state of networks of another size, or for other images.
 
     Args:
-        saved: ``state_dict()["size"]`` of a learner.
-        size: Of the learner that loads it.
+        saved: ``size_of`` the networks of the checkpoint.
+        present: And of the learner that loads it.
 
     Raises:
         ValueError: If they differ.
     """
-    if saved != asdict(size):
-        raise ValueError(
-            f"The checkpoint holds networks of {saved['layers']} × {saved['units']} units, this learner's have "
-            f"{size.layers} × {size.units}: set network.layers={saved['layers']} network.units={saved['units']}."
-        )
+    names = {"layers": "network.layers", "units": "network.units", "image_size": "env.image_size"}
+    for key, setting in names.items():
+        if saved[key] != present[key]:
+            raise ValueError(
+                f"The checkpoint's networks were made with {setting}={saved[key]}, this learner's with {present[key]}: "
+                f"set {setting}={saved[key]}, or begin anew."
+            )

@@ -5,7 +5,7 @@ Shape legend: N environments, T steps of a rollout, M records of a minibatch, A 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size
+from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size, size_of
 from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.metrics import RunningMean
 from dreamer_racing.modules import Interface
@@ -84,10 +84,10 @@ class PPOLearner:
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
-        self.size = size
         self.config = config or PPOConfig()
         self.device = torch.device(device)
         self._keys = interface.observation_keys
+        self._size = size_of(size, interface)
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
                 torch.manual_seed(seed)
@@ -196,7 +196,7 @@ class PPOLearner:
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, but for the global random generators."""
         return {
-            "size": asdict(self.size),
+            "size": self._size,
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -209,7 +209,7 @@ class PPOLearner:
         Raises:
             ValueError: If it is that of networks of another size; nothing is changed then.
         """
-        check_size(state_dict["size"], self.size)
+        check_size(state_dict["size"], self._size)
         self.actor.load_state_dict(state_dict["actor"])
         self.critic.load_state_dict(state_dict["critic"])
         self.optimizer.load_state_dict(state_dict["optimizer"])

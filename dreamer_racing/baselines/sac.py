@@ -5,7 +5,7 @@ Shape legend: B batch, A action.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size
+from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size, size_of
 from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
@@ -71,10 +71,10 @@ class SACLearner:
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
-        self.size = size
         self.config = config or SACConfig()
         self.device = torch.device(device)
         self._keys = interface.observation_keys
+        self._size = size_of(size, interface)
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
                 torch.manual_seed(seed)
@@ -161,7 +161,7 @@ class SACLearner:
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, but for the global random generators."""
         return {
-            "size": asdict(self.size),
+            "size": self._size,
             "loss": self._loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "updates": self.updates,
@@ -173,7 +173,7 @@ class SACLearner:
         Raises:
             ValueError: If it is that of networks of another size; nothing is changed then.
         """
-        check_size(state_dict["size"], self.size)
+        check_size(state_dict["size"], self._size)
         self._loss.load_state_dict(state_dict["loss"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.optimizer.param_groups[0]["lr"] = self.config.learning_rate  # a setting of this learner, not state

@@ -4,7 +4,7 @@ Keys, as those of `DroneRacingEnv` where both have them:
 
 | key | shape | meaning |
 |---|---|---|
-| `pixels` | (N, 64, 64, 3) uint8 | the task's camera, only with `from_pixels=True` |
+| `pixels` | (N, height, width, 3) uint8 | the task's camera, 64 × 64 by default, only with `from_pixels=True` |
 | `vector` | (N, V) float32 | all observations of the task in a row, only with `from_pixels=False` |
 | `action` | (N, A) float32 | in [-1, 1], scaled to the range of each actuator |
 | `reward` | (N, 1) float32 | summed over the action repeat |
@@ -12,7 +12,7 @@ Keys, as those of `DroneRacingEnv` where both have them:
 | `truncated` | (N, 1) bool | the suite's time limit, 1000 simulator steps, where the discount stays 1; not in `lqr` |
 | `done` | (N, 1) bool | either |
 
-Camera, image size, action repeat and time limit are those of DreamerV3's `dmc_vision`.
+Camera, default image size, action repeat and time limit are those of DreamerV3's `dmc_vision`.
 
 Shapes: N worlds, V observation, A action.
 
@@ -42,7 +42,6 @@ from dm_control.rl import control  # noqa: E402
 
 TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
 """Domain and task of the suite by the name `domain_task`."""
-IMAGE_SIZE = 64  # width and height of `pixels`
 CAMERAS = {"quadruped": 2}  # by domain; 0 for all others
 PHYSICS_STATE = mujoco_bindings.mjtState.mjSTATE_INTEGRATION  # all that MuJoCo's next step depends on
 
@@ -61,6 +60,7 @@ class ControlSuiteEnv(EnvBase):
         from_pixels: whether there are `pixels`; if not there is a `vector` instead.
         action_repeat: simulator steps that an action lasts; an episode is 1000 simulator steps.
         camera: number or name of the task's camera; if None that of the reference.
+        image_size: width and height of `pixels`.
         seed: of the worlds; None draws one from the operating system.
 
     Raises:
@@ -81,6 +81,7 @@ class ControlSuiteEnv(EnvBase):
         from_pixels: bool = True,
         action_repeat: int = 2,
         camera: int | str | None = None,
+        image_size: int = 64,
         seed: int | None = None,
     ) -> None:
         _check_arguments(task, num_envs, action_repeat)
@@ -88,6 +89,7 @@ class ControlSuiteEnv(EnvBase):
         self.task = task
         self.from_pixels = from_pixels
         self.action_repeat = action_repeat
+        self.image_size = image_size
         self.camera = CAMERAS.get(TASKS[task][0], 0) if camera is None else camera
         self.worlds: list[SuiteWorld] = []
         self._set_seed(seed)
@@ -103,7 +105,7 @@ class ControlSuiteEnv(EnvBase):
         self.reward_spec = Unbounded((*n, 1), dtype=torch.float32, device=self.device)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=n, device=self.device)
         if self.from_pixels:
-            shape, dtype = (*n, IMAGE_SIZE, IMAGE_SIZE, 3), torch.uint8
+            shape, dtype = (*n, self.image_size, self.image_size, 3), torch.uint8
             observation = {"pixels": Bounded(0, 255, shape, dtype=dtype, device=self.device)}
         else:
             shape, dtype = (*n, world.vector_size), torch.float32
@@ -165,7 +167,7 @@ class ControlSuiteEnv(EnvBase):
             self.worlds.append(self._make_world(int(number)))
 
     def _make_world(self, seed: int) -> "SuiteWorld":
-        return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None)
+        return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None, self.image_size)
 
     def state_dict(self) -> dict[str, Any]:
         """What an environment with the same arguments needs to go on exactly as this one would, bit for bit.
@@ -212,6 +214,7 @@ class SuiteWorld:
         task: a name of `TASKS`.
         seed: of the task's model and episodes.
         camera: number or name of the camera; None for no images.
+        image_size: width and height of the images.
 
     Attributes:
         action_size: A.
@@ -224,7 +227,7 @@ class SuiteWorld:
         RendererUnavailableError: dm_control has no OpenGL that works here.
     """
 
-    def __init__(self, task: str, seed: int, camera: int | str | None) -> None:
+    def __init__(self, task: str, seed: int, camera: int | str | None, image_size: int) -> None:
         self.seed = seed
         self.env: control.Environment = suite.load(*TASKS[task], task_kwargs={"random": seed})
         self.terminated = self.truncated = False
@@ -236,7 +239,7 @@ class SuiteWorld:
         limited = np.maximum(abs(action.minimum), abs(action.maximum)) < mujoco_bindings.mjMAXVAL
         # an actuator without limits takes the action as it is
         self._low, self._high = np.where(limited, action.minimum, -1.0), np.where(limited, action.maximum, 1.0)
-        self._camera = None if camera is None else self._make_camera(task, camera)
+        self._camera = None if camera is None else self._make_camera(task, camera, image_size)
 
     @property
     def ended(self) -> bool:
@@ -270,7 +273,7 @@ class SuiteWorld:
         return reward
 
     def observe(self) -> np.ndarray:
-        """The image uint8 (64, 64, 3), or without a camera all observations in a row, float32 (V,)."""
+        """The image uint8 (height, width, 3), or without a camera all observations in a row, float32 (V,)."""
         if self._camera is not None:
             return np.ascontiguousarray(self._camera.render())
         values = self.env.task.get_observation(self.env.physics).values()
@@ -316,15 +319,15 @@ class SuiteWorld:
             self._camera = None
         self.env.physics.free()
 
-    def _make_camera(self, task: str, camera: int | str) -> mujoco.Camera:
+    def _make_camera(self, task: str, camera: int | str, image_size: int) -> mujoco.Camera:
         model = self.env.physics.model
         names = [model.id2name(number, "camera") for number in range(model.ncam)]
         if camera not in names and camera not in range(model.ncam):
             raise ValueError(f"camera={camera!r}: {task} has the cameras 0 to {model.ncam - 1}, {', '.join(names)}.")
         view = model.vis.global_
-        view.offwidth = view.offheight = IMAGE_SIZE  # the same image as from a larger buffer, sooner
+        view.offwidth = view.offheight = image_size  # the same image as from a larger buffer, sooner
         try:
-            return mujoco.Camera(self.env.physics, IMAGE_SIZE, IMAGE_SIZE, camera)
+            return mujoco.Camera(self.env.physics, image_size, image_size, camera)
         except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
             raise RendererUnavailableError(
                 f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "

@@ -4,7 +4,7 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 
 | `observation` | space |
 |---|---|
-| `"pixels"` | `Box(0, 255, (64, 64, 3), uint8)`, the nose camera |
+| `"pixels"` | `Box(0, 255, (height, width, 3), uint8)`, the nose camera, 64 × 64 by default |
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
 

@@ -9,7 +9,7 @@ Physics, rules, rewards and start poses are those of the batched environments, f
 | `linear_velocity` | (3,) | m/s, world |
 | `body_rates` | (3,) | rad/s, body frame |
 | `target_gate` | (1,) int64 | the gate to pass next |
-| `pixels` | (64, 64, 3) uint8 | nose camera, only with `from_pixels=True` |
+| `pixels` | (height, width, 3) uint8 | nose camera, 64 × 64 by default, only with `from_pixels=True` |
 
 A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A broken
 physics state or an action that is not finite is a crash too, never an exception.

@@ -1,4 +1,4 @@
-"""Decoders: belief and state to the mean of a 64×64 RGB image, or of numbers.
+"""Decoders: belief and state to the mean of an RGB image, or of numbers.
 
 Shape legend: N any batch, C channels, V numbers, F features, G blocks.
 """
@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.encoder import IMAGE_SIZE, fold_patches, make_convolution, unfold_patches
+from dreamer_racing.modules.encoder import fold_patches, make_convolution, smallest_map, unfold_patches
 from dreamer_racing.modules.heads import MLP, symexp, symlog
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize_convolution, linear
 
@@ -74,7 +74,7 @@ class StridedConvolution(nn.ConvTranspose2d):
 
 
 class ImageDecoder(nn.Module):
-    """Mirror of ``ImageEncoder``: a projection to the smallest map, then doublings up to 64×64.
+    """Mirror of ``ImageEncoder``: a projection to the smallest map, then doublings up to the image.
 
     Args:
         belief: Width of h.
@@ -87,6 +87,10 @@ class ImageDecoder(nn.Module):
         blocks: Blocks of the belief's projection; 1 projects belief and state densely.
         norm: ``"rms"`` or ``"layer"``.
         patch: Side of the pixel blocks that are unfolded from channels after the last stage; 1 unfolds nothing.
+        image_size: Height and width of the images, pixels.
+
+    Raises:
+        ValueError: If images of that size cannot be halved so often.
 
     Reference: danijar/dreamerv3, ``rssm.Decoder``.
     """
@@ -103,11 +107,13 @@ class ImageDecoder(nn.Module):
         blocks: int = 8,
         norm: str = "rms",
         patch: int = 1,
+        image_size: int = 64,
     ) -> None:
         super().__init__()
         self.patch = patch
+        self.image_size = image_size
         channels = [depth * multiplier for multiplier in reversed(multipliers)]
-        resolution = IMAGE_SIZE // patch // 2 ** len(channels)
+        resolution = smallest_map(image_size, patch, len(channels))
         self.projection: nn.Module = (
             BlockProjection(belief, state, resolution, channels[0], blocks, units, norm)
             if blocks > 1
@@ -128,10 +134,10 @@ class ImageDecoder(nn.Module):
             state: ``(..., state)``.
 
         Returns:
-            Mean of the image in [0, 1], ``(..., 64, 64, 3)``.
+            Mean of the image in [0, 1], ``(..., height, width, 3)``.
         """
         images = unfold_patches(self._folded(belief, state), self.patch)
-        return images.reshape(*belief.shape[:-1], IMAGE_SIZE, IMAGE_SIZE, 3)
+        return images.reshape(*belief.shape[:-1], self.image_size, self.image_size, 3)
 
     def squared_error(self, belief: Tensor, state: Tensor, pixels: Tensor) -> Tensor:
         """Compare predicted images with true ones, in whatever order of pixels is cheapest.
@@ -139,7 +145,7 @@ class ImageDecoder(nn.Module):
         Args:
             belief: ``(..., belief)``.
             state: ``(..., state)``.
-            pixels: uint8 ``(..., 64, 64, 3)``.
+            pixels: uint8 ``(..., height, width, 3)``.
 
         Returns:
             Mean over batch, pixels and channels of the squared error of values in [0, 1], a scalar.
@@ -148,7 +154,7 @@ class ImageDecoder(nn.Module):
         return F.mse_loss(self._folded(belief, state).float(), target)
 
     def _folded(self, belief: Tensor, state: Tensor) -> Tensor:
-        """Predict images ``(N, 64 / patch, 64 / patch, patch² · 3)``."""
+        """Predict images ``(N, height / patch, width / patch, patch² · 3)``."""
         maps = self.projection(belief.flatten(0, -2), state.flatten(0, -2))
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
             maps = convolution(F.silu(norm(maps)).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)

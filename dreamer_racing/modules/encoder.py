@@ -17,8 +17,25 @@ from dreamer_racing.modules.interface import PIXELS, VECTOR, Interface
 from dreamer_racing.modules.layers import NORMS, NormedLinear, initialize_convolution
 from dreamer_racing.modules.sizes import ModelSize
 
-IMAGE_SIZE = 64
-"""Height and width of the images, pixels."""
+
+def smallest_map(image_size: int, patch: int, stages: int) -> int:
+    """Return the side of the map that is left of an image when its pixel blocks are folded and it is halved.
+
+    Args:
+        image_size: Height and width of the image, pixels.
+        patch: Side of the blocks.
+        stages: Number of halvings.
+
+    Raises:
+        ValueError: If that does not come out even.
+    """
+    step = patch * 2**stages
+    if image_size < 1 or image_size % step:
+        raise ValueError(
+            f"image_size={image_size}: the networks fold blocks of {patch} × {patch} pixels and halve the image "
+            f"{stages} times, so it must be a multiple of {step}, for instance {2 * step}, {4 * step} or {6 * step}."
+        )
+    return image_size // step
 
 
 def make_convolution(in_channels: int, out_channels: int, kernel: int, stride: int = 1) -> nn.Conv2d:
@@ -57,6 +74,10 @@ class ImageEncoder(nn.Module):
         strided: Halve by stride 2 rather than by a 2×2 max-pool; four times fewer FLOPs.
         norm: ``"rms"`` or ``"layer"``.
         patch: Side of the pixel blocks that are folded into channels before the first stage; 1 folds nothing.
+        image_size: Height and width of the images, pixels.
+
+    Raises:
+        ValueError: If images of that size cannot be halved so often.
 
     Example:
         >>> import torch
@@ -75,6 +96,7 @@ class ImageEncoder(nn.Module):
         strided: bool = False,
         norm: str = "rms",
         patch: int = 1,
+        image_size: int = 64,
     ) -> None:
         super().__init__()
         self.patch = patch
@@ -86,14 +108,13 @@ class ImageEncoder(nn.Module):
         )
         self.norms = nn.ModuleList(NORMS[norm](count) for count in channels)
         self.pool = nn.Identity() if strided else nn.MaxPool2d(2)
-        resolution = IMAGE_SIZE // patch // 2 ** len(channels)
-        self.embedding_size = resolution**2 * channels[-1]
+        self.embedding_size = smallest_map(image_size, patch, len(channels)) ** 2 * channels[-1]
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Embed images.
 
         Args:
-            pixels: uint8 ``(..., 64, 64, 3)``.
+            pixels: uint8 ``(..., height, width, 3)``.
 
         Returns:
             float32 ``(..., E)``.
@@ -148,7 +169,13 @@ class ObservationEncoder(nn.Module):
         encoders: dict[str, ImageEncoder | VectorEncoder] = {}
         if interface.pixels:
             encoders[PIXELS] = ImageEncoder(
-                size.cnn_depth, size.cnn_multipliers, size.cnn_kernel, size.strided, size.norm, size.cnn_patch
+                size.cnn_depth,
+                size.cnn_multipliers,
+                size.cnn_kernel,
+                size.strided,
+                size.norm,
+                size.cnn_patch,
+                interface.image_size,
             )
         if interface.vector_dim:
             encoders[VECTOR] = VectorEncoder(interface.vector_dim, size.vector_layers, size.units, size.norm)

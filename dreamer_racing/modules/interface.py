@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 PIXELS = "pixels"
-"""Key of the images that the agent sees, uint8 ``(..., 64, 64, 3)``."""
+"""Key of the images that the agent sees, uint8 ``(..., height, width, 3)``."""
 VECTOR = "vector"
 """Key of the numbers that the agent sees, float32 ``(..., V)``."""
 PRIVILEGED = ("privileged", "vector")
@@ -25,6 +25,7 @@ class Interface:
     Attributes:
         action_dim: A.
         pixels: Whether the agent sees images under ``"pixels"``.
+        image_size: Height and width of those images, pixels.
         vector_dim: V, size of what it sees under ``"vector"``; 0 if nothing.
         privileged_dim: P, size of what losses may use of ``("privileged", "vector")``; 0 if nothing.
 
@@ -34,6 +35,7 @@ class Interface:
 
     action_dim: int = 4
     pixels: bool = True
+    image_size: int = 64
     vector_dim: int = 0
     privileged_dim: int = 0
 
@@ -46,12 +48,20 @@ class Interface:
         """Read the interface off an environment's specs.
 
         Raises:
-            ValueError: If the environment has neither ``"pixels"`` nor ``"vector"``.
+            ValueError: If the environment has neither ``"pixels"`` nor ``"vector"``, or images that are not square.
         """
         specs = env.observation_spec
         keys = set(specs.keys(include_nested=True))
+        height, width = specs[PIXELS].shape[-3:-1] if PIXELS in keys else [cls.image_size] * 2
+        if height != width:
+            raise ValueError(f"The environment's images are {height} × {width} pixels: agents see square ones.")
         vector, privileged = (specs[key].shape[-1] if key in keys else 0 for key in (VECTOR, PRIVILEGED))
-        return cls(env.action_spec.shape[-1], PIXELS in keys, vector, privileged)
+        return cls(env.action_spec.shape[-1], PIXELS in keys, height, vector, privileged)
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """Height, width and colours of an image."""
+        return (self.image_size, self.image_size, 3)
 
     @property
     def observation_keys(self) -> list[str]:

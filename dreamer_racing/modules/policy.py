@@ -29,7 +29,7 @@ class DreamerPolicy(TensorDictModuleBase):
 
     | key | read / written | shape |
     |---|---|---|
-    | ``pixels``, ``vector`` | read, what of them the agent sees | uint8 (N, 64, 64, 3), float32 (N, V) |
+    | ``pixels``, ``vector`` | read, what of them the agent sees | uint8 (N, height, width, 3), float32 (N, V) |
     | ``is_init`` | read | bool (N, 1) |
     | ``belief``, ``state``, ``previous_action`` | read | (N, D), (N, S), (N, A) |
     | ``action`` | written | (N, A) in [−1, 1] |

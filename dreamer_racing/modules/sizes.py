@@ -25,7 +25,7 @@ class ModelSize:
         norm: ``"rms"`` or ``"layer"``; layer norm is much the cheaper on CPU.
         learned_initial: Whether an episode's first h is learned (2023) or zero (2025).
         cnn_depth: Channels of a convolution are ``cnn_depth * multiplier``.
-        cnn_multipliers: One per halving of the 64-pixel image.
+        cnn_multipliers: One per halving of the image.
         cnn_kernel: Kernel size of every convolution, pixels.
         strided: Halve by stride (a quarter of the FLOPs) rather than by 2×2 max-pool.
         cnn_patch: Side of the pixel blocks folded into channels before the first convolution (1: none). With 2, the

@@ -84,6 +84,7 @@ class WorldModel(nn.Module):
             size.blocks,
             size.norm,
             size.cnn_patch,
+            self.interface.image_size,
         )
 
     def observe(
@@ -96,7 +97,7 @@ class WorldModel(nn.Module):
         """Encode and unroll a sequence of records.
 
         Args:
-            observation: What was seen, by key: ``pixels`` uint8 ``(B, T, 64, 64, 3)``, ``vector`` ``(B, T, V)``.
+            observation: What was seen, by key: ``pixels`` uint8 ``(B, T, height, width, 3)``, ``vector`` ``(B, T, V)``.
             previous_action: ``(B, T, A)``.
             is_init: bool ``(B, T)``.
             deterministic: Take the posterior's mode instead of a sample.
@@ -121,7 +122,7 @@ class WorldModel(nn.Module):
             context: Number of records that are observed, at least 1.
 
         Returns:
-            Images uint8 ``(B, T, 64, 64, 3)``.
+            Images uint8 ``(B, T, height, width, 3)``.
 
         Raises:
             ValueError: If ``context`` is not between 1 and T, or if there is no image decoder.

@@ -1,5 +1,6 @@
 """Networks of the baselines: what they read, in which order, and what the acting step writes."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -37,6 +38,12 @@ def test_images_are_scaled_to_one() -> None:
     trunk.convolutions[0].register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
     trunk(torch.full((1, 64, 64, 3), 255, dtype=torch.uint8))
     assert seen[0].shape == (1, 3, 64, 64) and torch.all(seen[0] == 1.0)
+
+
+def test_images_that_are_too_small_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"image_size=32: .* at least 36 × 36"):
+        ImageTrunk(32)
+    ImageTrunk(36)
 
 
 def test_the_deterministic_policy_takes_the_mode() -> None:

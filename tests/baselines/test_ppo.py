@@ -127,8 +127,14 @@ def test_a_restored_learner_goes_on_as_the_one_that_was_saved() -> None:
 def test_networks_of_another_size_are_refused() -> None:
     learner = PPOLearner(SMALL, NUMBERS, seed=0)
     saved = PPOLearner(NetworkSize(3, 8), NUMBERS, seed=0).state_dict()
-    with pytest.raises(ValueError, match=r"3 × 8 units.*2 × 16: set network.layers=3 network.units=8"):
+    with pytest.raises(ValueError, match="network.layers=3, this learner's with 2: set network.layers=3"):
         learner.load_state_dict(saved)
+
+
+def test_networks_for_other_images_are_refused() -> None:
+    learner = PPOLearner(SMALL, Interface(image_size=64), seed=0)
+    with pytest.raises(ValueError, match=r"env.image_size=96, this learner's with 64"):
+        learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
 
 
 def test_a_reward_that_is_not_finite_spoils_no_network() -> None:

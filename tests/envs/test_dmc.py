@@ -210,6 +210,16 @@ def test_pixels_are_those_of_the_reference_camera(opengl: None, task: str, camer
     env.close()
 
 
+@pytest.mark.parametrize("image_size", [32, 96])
+def test_image_size(opengl: None, image_size: int) -> None:
+    env = ControlSuiteEnv("cartpole_swingup", 1, image_size=image_size, seed=0)
+    pixels = env.reset()["pixels"]
+    assert pixels.shape == (1, image_size, image_size, 3) == env.observation_spec["pixels"].shape
+    assert np.array_equal(pixels[0].numpy(), env.worlds[0].env.physics.render(image_size, image_size, camera_id=0))
+    assert Interface.of(env).image_size == image_size
+    env.close()
+
+
 def test_a_named_camera(opengl: None) -> None:
     views = []
     for camera in (1, "lookatcart"):

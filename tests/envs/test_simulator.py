@@ -192,6 +192,17 @@ def test_images_are_upright(renderer: str) -> None:
     assert (brightness[:, -12:].amin((1, 2)) < 60).all()
 
 
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_image_sizes_show_the_same(renderer: str) -> None:
+    """Every third pixel of a side three times as long looks along the same ray."""
+    start = poses(6, seed=3)
+    small, large = (images(renderer, start, camera=Camera(size, size)) for size in (32, 96))
+    assert (small.shape, large.shape) == ((6, 32, 32, 3), (6, 96, 96, 3))
+    same = (small.int() - large[:, 1::3, 1::3]).abs().amax(-1) <= 2
+    assert same.float().mean() > 0.97  # pixels on an edge may go either way
+    assert (small.int() - large[:, ::3, ::3]).abs().amax(-1).gt(2).float().mean() > 0.03
+
+
 def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
     renderer_or_skip("osmesa")
     poses = level(0.0, 90.0, 180.0)
@@ -202,15 +213,18 @@ def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
         "from dreamer_racing.envs.simulator.rendering import make_renderer\n"
         "from dreamer_racing.envs.quadrotor import PRESETS\n"
         "from dreamer_racing.envs.tracks import load_track\n"
-        "model = build_scene(load_track('kidney'), PRESETS['easy']).compile()\n"
-        "renderer = make_renderer('osmesa', model, Camera(), 3, 2)\n"
-        "torch.save(renderer.render(*torch.load('poses.pt')), 'images.pt')\n"
-        "renderer.close()\n"
+        "for size in (32, 64, 96):\n"
+        "    camera = Camera(size, size)\n"
+        "    model = build_scene(load_track('kidney'), PRESETS['easy'], camera).compile()\n"
+        "    renderer = make_renderer('osmesa', model, camera, 3, 2)\n"
+        "    torch.save(renderer.render(*torch.load('poses.pt')), f'images_{size}.pt')\n"
+        "    renderer.close()\n"
     )
     environment = {key: value for key, value in os.environ.items() if key not in ("PYOPENGL_PLATFORM", "MUJOCO_GL")}
     subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, check=True, timeout=120)
-    drawn, expected = torch.load(tmp_path / "images.pt"), images("warp", poses)
-    assert (drawn.float() - expected.float()).abs().mean() < 3.0
+    for size in (32, 64, 96):
+        drawn, expected = torch.load(tmp_path / f"images_{size}.pt"), images("warp", poses, camera=Camera(size, size))
+        assert (drawn.float() - expected.float()).abs().mean() < 3.0
 
 
 @pytest.mark.parametrize("renderer", ["egl", "warp"])

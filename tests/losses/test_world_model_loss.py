@@ -6,10 +6,10 @@ from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
 from dreamer_racing.losses import ReconstructionLoss, kl_losses
-from dreamer_racing.modules import WorldModel
+from dreamer_racing.modules import Interface, WorldModel
 
 
-def make_batch(batch: int = 2, time: int = 4) -> TensorDict:
+def make_batch(batch: int = 2, time: int = 4, image_size: int = 64) -> TensorDict:
     torch.manual_seed(0)
     flag = torch.zeros(batch, time, 1, dtype=torch.bool)
     is_init, terminated = flag.clone(), flag.clone()
@@ -17,7 +17,7 @@ def make_batch(batch: int = 2, time: int = 4) -> TensorDict:
     terminated[0, 1] = True
     return TensorDict(
         {
-            "pixels": torch.randint(0, 256, (batch, time, 64, 64, 3), dtype=torch.uint8),
+            "pixels": torch.randint(0, 256, (batch, time, image_size, image_size, 3), dtype=torch.uint8),
             "previous_action": torch.rand(batch, time, 4) * 2 - 1,
             "reward": torch.randn(batch, time, 1),
             "is_init": is_init,
@@ -77,15 +77,16 @@ def test_free_nats_bound_the_sum_over_latents():
     assert close.grad.abs().sum() == 0
 
 
-def test_losses_of_a_new_model():
-    world_model = WorldModel("debug")
-    batch = make_batch()
+@pytest.mark.parametrize("image_size", [32, 64, 96])
+def test_losses_of_a_new_model(image_size):
+    world_model = WorldModel("debug", Interface(image_size=image_size))
+    batch = make_batch(image_size=image_size)
     loss = ReconstructionLoss(world_model)
     losses = loss(batch)
     assert set(loss.out_keys) == set(losses.keys())
     # Uniform over 255 bins, whatever the reward.
     assert losses["loss_reward"].item() == pytest.approx(math.log(255), rel=1e-5)
-    torch.testing.assert_close(losses["loss_image"], losses["image_error"] * 64 * 64 * 3)
+    torch.testing.assert_close(losses["loss_image"], losses["image_error"] * image_size**2 * 3)
     torch.testing.assert_close(losses["reward_error"], batch["reward"].abs().mean())
     assert losses["replay_context"].batch_size == (2, 4)
     assert losses["replay_context", "belief"].requires_grad
@@ -104,11 +105,12 @@ def test_continue_target_is_one_minus_terminated():
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_every_parameter_of_the_world_model_gets_a_gradient():
-    world_model = WorldModel("debug")
+@pytest.mark.parametrize("image_size", [32, 64, 96])
+def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
+    world_model = WorldModel("debug", Interface(image_size=image_size))
     with torch.no_grad():
         world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
-    losses = ReconstructionLoss(world_model, free_nats=0.0)(make_batch())
+    losses = ReconstructionLoss(world_model, free_nats=0.0)(make_batch(image_size=image_size))
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in world_model.named_parameters():
         assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name

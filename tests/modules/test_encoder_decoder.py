@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from dreamer_racing.modules.decoder import ImageDecoder
-from dreamer_racing.modules.encoder import ImageEncoder, fold_patches, unfold_patches
+from dreamer_racing.modules.encoder import ImageEncoder, fold_patches, smallest_map, unfold_patches
 
 VARIANTS = [
     {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": False, "norm": "rms"},
@@ -12,17 +12,29 @@ VARIANTS = [
 ]
 
 
+@pytest.mark.parametrize(("image_size", "side"), [(32, 2), (64, 4), (96, 6)])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_encoder_and_decoder_shapes(variant):
-    encoder = ImageEncoder(depth=2, **variant)
-    embedding = encoder(torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8))
-    assert embedding.shape == (2, 3, encoder.embedding_size)
+def test_encoder_and_decoder_shapes(variant, image_size, side):
+    encoder = ImageEncoder(depth=2, **variant, image_size=image_size)
+    embedding = encoder(torch.randint(0, 256, (2, 3, image_size, image_size, 3), dtype=torch.uint8))
+    channels = 2 * variant["multipliers"][-1]
+    assert embedding.shape == (2, 3, encoder.embedding_size) == (2, 3, side * side * channels)
     for blocks in (1, 2):
-        decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=blocks, **variant)
+        decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=blocks, **variant, image_size=image_size)
         images = decoder(torch.randn(2, 3, 8), torch.randn(2, 3, 6))
-        assert images.shape == (2, 3, 64, 64, 3)
+        assert images.shape == (2, 3, image_size, image_size, 3)
         assert images.min() > 0
         assert images.max() < 1
+
+
+@pytest.mark.parametrize("image_size", [40, 8, 0, -16])
+def test_images_that_cannot_be_halved_are_refused(image_size):
+    assert smallest_map(16, patch=2, stages=3) == 1
+    message = f"image_size={image_size}: .* 2 × 2 pixels .* 3 times, .* multiple of 16, for instance 32, 64 or 96"
+    with pytest.raises(ValueError, match=message):
+        ImageEncoder(depth=2, **VARIANTS[-1], image_size=image_size)
+    with pytest.raises(ValueError, match=message):
+        ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **VARIANTS[-1], image_size=image_size)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -29,8 +29,8 @@ class SpecEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None: ...
 
 
-def images(num_envs: int) -> Bounded:
-    return Bounded(0, 255, (num_envs, 64, 64, 3), dtype=torch.uint8)
+def images(num_envs: int, height: int = 64, width: int = 64) -> Bounded:
+    return Bounded(0, 255, (num_envs, height, width, 3), dtype=torch.uint8)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -52,6 +52,13 @@ def test_privileged_entries_other_than_the_vector_do_not_count():
 def test_interface_of_a_transformed_environment():
     env = TransformedEnv(SpecEnv(3, 4, vector=Unbounded((3, 5))), InitTracker())
     assert Interface.of(env) == Interface(pixels=False, vector_dim=5)
+
+
+def test_size_of_the_images():
+    assert Interface.of(SpecEnv(3, 4, pixels=images(3, 96, 96))) == Interface(image_size=96)
+    assert Interface(image_size=96).image_shape == (96, 96, 3)
+    with pytest.raises(ValueError, match="48 × 32 pixels: agents see square ones"):
+        Interface.of(SpecEnv(3, 4, pixels=images(3, 48, 32)))
 
 
 def test_an_agent_that_sees_nothing_is_refused():
