@@ -145,7 +145,8 @@ def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: fl
         window: env_steps around each, over which to average.
 
     Returns:
-        (P,): the mean within the window; where there is no value, between the neighbours; NaN beyond the ends.
+        (P,): the mean within the window; where there is no value, between the neighbours; NaN beyond the
+        ends.
     """
     first = np.searchsorted(steps, grid - window / 2, "left")
     last = np.searchsorted(steps, grid + window / 2, "right")
@@ -259,7 +260,7 @@ def write_curves(path: str | Path, curves: LearningCurves) -> None:
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         file.write(f"# aggregate: {curves.aggregate}\n# window: {curves.window!r}\n")
         file.writelines(f"# problem: {problem}\n" for problem in curves.problems)
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_COLUMNS)
         for curve in curves.curves:
             numbers = zip(curve.env_steps, curve.centre, curve.low, curve.high, curve.seeds, strict=True)

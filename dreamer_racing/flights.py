@@ -40,7 +40,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> No
     with partial.open("w", newline="", encoding="utf-8") as file:
         head = (track, repr(trajectory.control_dt), trajectory.outcome or "none")
         file.writelines(f"# {name}: {value}\n" for name, value in zip(HEAD, head, strict=True))
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         columns = [column for names in STATE.values() for column in names]
         writer.writerow(["t", *columns, *(f"a{index}" for index in range(trajectory.action.shape[1]))])
         for index, row in enumerate(zip(*fields, actions, strict=True)):
