@@ -111,7 +111,7 @@ def learning_curves(
         raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
     groups = group_runs(runs)
     longest = max(run.metrics.env_steps.max(initial=0) for run in runs)
-    width = max(window if window is not None else WINDOW_SHARE * longest, 1.0)
+    width = float(max(window if window is not None else WINDOW_SHARE * longest, 1.0))
     grid = np.linspace(0.0, longest, POINTS)
     missing, curves = [*problems, *_short_runs(groups)], []
     for name in quantities:

@@ -301,7 +301,9 @@ def _draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str)
             along[row + 1], 1.02, number, transform=axes.get_xaxis_transform(), ha="center", fontsize=7, color=MUTED
         )
     if trajectory.crashed and np.isfinite(points[-1]).all():
-        axes.plot(*points[-1], marker="X", color=CRASH_COLOR, markersize=9, markeredgecolor="white", zorder=4)
+        axes.plot(
+            *points[-1], marker="X", color=CRASH_COLOR, markersize=9, markeredgecolor="white", zorder=4, clip_on=False
+        )
     axes.set(xlim=(0.0, max(along[-1], 1e-6)), ylim=(0.0, 1.05 * speed.vmax), xlabel=PROFILE_AXES[over])
     axes.set_ylabel("speed (m/s)")
     axes.yaxis.set_major_locator(MaxNLocator(4))

@@ -116,14 +116,19 @@ def test_a_raise_is_a_whole_increment(tmp_path):
     np.testing.assert_array_equal(weight_raises(data), [3000, 6000])
 
 
-def test_curves_survive_their_file(tmp_path):
+@pytest.mark.parametrize("window", [None, 700.0])
+def test_curves_survive_their_file(tmp_path, window):
     for seed in range(3):
         write_run(tmp_path / "runs", f"dreamer_v3_circle_seed{seed}", [seed, seed + 1.5], seed=seed)
     (tmp_path / "runs" / "dreamer_v3_circle_seed2" / "metrics.csv").write_text("")
-    before = curves_of(tmp_path / "runs", window=700.0)
+    before = curves_of(tmp_path / "runs", window=window)
     write_curves(tmp_path / "curves.csv", before)
     after = read_curves(tmp_path / "curves.csv")
-    assert (after.aggregate, after.window, after.problems) == ("mean", 700.0, before.problems) and before.problems
+    assert (after.aggregate, after.window, after.problems) == (
+        "mean",
+        window or 0.02 * 2000,
+        before.problems,
+    ) and before.problems
     for old, new in zip(before.curves, after.curves, strict=True):
         assert (old.key, old.quantity) == (new.key, new.quantity)
         np.testing.assert_array_equal(old.seeds, new.seeds)
