@@ -25,6 +25,8 @@ COLUMNS = {
 }
 """What is compared: heading, and column of ``metrics.csv``."""
 DRAWN = ("gates", "return")
+OTHER_COLOR = "#74c0fc"
+WALL_CLOCK = "wall_clock"  # column: s since the run began
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def compare_variants(runs: Sequence[RunData]) -> list[VariantResult]:
 def _result(key: CurveKey, group: Sequence[RunData]) -> VariantResult:
     ends = {name: [_end(run, column) for run in group] for name, (_, column) in COLUMNS.items()}
     values = {name: np.array([value for value in found if value is not None]) for name, found in ends.items()}
-    clocks = [run.metrics.columns["wall_clock"][1][-1] for run in group if "wall_clock" in run.metrics.columns]
+    clocks = [run.metrics.columns[WALL_CLOCK][1][-1] for run in group if WALL_CLOCK in run.metrics.columns]
     return VariantResult(
         key,
         {name: found for name, found in values.items() if len(found)},
@@ -85,7 +87,15 @@ def _end(run: RunData, column: str) -> float | None:
 def comparison_table(results: Sequence[VariantResult]) -> str:
     """Write the results as Markdown: mean ± standard deviation over seeds; an empty cell was not measured."""
     shown = [name for name in COLUMNS if any(name in result.values for result in results)]
-    headings = ["algorithm", "track", "variant", "seeds", "env_steps", *(COLUMNS[name][0] for name in shown), "wall clock"]
+    headings = [
+        "algorithm",
+        "track",
+        "variant",
+        "seeds",
+        "env_steps",
+        *(COLUMNS[name][0] for name in shown),
+        "wall clock",
+    ]
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     for result in results:
         seeds = max((len(values) for values in result.values.values()), default=0)
@@ -122,7 +132,9 @@ def plot_comparison(results: Sequence[VariantResult], path: str | Path) -> None:
                 continue
             reference = result.key.variant in ("", REFERENCE)
             error = values.std(ddof=1) if len(values) > 1 else 0.0
-            axes.barh(place, values.mean(), xerr=error, color=INK if reference else "#74c0fc", ecolor=MUTED, height=0.65)
+            axes.barh(
+                place, values.mean(), xerr=error, color=INK if reference else "#74c0fc", ecolor=MUTED, height=0.65
+            )
             axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4)
             if reference and not several:
                 axes.axvline(values.mean(), color=INK, linestyle=(0, (4, 3)), linewidth=0.9)

@@ -20,9 +20,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-logger = logging.getLogger(__name__)
+from dreamer_racing.metrics_file import X_AXIS, read_rows
 
-X_AXIS = "env_steps"
+logger = logging.getLogger(__name__)
 
 
 class MetricsLog:
@@ -135,10 +135,9 @@ class MetricsLog:
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Reads the complete rows; the last one may have been cut short by a kill."""
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = [line for line in file if line.endswith("\n")]
-    return [row for row in csv.DictReader(lines, restval=None) if None not in row and None not in row.values()]
+    """Read the complete rows."""
+    header, rows, _ = read_rows(path)
+    return [dict(zip(header, row, strict=True)) for row in rows]
 
 
 def _keep_aside(path: Path) -> None:

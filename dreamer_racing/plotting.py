@@ -6,7 +6,6 @@ Shapes: K control steps of an episode.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
@@ -28,6 +27,7 @@ from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation import Trajectory
+from dreamer_racing.metrics_file import read_metrics
 
 GATE_COLOR = "#e8590c"
 DECOY_COLOR = "#c2255c"
@@ -70,9 +70,7 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
         axes.set_xlabel("")
         panels.append((side, (0, 2)))
     for panel, plane in panels:
-        _draw_path(panel, trajectory, plane, speed)
-        _draw_cameras(panel, trajectory, plane)
-        _draw_ends(panel, trajectory, plane)
+        draw_flight(panel, trajectory, speed, plane)
     bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), cax=axes.inset_axes((1.015, 0.0, 0.022, 1.0)))
     bar.set_label("speed (m/s)")
     bar.outline.set_visible(False)
@@ -104,6 +102,20 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
         axes.set_xlabel("x (m)")
 
 
+def draw_flight(axes: Axes, trajectory: Trajectory, speed: Normalize, plane: tuple[int, int] = (0, 1)) -> None:
+    """Draw an episode's path coloured by speed, the camera's direction every 0.1 s, start and crash.
+
+    Args:
+        axes: where, on top of the track.
+        trajectory: the episode.
+        speed: from m/s to the colours of `SPEED_COLORS`.
+        plane: the two of x, y and z (0, 1, 2) that are drawn.
+    """
+    _draw_path(axes, trajectory, plane, speed)
+    _draw_cameras(axes, trajectory, plane)
+    _draw_ends(axes, trajectory, plane)
+
+
 def plot_curve(
     metrics_csv: str | Path,
     path: str | Path,
@@ -122,7 +134,7 @@ def plot_curve(
     Raises:
         ValueError: the file has no rows, or none of the columns.
     """
-    table = _read_metrics(Path(metrics_csv))
+    table = read_metrics(metrics_csv).columns
     wanted = columns or DEFAULT_PANELS
     found = {name: _match(table, patterns) for name, patterns in wanted.items()}
     panels = {name: matches for name, matches in found.items() if matches}
@@ -307,32 +319,22 @@ def _title(track: Track, trajectory: Trajectory) -> str:
 
 
 def _add_legend(figure: Figure, track: Track, trajectory: Trajectory) -> None:
-    bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
-    handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
-    if track.decoys:
-        handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))
-    handles.append(Line2D([], [], linestyle="", label="start", **_START))
-    if trajectory.crashed:
-        handles.append(Line2D([], [], linestyle="", label="crash", **_CRASH))
-    handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
-    handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
+    handles = flight_legend(bool(track.decoys), trajectory.crashed)
     figure.legend(handles=handles, loc="outside lower left", ncols=len(handles), frameon=False, fontsize=9)
 
 
-def _read_metrics(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return env_steps and values of every column but env_steps, without its empty and non-finite cells."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path} has no rows: nothing was logged yet.")
-    table = {}
-    for column in rows[0]:
-        cells = [(float(row["env_steps"]), float(row[column])) for row in rows if row[column]]
-        steps, values = np.array(cells, dtype=float).reshape(-1, 2).T
-        finite = np.isfinite(values)
-        if column != "env_steps" and finite.any():
-            table[column] = (steps[finite], values[finite])
-    return table
+def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
+    """Make the entries of the legend of a flight from above, with decoys or a crash if there are any."""
+    bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
+    handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
+    if decoys:
+        handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))
+    handles.append(Line2D([], [], linestyle="", label="start", **_START))
+    if crash:
+        handles.append(Line2D([], [], linestyle="", label="crash", **_CRASH))
+    handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
+    handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
+    return handles
 
 
 def _match(names: Mapping[str, object], patterns: Sequence[str]) -> list[str]:

@@ -52,7 +52,7 @@ def write_video(
     )
     with writer:
         for frame in array:
-            writer.append_data(_make_even(_enlarge(frame, scale)))
+            writer.append_data(_make_even(enlarge(frame, scale)))
 
 
 def write_gif(
@@ -82,7 +82,7 @@ def write_gif(
     array = _as_frames(frames, "frames")
     palette = _shared_palette(array, colors)
     images = [
-        Image.fromarray(_enlarge(frame, scale)).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array
+        Image.fromarray(enlarge(frame, scale)).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array
     ]
     delay = round(max(MIN_DELAY, 1 / fps), 2)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -135,10 +135,24 @@ def side_by_side(
     phase[:context] = CONTEXT_COLOR
     colors = [np.full_like(phase, 255), phase, np.full_like(phase, 255)]
     framed = [
-        _frame(_enlarge(panel, scale), color, border)
+        add_border(enlarge(panel, scale), color, border)
         for panel, color in zip(panels, colors[: len(panels)], strict=True)
     ]
     return np.concatenate(framed, axis=2)
+
+
+def enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
+    """Repeat every pixel of (..., H, W, 3)."""
+    return pixels if scale == 1 else pixels.repeat(scale, axis=-3).repeat(scale, axis=-2)
+
+
+def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
+    """Put (T, H, W, 3) into a border of a colour for each frame (T, 3)."""
+    frames, height, width, _ = panel.shape
+    framed = np.empty((frames, height + 2 * border, width + 2 * border, 3), dtype=np.uint8)
+    framed[:] = color[:, None, None]
+    framed[:, border : border + height, border : border + width] = panel
+    return framed
 
 
 def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail: float = 1.0) -> np.ndarray:
@@ -190,7 +204,7 @@ def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, ga
     height, width = trajectory.pixels.shape[1:3]
     if height != width:
         raise ValueError(f"images of {height} × {width} pixels do not fit beside a square map.")
-    view = _enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
+    view = enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
     side = view.shape[1]
     between = np.full((len(view), side, gap, 3), 255, dtype=np.uint8)
     return np.concatenate((view, between, top_down_frames(track, trajectory, side)), axis=2)
@@ -235,24 +249,10 @@ def _as_frames(frames: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
     return array
 
 
-def _enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
-    """Repeat every pixel of (..., H, W, 3)."""
-    return pixels if scale == 1 else pixels.repeat(scale, axis=-3).repeat(scale, axis=-2)
-
-
 def _make_even(frame: np.ndarray) -> np.ndarray:
     """Repeat the last row or column of (H, W, 3) where there is an odd number of them."""
     height, width, _ = frame.shape
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _frame(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
-    """Put (T, H, W, 3) into a border of a colour for each frame (T, 3)."""
-    frames, height, width, _ = panel.shape
-    framed = np.empty((frames, height + 2 * border, width + 2 * border, 3), dtype=np.uint8)
-    framed[:] = color[:, None, None]
-    framed[:, border : border + height, border : border + width] = panel
-    return framed
 
 
 def _shared_palette(frames: np.ndarray, colors: int) -> Image.Image:

@@ -12,8 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
+from dreamer_racing.dreams import record_dream
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
+from dreamer_racing.flights import write_trajectory
 from dreamer_racing.learner import DreamerLearner, Learner
 from dreamer_racing.plotting import plot_top_down
 from dreamer_racing.recording import side_by_side, write_video
@@ -48,6 +50,7 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
+        self._track = str(worlds["track"])
         self._policy = learner.policy()
         self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
         self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))
@@ -79,17 +82,24 @@ class EvaluationReport:
         return self._policy(tensordict.to(self._learner.device)).to("cpu")
 
     def write(self, name: str, result: Evaluation) -> None:
-        """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`."""
+        """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
+
+        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that imagines
+        images, `<name>_dream.npz`.
+        """
         for folder in ("evaluations", "plots", "videos"):
             (self.directory / folder).mkdir(parents=True, exist_ok=True)
         (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
+        write_trajectory(self.directory / "evaluations" / f"{name}_trajectory.csv", trajectory, self._track)
         plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
         if trajectory.pixels is None:
             return
         frames = trajectory.pixels[: self.video_steps]
         if isinstance(self._learner, DreamerLearner):
             frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
+            if (dream := record_dream(self._learner, trajectory)) is not None:
+                dream.save(self.directory / "evaluations" / f"{name}_dream.npz")
         write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
     def close(self) -> None:

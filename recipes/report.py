@@ -5,6 +5,8 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+QUANTITIES = ("return", "success_rate", "gates", "lap_time")
+
 
 class DrawFigures(Callback):
     """Draws what `recipes/plot.py` draws, into `figures/` of the experiment, also when a run of it has failed."""
@@ -16,4 +18,4 @@ class DrawFigures(Callback):
 
         place = config.hydra.sweep.dir
         print(f"figures: {place}/figures")
-        draw(PlotConfig(runs=place, output=f"{place}/figures"))
+        draw(PlotConfig(runs=place, output=f"{place}/figures", quantities=list(QUANTITIES)))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
@@ -243,6 +244,29 @@ class ExportConfig:
     seed: int = 0
 
 
+class Aggregate(Enum):
+    """What stands for the seeds of a learning curve."""
+
+    mean = "mean"
+    iqm = "iqm"
+
+
+@dataclass
+class PlotConfig:
+    """`recipes/plot.py`."""
+
+    runs: Any = "runs"  # run directory, folder of some, pattern, or a list [a,b]; or a learning_curves.csv
+    figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
+    output: str = "figures"  # folder
+    quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/curves.py
+    aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
+    window: float | None = None  # of the curves' running mean, env_steps; null: 2 % of the longest run
+    flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
+    flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
+    over: str = "distance"  # axis of the speed profile: distance | time
+    dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
+
+
 def register() -> None:
     """Make the schemas known to hydra."""
     store = ConfigStore.instance()
@@ -252,6 +276,7 @@ def register() -> None:
     store.store(name="experiment_schema", node=ExperimentConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="export_schema", node=ExportConfig)
+    store.store(name="plot_schema", node=PlotConfig)
     for group, node in (
         ("env", EnvConfig),
         ("model", ModelConfig),

@@ -15,7 +15,8 @@ from PIL import Image
 from dreamer_racing.envs.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation import Trajectory
-from dreamer_racing.plotting import _read_metrics, _smooth, camera_directions, draw_track, plot_curve, plot_top_down
+from dreamer_racing.metrics_file import read_metrics
+from dreamer_racing.plotting import _smooth, camera_directions, draw_track, plot_curve, plot_top_down
 
 
 def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> Trajectory:
@@ -142,7 +143,7 @@ def test_curves_of_a_run(tmp_path, figures):
 
 
 def test_empty_and_non_finite_cells_are_left_out(tmp_path):
-    table = _read_metrics(write_metrics(tmp_path / "metrics.csv", rows=4))
+    table = read_metrics(write_metrics(tmp_path / "metrics.csv", rows=4)).columns
     assert list(table) == ["episode/return", "loss", "loss_actor", "other"]
     assert [values.tolist() for values in table["episode/return"]] == [[1000, 3000], [1, 3]]
     assert table["loss_actor"][0].tolist() == [1000, 2000, 3000]

@@ -1,0 +1,111 @@
+"""The results page is what the generator makes of results/, and the generator invents nothing."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def results() -> ModuleType:
+    sys.path.insert(0, str(ROOT / "recipes"))
+    try:
+        return importlib.import_module("results")
+    finally:
+        sys.path.pop(0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with one planned table and one result, whose JSON file knows its machine and commit."""
+    table = {"title": "Planned", "text": "What is to be run.", "rows": {"ppo": "PPO"}, "columns": {"a": "A", "b": "B"}}
+    (tmp_path / "planned.json").write_text(json.dumps([table]))
+    (tmp_path / "one" / "deep").mkdir(parents=True)
+    records = [{"machine": "M", "commit": "c1", "s": 1.0}, {"machine": "M", "commit": "c2", "s": 2.0}]
+    (tmp_path / "one" / "deep" / "numbers.json").write_text(json.dumps(records))
+    (tmp_path / "one" / "deep" / "curve.png").touch()
+    entry = {"title": "One: a result", "files": {"curve.png": "A curve", "numbers.json": ""}, "fills": ["ppo/b"]}
+    (tmp_path / "one" / "deep" / "provenance.json").write_text(json.dumps(entry))
+    return tmp_path
+
+
+def change(folder: Path, **fields) -> None:
+    path = folder / "one" / "deep" / "provenance.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def test_page_in_the_repository_is_up_to_date(results):
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    assert page == results.make_page(ROOT / "results"), "run python recipes/results.py"
+
+
+def test_links_of_the_page_lead_somewhere():
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    targets = {target for target in re.findall(r"\]\(([^)#]+)", page) if not target.startswith("http")}
+    assert targets and all((ROOT / "docs" / target).exists() for target in targets)
+
+
+def test_every_result_is_on_the_page(results):
+    """Whatever lies in results/ is named by a provenance.json."""
+    listed = {
+        entry.folder / name
+        for path in (ROOT / "results").rglob("provenance.json")
+        for entry in results.read_entries(path)
+        for name in entry.files
+    }
+    own = {"provenance.json", "planned.json"}
+    present = {path for path in (ROOT / "results").rglob("*") if path.is_file() and path.name not in own}
+    assert present - listed == set()
+
+
+def test_cells_without_a_result_say_so(results, folder):
+    page = results.make_page(folder)
+    assert "| PPO | not run | [One: a result](#one-a-result) |" in page
+    assert "## One: a result" in page
+
+
+def test_facts_come_from_the_entry_or_its_records_and_are_never_invented(results, folder):
+    page = results.make_page(folder)
+    for row in (
+        "| command | not recorded |",
+        "| commit | c1; c2 |",
+        "| machine | M |",
+        "| wall clock | not recorded |",
+    ):
+        assert row in page
+    change(folder, command="python x.py", machine="N", wall_clock="3 minutes", commit="c3")
+    page = results.make_page(folder)
+    for row in ("| command | `python x.py` |", "| commit | c3 |", "| machine | N |", "| wall clock | 3 minutes |"):
+        assert row in page
+    change(folder, command=["python x.py", "python y.py"])
+    page = results.make_page(folder)
+    assert "```bash\npython x.py\npython y.py\n```" in page and "| command | above |" in page
+
+
+def test_pictures_are_shown_and_numbers_linked(results, folder):
+    page = results.make_page(folder)
+    place = f"../{folder.name}/one/deep"
+    assert f"![A curve]({place}/curve.png)" in page and f"Numbers: [numbers.json]({place}/numbers.json)." in page
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"title": ""}, "an entry has no title"),
+        ({"files": {}}, "an entry has no files"),
+        ({"files": ["lost.png"]}, "files names lost.png, which is not there"),
+        ({"fills": ["ppo/c"]}, r"fills \['ppo/c'\]: not in planned.json"),
+    ],
+)
+def test_bad_entries_are_refused_with_their_file(results, folder, fields, words):
+    change(folder, **fields)
+    with pytest.raises(ValueError, match=rf"one/deep/provenance\.json: {words}"):
+        results.make_page(folder)
