@@ -107,7 +107,7 @@ def write_run(
         write_trajectory(f"{stem}_trajectory.csv", flight(track), track)
         if algorithm == "dreamer_v3":
             images = generator.integers(0, 256, (3, 1, CONTEXT + PREDICTED, 64, 64, 3), dtype=np.uint8)
-            Dream(*images, context=CONTEXT, frame_dt=0.08).save(f"{stem}_dream.npz")
+            Dream(images[0], images[1], images[2], CONTEXT, 0.08).save(f"{stem}_dream.npz")
 
 
 @cache

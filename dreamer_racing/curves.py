@@ -225,7 +225,8 @@ def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[np.n
         kept = [stratum[np.isfinite(stratum[:, points]).all(1)][:, points] for stratum in strata]
         if any(len(stratum) for stratum in kept):
             result[:, points] = AGGREGATES[aggregate]([stratum for stratum in kept if len(stratum)])
-    return Curve(key, quantity, grid, *result, seeds=present.sum(0))
+    centre, low, high = result
+    return Curve(key, quantity, grid, centre, low, high, present.sum(0))
 
 
 def _pool(values: dict[CurveKey, np.ndarray]) -> dict[CurveKey, list[np.ndarray]]:
@@ -290,8 +291,8 @@ def read_curves(path: str | Path) -> LearningCurves:
         rows[row["quantity"], key].append([float(row[name] or "nan") for name in _COLUMNS[4:]])
     tables = {names: np.array(values).T for names, values in rows.items()}  # (5, P)
     curves = [
-        Curve(key, quantity, *table[:4], seeds=table[4].astype(int))
-        for (quantity, key), table in tables.items()
+        Curve(key, quantity, env_steps, centre, low, high, seeds.astype(int))
+        for (quantity, key), (env_steps, centre, low, high, seeds) in tables.items()
         if quantity != _RAISE
     ]
     raises = {key: table[0] for (quantity, key), table in tables.items() if quantity == _RAISE}

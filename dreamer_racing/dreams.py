@@ -48,8 +48,14 @@ class Dream:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         partial = Path(path).with_name(f".{Path(path).name}.partial.npz")
         predicted = self.imagined[:, self.context :]  # before that, it is the reconstruction
-        numbers = {"context": self.context, "frame_dt": self.frame_dt}
-        np.savez_compressed(partial, real=self.real, reconstructed=self.reconstructed, imagined=predicted, **numbers)
+        np.savez_compressed(
+            partial,
+            real=self.real,
+            reconstructed=self.reconstructed,
+            imagined=predicted,
+            context=np.array(self.context),
+            frame_dt=np.array(self.frame_dt),
+        )
         os.replace(partial, path)
 
     @classmethod
@@ -97,10 +103,16 @@ def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int =
         batch_size=real.shape[:2],
     )
     reconstructed = learner.open_loop(batch, length).cpu()
-    imagined = learner.open_loop(batch, STRIDE * (CONTEXT - 1) + 1).cpu()
-    frames = [images[:, ::STRIDE].numpy() for images in (real, reconstructed, imagined)]
-    frames[2][:, :CONTEXT] = frames[1][:, :CONTEXT]  # else another sample of the same latents
-    return Dream(*frames, context=CONTEXT, frame_dt=STRIDE * trajectory.control_dt)
+    seen = STRIDE * (CONTEXT - 1) + 1
+    imagined = learner.open_loop(batch, seen).cpu()
+    imagined[:, :seen] = reconstructed[:, :seen]  # rather than another sample of the same latents
+    return Dream(
+        real=real[:, ::STRIDE].numpy(),
+        reconstructed=reconstructed[:, ::STRIDE].numpy(),
+        imagined=imagined[:, ::STRIDE].numpy(),
+        context=CONTEXT,
+        frame_dt=STRIDE * trajectory.control_dt,
+    )
 
 
 def shown_frames(dream: Dream, columns: int) -> list[int]:

@@ -304,7 +304,7 @@ def _draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str)
         axes.plot(
             *points[-1], marker="X", color=CRASH_COLOR, markersize=9, markeredgecolor="white", zorder=4, clip_on=False
         )
-    axes.set(xlim=(0.0, max(along[-1], 1e-6)), ylim=(0.0, 1.05 * speed.vmax), xlabel=PROFILE_AXES[over])
+    axes.set(xlim=(0.0, max(along[-1], 1e-6)), ylim=(0.0, 1.05 * float(speed.vmax or 1.0)), xlabel=PROFILE_AXES[over])
     axes.set_ylabel("speed (m/s)")
     axes.yaxis.set_major_locator(MaxNLocator(4))
     _dress(axes)
@@ -345,6 +345,9 @@ def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: 
         (CONTEXT_COLOR, "the model has seen this image"),
         (OPEN_LOOP_COLOR, "predicted from actions alone, since 0 s"),
     )
-    handles = [Line2D([], [], color=np.array(color) / 255, label=label, **square) for color, label in phases]
+    handles = [
+        Line2D([], [], color=(red / 255, green / 255, blue / 255), label=label, **square)
+        for (red, green, blue), label in phases
+    ]
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False, fontsize=9)
     save(figure, path)
