@@ -131,6 +131,7 @@ class DreamerConfig:
     """`recipes/dreamer_v3.py`."""
 
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
+    decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     total_env_steps: int = 1_000_000  # control steps summed over environments
     prefill: int = 4_000  # env_steps collected before the first update
@@ -155,12 +156,30 @@ class EvaluateConfig:
     """`recipes/evaluate.py`."""
 
     checkpoint: str = MISSING  # run directory or checkpoint
-    episodes: int = 100
+    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    episodes: int = 100  # of each condition
     num_envs: int = 20
     track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper | none; null: as it was trained
     preset: str | None = None  # null: the physics it was trained on
     run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
     video_steps: int = 500
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = 0
+
+
+@dataclass
+class PerceptionConfig:
+    """`recipes/perception.py`."""
+
+    checkpoint: str = MISSING  # run directory or checkpoint
+    episodes: int = 100  # of each kind of flight
+    num_envs: int = 100
+    track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: <run of the checkpoint>/perception
     device: str = "auto"
     renderer: str = "auto"
     seed: int = 0
@@ -183,6 +202,7 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(name="dreamer_v3_schema", node=DreamerConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="perception_schema", node=PerceptionConfig)
     store.store(name="export_schema", node=ExportConfig)
     for group, node in (
         ("env", EnvConfig),

@@ -1,0 +1,143 @@
+"""Measure what a trained policy looks at, and whether it needs to.
+
+    python recipes/perception.py checkpoint=runs/dreamer_v3_figure8_20260101-120000
+    python recipes/perception.py checkpoint=runs/dreamer_v3_figure8_20260101-120000 track=figure8 +decoys=paper
+
+Flies without and with decoys, measures the angle between the camera's axis and gates and decoys and how long each is in
+view, then flies with frozen, blank and noise images. Writes perception.json, perception.md and perception.png; an
+earlier report is never overwritten. docs/evaluation.md says what is measured.
+"""
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from arena import worlds_of
+from command_line import plain_errors, start_logging
+from omegaconf import DictConfig, OmegaConf
+from restoring import Restored, fresh_directory, heading, restore
+from schema import DreamerConfig, PerceptionConfig, register
+
+from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
+from dreamer_racing.evaluation import Trajectory
+from dreamer_racing.lesions import LESIONS, LesionedPolicy
+from dreamer_racing.perception import Sight, measure_sight, sight_table
+from dreamer_racing.protocol import MODES, Result, fly, results_table
+from dreamer_racing.report_plots import plot_sight
+
+RESULT = "perception.json"
+WITHOUT, WITH = "without decoys", "with decoys"
+START_NOISE = 1.0  # as in training, so that no two flights are the same and none can be flown from memory
+
+register()
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="perception")
+def main(config: DictConfig) -> None:
+    """Restore the policy, fly it with and without decoys and lesions, report."""
+    start_logging()
+    started = time.monotonic()
+    with plain_errors():
+        settings = cast(PerceptionConfig, OmegaConf.to_object(config))
+        restored = restore(settings)
+        if not restored.trained.env.from_pixels:
+            raise ValueError(f"{restored.checkpoint} sees numbers, not images: there is nothing to measure.")
+        tracks = tracks_to_fly(restored.trained)
+        directory = fresh_directory(settings.run_dir or restored.run_dir / "perception", RESULT)
+    looked = fly_and_look(settings, restored, tracks)
+    lesions = fly_lesioned(settings, restored)
+    provenance = restored.provenance(settings, time.monotonic() - started)
+    write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
+    print(f"\nwritten to {directory}")
+
+
+@dataclass
+class Looked:
+    """Flights of one kind, and what the camera was turned to in them."""
+
+    track: Track
+    gates_per_episode: float
+    success_rate: float
+    trajectory: Trajectory  # the first of them
+    sights: dict[str, Sight]
+
+
+def tracks_to_fly(trained: DreamerConfig) -> dict[str, Track]:
+    """The track without decoys and, if it has a place for them, with them."""
+    track = with_decoys(trained.track, trained.decoys)
+    if trained.decoys is None and not track.decoys:
+        track = with_decoys(track, decoys_for(track))
+    plain = {WITHOUT: with_decoys(track, "none")}
+    if not track.decoys:
+        print(f"decoys: none, {track.name} has no place for them")
+        return plain
+    return plain | {WITH: track}
+
+
+def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str, Track]) -> dict[str, Looked]:
+    """Fly the deterministic policy without and with decoys from the same noisy starts; measure what it looked at."""
+    worlds = worlds_of(restored.trained) | {"start_noise": START_NOISE, "seed": config.seed}
+    decoys = next(reversed(tracks.values())).decoys  # without them too: where they would stand
+    looked = {}
+    for name, track in tracks.items():
+        flown = fly(
+            restored.learner.policy(),
+            {**worlds, "track": track},
+            config.episodes,
+            num_envs=config.num_envs,
+            num_trajectories=config.episodes,
+            record_pixels=False,
+        )
+        print(f"\n{name}, {len(flown.trajectories)} flights recorded\n{flown.summary()}")
+        sights = measure_sight(flown.trajectories, track, worlds["camera"], decoys)
+        looked[name] = Looked(track, flown.gates_per_episode, flown.success_rate, flown.trajectories[0], sights)
+    return looked
+
+
+def fly_lesioned(config: PerceptionConfig, restored: Restored) -> list[Result]:
+    """Fly the policy in both modes on the track as it was asked for, with every lesion of its camera."""
+    trained = restored.trained
+    worlds = worlds_of(trained) | {"start_noise": START_NOISE, "seed": config.seed}
+    results = []
+    for name, lesion in LESIONS.items():
+        for mode in MODES:
+            policy = LesionedPolicy(restored.learner.policy(), lesion())
+            flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
+            results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
+            print(f"\n{name} images, {mode} policy\n{flown.summary()}")
+    return results
+
+
+def write(
+    directory: Path, looked: dict[str, Looked], lesions: list[Result], provenance: dict[str, Any], camera: Camera
+) -> None:
+    """Write numbers, tables and the plot."""
+    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
+    plot_sight({name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}, camera,
+               directory / "perception.png", title)  # fmt: skip
+    flights = {
+        name: {
+            "gates_per_episode": kind.gates_per_episode,
+            "success_rate": kind.success_rate,
+            "sights": {thing: sight.to_dict() for thing, sight in kind.sights.items()},
+        }
+        for name, kind in looked.items()
+    }
+    records = [{"images" if key == "condition" else key: value for key, value in result.to_dict().items()}
+               for result in lesions]  # fmt: skip
+    numbers = {"flights": flights, "lesions": records, "provenance": provenance}
+    (directory / RESULT).write_text(json.dumps(numbers, indent=2, allow_nan=False) + "\n")
+    sights = sight_table({name: kind.sights for name, kind in looked.items()})
+    text = (
+        f"{heading(title, provenance)}\n## What the camera is turned to\n\n{sights}\n![perception](perception.png)\n\n"
+        f"## Lesions of the camera\n\n{results_table(lesions, 'images')}"
+    )
+    (directory / "perception.md").write_text(text)
+
+
+if __name__ == "__main__":
+    main()
