@@ -94,10 +94,10 @@ CONDITIONS = (
     Condition("camera_tilt", "camera tilted by up to ±5° more or less than in training", camera_tilt=5.0),
     Condition(
         "gate_displacement",
-        "every gate moved by up to 0.3 m and turned by up to ±10°: five such tracks",
+        "every gate moved by up to 0.3 m and turned by up to ±10°: ten such tracks",
         gate_shift=0.3,
         gate_turn=10.0,
-        num_tracks=5,
+        num_tracks=10,
     ),
 )
 """The conditions of the protocol; their numbers are this project's choice [choice]."""

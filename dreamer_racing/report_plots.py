@@ -34,11 +34,15 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
     places = list(dict.fromkeys((result.preset, result.condition) for result in results))
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     success, gates = figure.subplots(2, 1, sharex=True)
-    for axes, name, value in ((success, "Success", "success_rate"), (gates, "Gates per episode", "gates_per_episode")):
+    panels = (
+        (success, "Success", "success_rate", "{:.0%}"),
+        (gates, "Gates per episode", "gates_per_episode", "{:.2f}"),
+    )
+    for axes, name, value, form in panels:
         for index, mode in enumerate(MODES):
             own = {(r.preset, r.condition): getattr(r.evaluation, value) for r in results if r.mode == mode}
             heights = [own.get(place, np.nan) for place in places]
-            _draw_bars(axes, np.arange(len(places)) + (index - 0.5) * 0.4, heights, MODE_COLORS[mode], mode)
+            _draw_bars(axes, np.arange(len(places)) + (index - 0.5) * 0.4, heights, MODE_COLORS[mode], mode, form=form)
         _dress(axes, name)
     success.set_ylim(0.0, 1.05)
     success.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -97,12 +101,13 @@ def plot_sight(
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
     map_height = min(6.5, 8.5 / columns * depth / width)
     figure = Figure(figsize=(10.0, map_height + 5.4), layout="constrained")
-    maps, distributions, shares = figure.subfigures(3, 1, height_ratios=[map_height + 0.4, 2.8, 2.2])
+    rows = figure.subfigures(3, 1, squeeze=False, height_ratios=[map_height + 0.4, 2.8, 2.2])
+    maps, distributions, shares = rows[:, 0]
     _draw_maps(maps, flights, camera)
     panels = distributions.subplots(1, columns, sharey=True, squeeze=False)[0]
     for axes, (name, (_, _, sights)) in zip(panels, flights.items(), strict=True):
         _draw_distributions(axes, name, sights, camera)
-    panels[0].set_ylabel("share of time, per 5°")
+    panels[0].set_ylabel("share of observations, per 5°")
     _draw_shares(shares.subplots(), {name: sights for name, (_, _, sights) in flights.items()})
     _save(figure, path, title)
 

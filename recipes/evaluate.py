@@ -39,8 +39,7 @@ def main(config: DictConfig) -> None:
     started = time.monotonic()
     with plain_errors():
         settings = cast(EvaluateConfig, OmegaConf.to_object(config))
-        if settings.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol={settings.protocol}: there are {', '.join(PROTOCOLS)}.")
+        check(settings)
         restored = restore(settings)
         directory = fresh_directory(settings.run_dir or restored.run_dir / "evaluation", RESULT)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
@@ -55,6 +54,18 @@ def main(config: DictConfig) -> None:
         write_markdown(directory, results, written["provenance"])
     (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
     print(f"\nwritten to {directory}")
+
+
+def check(config: EvaluateConfig) -> None:
+    """Refuse what is no protocol, and episodes of which there are none.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+    """
+    if config.protocol not in PROTOCOLS:
+        raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
+    if config.episodes < 1 or config.num_envs < 1:
+        raise ValueError(f"episodes={config.episodes}, num_envs={config.num_envs}: both must be at least 1.")
 
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
@@ -82,9 +93,9 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
     worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
-    options = {"num_envs": config.num_envs, "seed": config.seed}
+    policy = restored.learner.policy()
     results = []
-    for result in run_protocol(restored.learner.policy(), worlds, config.episodes, **options):
+    for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)
         print(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
         if result.preset == trained.env.preset:
