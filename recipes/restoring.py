@@ -24,6 +24,7 @@ class Restored:
     trained: DreamerConfig  # configuration of its run, with the race asked for in place of the one trained on
     learner: DreamerLearner
     counters: dict[str, int]
+    machine: dict[str, Any]  # versions and commit too, as they were at the start
 
     @property
     def run_dir(self) -> Path:
@@ -49,7 +50,7 @@ class Restored:
             "seed": config.seed,
             "wall_clock_seconds": round(seconds, 1),
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
-            **provenance(),
+            **self.machine,
         }
 
 
@@ -60,6 +61,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
         ValueError: it was not trained to race, or the device is not there.
         TrackError: there is no such track, or no such decoys on it.
     """
+    machine = provenance()
     device = choose_device(config.device)
     checkpoint = latest_checkpoint(config.checkpoint)
     saved = OmegaConf.load(checkpoint.parent.parent / "config.yaml")
@@ -74,7 +76,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
     trained.env.renderer = config.renderer
     learner, counters = restore_learner(trained, checkpoint, device)
     print(f"checkpoint: {checkpoint} ({trained.model.size}, {counters['env_steps']:,} env_steps)")
-    return Restored(checkpoint, trained, learner, counters)
+    return Restored(checkpoint, trained, learner, counters, machine)
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:
