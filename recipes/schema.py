@@ -175,7 +175,7 @@ class PerceptionConfig:
 
     checkpoint: str = MISSING  # run directory or checkpoint
     episodes: int = 100  # of each kind of flight
-    num_envs: int = 100
+    num_envs: int = 100  # the first flight in each is looked at
     track: str | None = None  # null: the track it was trained on
     decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
     preset: str | None = None  # null: the physics it was trained on

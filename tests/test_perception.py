@@ -12,6 +12,7 @@ from PIL import Image
 from dreamer_racing.envs.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.tracks import Gate, load_track, make_track
+from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.evaluation import Trajectory
 from dreamer_racing.perception import Sight, angles, is_in_view, measure_sight, points_in_camera, sight_table
 from dreamer_racing.report_plots import plot_sight
@@ -121,3 +122,24 @@ def test_plot_of_flights_with_and_without_decoys(tmp_path):
     plot_sight({"without": flights["without"]}, Camera(), tmp_path / "one.png")
     with Image.open(tmp_path / "new" / "both.png") as both, Image.open(tmp_path / "one.png") as one:
         assert both.width == one.width == 1500
+
+
+def test_points_are_where_the_renderer_draws_them():
+    """Top and bottom bars of gates, from random poses: the pixel that a point in view projects to is orange."""
+    worlds = RaceWorlds("circle", 40, renderer="warp", num_threads=1, seed=0)
+    worlds.reset()
+    state, track = worlds.privileged(), worlds.track
+    images = worlds.render()
+    bar = (track.shape.outer + track.shape.opening) / 4  # m above and below the gate's centre
+    centres = track.gate_positions()
+    points = torch.cat((centres, centres)) + torch.tensor([[0.0, 0.0, bar]] * 4 + [[0.0, 0.0, -bar]] * 4)
+    seen = points_in_camera(state["position"], state["attitude"], points, worlds.camera)  # (40, 8, 3)
+    depth, left, up = seen.unbind(-1)
+    edge = torch.maximum(left.abs(), up.abs()) > 0.95 * depth  # half a pixel may be another thing there
+    near = is_in_view(seen, worlds.camera) & ~edge & (depth < 4.0)
+    assert near.sum() > 20
+    world, _ = near.nonzero(as_tuple=True)
+    row, column = (32 * (1 - offset / depth)[near] for offset in (up, left))
+    colors = images[world, row.long(), column.long()].int()
+    assert (colors[:, 0] > 150).all() and (colors[:, 2] < 60).all()
+    worlds.close()

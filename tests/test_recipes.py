@@ -310,6 +310,7 @@ def test_a_run_is_not_begun_over_another(run_dir: Path, capsys: pytest.CaptureFi
     [
         (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
         (["env=dmc", "track=circle"], "track=circle is for races"),
+        (["env=dmc", "+decoys=paper"], "decoys=paper are for races"),
     ],
 )
 def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:
