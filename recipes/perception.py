@@ -31,7 +31,8 @@ from dreamer_racing.report_plots import plot_sight
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"
-START_NOISE = 1.0  # as in training, so that no two flights are the same and none can be flown from memory
+NO_NOISE, START_NOISE = 0.0, 1.0  # of starts, in units of training's; with it no two flights are the same
+START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
 
 register()
 
@@ -49,7 +50,7 @@ def main(config: DictConfig) -> None:
         tracks = tracks_to_fly(restored.trained)
         directory = fresh_directory(settings.run_dir or restored.run_dir / "perception", RESULT)
     looked = fly_and_look(settings, restored, tracks)
-    lesions = fly_lesioned(settings, restored)
+    lesions = {noise: fly_lesioned(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
     provenance = restored.provenance(settings, time.monotonic() - started)
     write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
     print(f"\nwritten to {directory}")
@@ -64,6 +65,14 @@ class Looked:
     success_rate: float
     trajectory: Trajectory  # the first of them
     sights: dict[str, Sight]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers; nothing but what JSON knows."""
+        return {
+            "gates_per_episode": self.gates_per_episode,
+            "success_rate": self.success_rate,
+            "sights": {thing: sight.to_dict() for thing, sight in self.sights.items()},
+        }
 
 
 def tracks_to_fly(trained: DreamerConfig) -> dict[str, Track]:
@@ -98,45 +107,54 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
     return looked
 
 
-def fly_lesioned(config: PerceptionConfig, restored: Restored) -> list[Result]:
+def fly_lesioned(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
     """Fly the policy in both modes on the track as it was asked for, with every lesion of its camera."""
     trained = restored.trained
-    worlds = worlds_of(trained) | {"start_noise": START_NOISE, "seed": config.seed}
+    worlds = worlds_of(trained) | {"start_noise": start_noise, "seed": config.seed}
     results = []
     for name, lesion in LESIONS.items():
         for mode in MODES:
             policy = LesionedPolicy(restored.learner.policy(), lesion())
             flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
             results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
-            print(f"\n{name} images, {mode} policy\n{flown.summary()}")
+            print(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
     return results
 
 
 def write(
-    directory: Path, looked: dict[str, Looked], lesions: list[Result], provenance: dict[str, Any], camera: Camera
+    directory: Path,
+    looked: dict[str, Looked],
+    lesions: dict[float, list[Result]],
+    provenance: dict[str, Any],
+    camera: Camera,
 ) -> None:
-    """Write numbers, tables and the plot."""
+    """Write numbers, tables and the plot; lesions are by the noise of starts."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    plot_sight({name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}, camera,
-               directory / "perception.png", title)  # fmt: skip
-    flights = {
-        name: {
-            "gates_per_episode": kind.gates_per_episode,
-            "success_rate": kind.success_rate,
-            "sights": {thing: sight.to_dict() for thing, sight in kind.sights.items()},
-        }
-        for name, kind in looked.items()
+    flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
+    plot_sight(flights, camera, directory / "perception.png", title)
+    (directory / "perception.md").write_text(to_markdown(title, looked, lesions, provenance))
+    numbers = {
+        "flights": {name: kind.to_dict() for name, kind in looked.items()},
+        "lesions": [
+            {"images": result.condition, "start_noise": noise, **result.to_dict()}
+            for noise, results in lesions.items()
+            for result in results
+        ],
+        "provenance": provenance,
     }
-    records = [{"images" if key == "condition" else key: value for key, value in result.to_dict().items()}
-               for result in lesions]  # fmt: skip
-    numbers = {"flights": flights, "lesions": records, "provenance": provenance}
     (directory / RESULT).write_text(json.dumps(numbers, indent=2, allow_nan=False) + "\n")
-    sights = sight_table({name: kind.sights for name, kind in looked.items()})
-    text = (
-        f"{heading(title, provenance)}\n## What the camera is turned to\n\n{sights}\n![perception](perception.png)\n\n"
-        f"## Lesions of the camera\n\n{results_table(lesions, 'images')}"
-    )
-    (directory / "perception.md").write_text(text)
+
+
+def to_markdown(
+    title: str, looked: dict[str, Looked], lesions: dict[float, list[Result]], provenance: dict[str, Any]
+) -> str:
+    """Return the tables as a page."""
+    parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
+    parts += [sight_table({name: kind.sights for name, kind in looked.items()}), "![perception](perception.png)\n"]
+    parts.append("## Lesions of the camera\n")
+    for noise, results in lesions.items():
+        parts += [START_TEXT[noise], results_table(results, "images")]
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":

@@ -188,8 +188,9 @@ def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
     assert set(report["flights"]) == {"without decoys", "with decoys"}
     for flights in report["flights"].values():
         assert {"next gate", "nearest visible gate", "decoy 1", "decoy 2"} <= set(flights["sights"])
-    lesions = [(record["images"], record["policy"]) for record in report["lesions"]]
-    assert lesions == [(name, mode) for name in LESIONS for mode in ("deterministic", "stochastic")]
+    lesions = [(record["start_noise"], record["images"], record["policy"]) for record in report["lesions"]]
+    modes = ("deterministic", "stochastic")
+    assert lesions == [(noise, name, mode) for noise in (0.0, 1.0) for name in LESIONS for mode in modes]
     assert (tmp_path / "seen" / "perception.png").exists() and (tmp_path / "seen" / "perception.md").exists()
     refused = recipe("perception", f"checkpoint='{run_dir}'", "+decoys=paper", *options, cwd=tmp_path)
     assert refused.returncode == 2 and "Traceback" not in refused.stderr
