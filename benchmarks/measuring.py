@@ -1,35 +1,11 @@
 """What every benchmark does: say where it was measured, print a table, write flat JSON."""
 
-import importlib.metadata
 import json
-import platform
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
-PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp")
-
-
-def provenance() -> dict[str, Any]:
-    """Machine, versions and commit, to be added to every record."""
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
-    return {
-        "machine": f"{platform.system()} {platform.machine()}, {_cpu()}, {torch.get_num_threads()} torch threads",
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in PACKAGES},
-        "commit": commit.stdout.strip(),
-    }
-
-
-def _cpu() -> str:
-    from dreamer_racing.envs.simulator.mujoco_cpu import available_cpus
-
-    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    return f"{available_cpus()} x {names[0].partition(': ')[2]}" if names else f"{available_cpus()} cores"
+from dreamer_racing.provenance import provenance
 
 
 def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:

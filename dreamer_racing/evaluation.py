@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -18,42 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dreamer_racing.envs.gates import CrashCause
-
-FINISHED, TIMEOUT = "finished", "timeout"
-CRASHES = tuple(cause.name.lower() for cause in CrashCause if cause is not CrashCause.NONE)
-"""Names of the causes of a crash; an episode's outcome is one of these, ``finished`` or ``timeout``."""
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """One recorded episode of K control steps, all tensors on the CPU; row 0 is before the first step."""
-
-    position: Tensor
-    """(K + 1, 3) m."""
-    attitude: Tensor
-    """(K + 1, 4) unit quaternion wxyz, body → world."""
-    linear_velocity: Tensor
-    """(K + 1, 3) in the world, m/s."""
-    target_gate: Tensor
-    """(K + 1,) int64: the gate to pass next."""
-    action: Tensor
-    """(K, A): row k leads from k to k + 1."""
-    pixels: Tensor | None
-    """(K + 1, H, W, 3) uint8, or None if the environment has no images."""
-    control_dt: float
-    """Duration of a step, s."""
-    outcome: str | None
-    """How the episode ended; None if the recording was stopped before its end."""
-
-    @property
-    def speed(self) -> Tensor:
-        """(K + 1,) m/s."""
-        return self.linear_velocity.norm(dim=-1)
-
-    @property
-    def crashed(self) -> bool:
-        """Whether the last row is where the drone crashed."""
-        return self.outcome in CRASHES
+from dreamer_racing.trajectory import CRASHES, FINISHED, TIMEOUT, Trajectory, TrajectoryRecorder
 
 
 @dataclass(frozen=True)
@@ -70,6 +35,9 @@ class Episode:
         gate_offsets: at each pass, distance from the gate's centre, m.
         speed_max: m/s.
         speed_mean: m/s.
+        action_change_mean: mean norm of the change of the action from one control step to the next, in units of the
+            action, whose four numbers lie in [−1, 1]; 0 of an episode of one step.
+        crash_gate: index of the gate that was next when the drone crashed, from 0; None if it did not.
     """
 
     reward_sum: float
@@ -81,6 +49,8 @@ class Episode:
     gate_offsets: list[float]
     speed_max: float
     speed_mean: float
+    action_change_mean: float
+    crash_gate: int | None
 
 
 @dataclass(frozen=True)
@@ -89,10 +59,12 @@ class Evaluation:
 
     Args:
         episodes: every episode, in the order in which they were dealt to the environments.
+        num_gates: race gates of the track.
         trajectories: the recorded ones.
     """
 
     episodes: list[Episode]
+    num_gates: int
     trajectories: list[Trajectory] = field(default_factory=list)
 
     @property
@@ -109,6 +81,17 @@ class Evaluation:
     def crashes(self) -> dict[str, int]:
         """Number of episodes that ended by each cause of a crash, zeros included."""
         return {cause: sum(episode.outcome == cause for episode in self.episodes) for cause in CRASHES}
+
+    @property
+    def crashes_by_gate(self) -> dict[str, list[int]]:
+        """For each cause of a crash, the number of episodes that ended by it on the way to each of the gates."""
+        return {
+            cause: [
+                sum(episode.outcome == cause and episode.crash_gate == gate for episode in self.episodes)
+                for gate in range(self.num_gates)
+            ]
+            for cause in CRASHES
+        }
 
     @property
     def gates_per_episode(self) -> float:
@@ -163,6 +146,24 @@ class Evaluation:
         offsets = [offset for episode in self.episodes for offset in episode.gate_offsets]
         return _mean(offsets) if offsets else None
 
+    @property
+    def action_change_mean(self) -> float:
+        """Mean norm of the change of the action over all pairs of successive control steps: 0 is smoothest.
+
+        The pairs are those of one episode; actions are taken as the drone takes them, clipped to [−1, 1].
+        """
+        changes = sum(episode.action_change_mean * (episode.length - 1) for episode in self.episodes)
+        return changes / max(1, sum(episode.length - 1 for episode in self.episodes))
+
+    @classmethod
+    def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """Put evaluations on tracks with the same number of gates together, in order."""
+        return cls(
+            [episode for part in parts for episode in part.episodes],
+            parts[0].num_gates,
+            [trajectory for part in parts for trajectory in part.trajectories],
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return all statistics and, under ``episodes``, every episode; nothing but what JSON knows."""
         names = (
@@ -173,7 +174,9 @@ class Evaluation:
             "speed_max",
             "speed_mean",
             "gate_offset_mean",
+            "action_change_mean",
             "crashes",
+            "crashes_by_gate",
             "timeout_rate",
             "return_mean",
             "return_std",
@@ -203,6 +206,7 @@ class Evaluation:
             ("lap time", f"best {best}, mean {mean} ({len(self.lap_times)} laps)"),
             ("speed", f"max {self.speed_max:.1f} m/s, mean {self.speed_mean:.1f} m/s"),
             ("gate offset", f"mean {offset}"),
+            ("action change", f"mean {self.action_change_mean:.3f} a step"),
             ("return", f"{self.return_mean:.1f} ± {self.return_std:.1f}"),
         )
         return "\n".join(f"{name:<18} {value}" for name, value in rows)
@@ -217,6 +221,7 @@ def evaluate(
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     num_trajectories: int = 1,
     max_recorded_steps: int = 1000,
+    record_pixels: bool = True,
 ) -> Evaluation:
     """Fly exactly this many whole episodes.
 
@@ -231,6 +236,7 @@ def evaluate(
         exploration_type: what TorchRL's probabilistic policies return: mode or sample.
         num_trajectories: the first episode of this many environments is recorded.
         max_recorded_steps: a recording stops here, K at most.
+        record_pixels: whether recordings keep images, 12 KB a step.
 
     Returns:
         The episodes and the recordings.
@@ -249,23 +255,24 @@ def evaluate(
     shares = [episodes // num_envs + (index < episodes % num_envs) for index in range(num_envs)]
     logs = [_EpisodeLog(control_dt) for _ in range(num_envs)]
     flown: list[list[Episode]] = [[] for _ in range(num_envs)]
-    recorders = [_Recorder(index, max_recorded_steps) for index in range(min(num_trajectories, num_envs, episodes))]
     with set_exploration_type(exploration_type):
         tensordict = env.reset()
-        for recorder in recorders:
-            recorder.start(tensordict)
+        recorder = TrajectoryRecorder(
+            tensordict, min(num_trajectories, num_envs, episodes), max_recorded_steps, record_pixels
+        )
+        action = torch.zeros(env.action_spec.shape, device=env.device)
         while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))
-            steps = _read_step(tensordict["next"])
+            action, action_before = _as_flown(tensordict["action"]), action
+            steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))
             for index, (log, step) in enumerate(zip(logs, steps, strict=True)):
                 if len(flown[index]) < shares[index]:
                     flown[index] += log.add(step)
-            for recorder in recorders:
-                recorder.add(tensordict, _outcome(steps[recorder.index]))
+            recorder.add(tensordict, [_outcome(step) for step in steps])
             tensordict = following
     waves = range(max(shares))
     ordered = [flown[index][wave] for wave in waves for index in range(num_envs) if wave < shares[index]]
-    return Evaluation(ordered, [recorder.trajectory(control_dt) for recorder in recorders])
+    return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt))
 
 
 def _check(env: EnvBase, episodes: int) -> float:
@@ -286,9 +293,21 @@ def _check(env: EnvBase, episodes: int) -> float:
     return float(env.worlds.parameters.control_dt)
 
 
-def _read_step(after: TensorDictBase) -> list[dict[str, float]]:
-    """Read what is measured in one step; one dictionary for each of the N environments, in one transfer."""
+def _as_flown(action: Tensor) -> Tensor:
+    """Return actions (N, A) as the drones take them; one that is not finite ends its episode and counts as zero."""
+    return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
+
+
+def _read_step(after: TensorDictBase, action_change: Tensor) -> list[dict[str, float]]:
+    """Read what is measured in one step; one dictionary for each of the N environments, in one transfer.
+
+    Args:
+        after: what the step led to.
+        action_change: norm of the change from the action before, (N, 1).
+    """
     columns = {
+        "action_change": action_change,
+        "target_gate": after["privileged", "target_gate"],
         "reward": after["reward"],
         "done": after["done"],
         "speed": after["privileged", "linear_velocity"].norm(dim=-1, keepdim=True),
@@ -316,7 +335,7 @@ class _EpisodeLog:
 
     def add(self, step: dict[str, float]) -> list[Episode]:
         """Add one step; return the episode that it ended, if it did."""
-        for name in ("reward", "speed", "gates_passed", "gate_offset", "lap_time"):
+        for name in ("reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change"):
             self._values[name].append(step[name])
         outcome = _outcome(step)
         if outcome is None:
@@ -325,6 +344,7 @@ class _EpisodeLog:
         speeds = [speed for speed in values["speed"] if speed < float("inf")] or [0.0]  # a lost state has no speed
         length = len(values["reward"])
         passed = values["gates_passed"]
+        changes = values["action_change"][1:]  # the first is from another episode's last action
         episode = Episode(
             reward_sum=sum(values["reward"]),
             length=length,
@@ -339,52 +359,10 @@ class _EpisodeLog:
             ],
             speed_max=max(speeds),
             speed_mean=_mean(speeds),
+            action_change_mean=_mean(changes) if changes else 0.0,
+            crash_gate=int(step["target_gate"]) if outcome in CRASHES else None,
         )
         return [episode]
-
-
-class _Recorder:
-    """Records the first episode of one environment.
-
-    Args:
-        index: which environment.
-        max_steps: K at most.
-    """
-
-    def __init__(self, index: int, max_steps: int) -> None:
-        self.index = index
-        self._max_steps = max_steps
-        self._rows: dict[str, list[Tensor]] = defaultdict(list)
-        self._outcome: str | None = None
-        self._running = True
-
-    def start(self, root: TensorDictBase) -> None:
-        """Record the first observation."""
-        self._observe(root)
-
-    def add(self, step: TensorDictBase, outcome: str | None) -> None:
-        """Record a step, its action at the root and its observation under ``next``; outcome is None if it goes on."""
-        self._running &= len(self._rows["action"]) < self._max_steps
-        if not self._running:
-            return
-        self._rows["action"].append(step["action"][self.index].float().cpu().clone())
-        self._observe(step["next"])
-        self._outcome = outcome
-        self._running = outcome is None
-
-    def _observe(self, tensordict: TensorDictBase) -> None:
-        entries = {name: tensordict["privileged", name] for name in ("position", "attitude", "linear_velocity")}
-        entries["target_gate"] = tensordict["privileged", "target_gate"].squeeze(-1)
-        pixels = tensordict.get("pixels", None)
-        if pixels is not None:
-            entries["pixels"] = pixels
-        for name, value in entries.items():
-            self._rows[name].append(value[self.index].cpu().clone())
-
-    def trajectory(self, control_dt: float) -> Trajectory:
-        rows = {name: torch.stack(values) for name, values in self._rows.items()}
-        pixels = rows.pop("pixels", None)
-        return Trajectory(**rows, pixels=pixels, control_dt=control_dt, outcome=self._outcome)
 
 
 def _mean(values: list[Any]) -> float:

@@ -62,7 +62,7 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
     heights = [gate.position[2] for gate in track.gates]
     side_view = max(heights) - min(heights) > HEIGHT_SPREAD
     figure, axes, side = _layout(track, side_view)
-    speed = Normalize(0.0, max(1.0, math.ceil(float(np.nanmax(trajectory.speed.numpy())))))
+    speed = speed_scale([trajectory])
     panels: list[tuple[Axes, tuple[int, int]]] = [(axes, (0, 1))]
     draw_track(axes, track)
     if side is not None:
@@ -77,6 +77,33 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
     axes.set_title(title or _title(track, trajectory), loc="left", fontsize=11, color=INK, pad=8)
     _add_legend(figure, track, trajectory)
     save(figure, path)
+
+
+def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
+    """Return the scale of colours from 0 to the highest speed of some flights, rounded up to whole m/s."""
+    top = max(float(np.nanmax(trajectory.speed.numpy())) for trajectory in trajectories)
+    return Normalize(0.0, max(1.0, math.ceil(top)))
+
+
+def draw_flight(
+    axes: Axes,
+    trajectory: Trajectory,
+    speed: Normalize,
+    plane: tuple[int, int] = (0, 1),
+    tilt: float = Camera.tilt,
+) -> None:
+    """Draw a path coloured by speed, the camera's directions along it, its start, and its end if that is a crash.
+
+    Args:
+        axes: where; `draw_track` draws what belongs below.
+        trajectory: the flight.
+        speed: scale of the colours.
+        plane: the two world axes that are seen.
+        tilt: of the camera, degrees.
+    """
+    _draw_path(axes, trajectory, plane, speed)
+    _draw_cameras(axes, trajectory, plane, tilt)
+    _draw_ends(axes, trajectory, plane)
 
 
 def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
@@ -100,20 +127,6 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
     _dress(axes, "y (m)" if labels else None)
     if labels:
         axes.set_xlabel("x (m)")
-
-
-def draw_flight(axes: Axes, trajectory: Trajectory, speed: Normalize, plane: tuple[int, int] = (0, 1)) -> None:
-    """Draw an episode's path coloured by speed, the camera's direction every 0.1 s, start and crash.
-
-    Args:
-        axes: where, on top of the track.
-        trajectory: the episode.
-        speed: from m/s to the colours of `SPEED_COLORS`.
-        plane: the two of x, y and z (0, 1, 2) that are drawn.
-    """
-    _draw_path(axes, trajectory, plane, speed)
-    _draw_cameras(axes, trajectory, plane)
-    _draw_ends(axes, trajectory, plane)
 
 
 def plot_curve(
@@ -266,11 +279,11 @@ def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed
     axes.add_collection(lines, autolim=False)
 
 
-def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
+def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], tilt: float) -> None:
     """Draw the camera's direction, projected into the plane, every 0.1 s."""
     every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
     origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
-    direction = camera_directions(trajectory.attitude[::every])[:, list(plane)].numpy()
+    direction = camera_directions(trajectory.attitude[::every], tilt)[:, list(plane)].numpy()
     axes.quiver(
         *origin.T,
         *(ARROW_LENGTH * direction).T,

@@ -13,6 +13,7 @@ from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.learner import DreamerLearner, Learner, LearnerConfig
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface
@@ -60,7 +61,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run."""
     env = config.env
     return {
-        "track": config.track,
+        "track": with_decoys(config.track, config.decoys),
         "preset": env.preset,
         "renderer": env.renderer,
         "camera": camera_of(config),

@@ -98,7 +98,7 @@ RANGES = {
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse a task without `env=dmc`, and a track with it: one of them would be ignored.
+    """Refuse a task without `env=dmc`, and a track or decoys with it: one of them would be ignored.
 
     Raises:
         ValueError: the message says what to add or leave out.
@@ -107,6 +107,8 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
     race = config.env.suite == "race"
     if race and "task" in given:
         raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
+    if not race and config.decoys:
+        raise ValueError(f"decoys={config.decoys} are for races, and env.suite={config.env.suite}: leave them out.")
     if not race and "track" in given:
         raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
 

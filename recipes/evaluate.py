@@ -1,63 +1,137 @@
 """Fly a trained policy and measure how well it races.
 
     python recipes/evaluate.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 episodes=100
+    python recipes/evaluate.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 protocol=full
 
 Flies the deterministic and the stochastic policy from the start pose for the track's laps, prints both, and writes
-evaluation.json beside plots, videos and the episodes' own numbers.
+evaluation.json beside plots, videos and the episodes' own numbers. protocol=full does it under every condition of
+docs/evaluation.md, with both presets of physics, and adds evaluation.md. An earlier evaluation is never overwritten.
 """
 
 import json
+import time
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
-import torch
-from arena import is_race, make_report, restore_learner, trained_config
-from command_line import choose_device, plain_errors, start_logging
+from arena import make_report, worlds_of
+from command_line import plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
+from restoring import Restored, fresh_directory, heading, restore
 from schema import EvaluateConfig, register
 
-from dreamer_racing.checkpoint import ensure_writable, latest_checkpoint
+from dreamer_racing.plotting import plot_top_down
+from dreamer_racing.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
+from dreamer_racing.recording import onboard_beside_map, write_video
+from dreamer_racing.report_plots import plot_conditions, plot_crashes
 from dreamer_racing.reporting import EvaluationReport
+
+PROTOCOLS = ("nominal", "full")
+RESULT = "evaluation.json"
 
 register()
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="evaluate")
 def main(config: DictConfig) -> None:
-    """Restore the policy, fly it both ways, report."""
+    """Restore the policy, fly it, report."""
     start_logging()
+    started = time.monotonic()
     with plain_errors():
-        report, directory = build(cast(EvaluateConfig, OmegaConf.to_object(config)))
-    results: dict[str, Any] = {}
-    for name in ("deterministic", "stochastic"):
+        settings = cast(EvaluateConfig, OmegaConf.to_object(config))
+        check(settings)
+        restored = restore(settings)
+        directory = fresh_directory(settings.run_dir or restored.run_dir / "evaluation", RESULT)
+        print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
+        report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
+    if report:
+        written = evaluate_nominal(report)
+    else:
+        results = evaluate_fully(settings, restored, directory)
+        written = describe(results, restored.trained.env.preset)
+    written["provenance"] = restored.provenance(settings, time.monotonic() - started)
+    if not report:
+        write_markdown(directory, results, written["provenance"])
+    (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
+    print(f"\nwritten to {directory}")
+
+
+def check(config: EvaluateConfig) -> None:
+    """Refuse what is no protocol, and episodes of which there are none.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+    """
+    if config.protocol not in PROTOCOLS:
+        raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
+    if config.episodes < 1 or config.num_envs < 1:
+        raise ValueError(f"episodes={config.episodes}, num_envs={config.num_envs}: both must be at least 1.")
+
+
+def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
+    """Make the races that the policy is to fly as it was trained to."""
+    options = {"num_envs": config.num_envs, "seed": config.seed}
+    report = make_report(restored.trained, directory, restored.learner, config.episodes, config.video_steps, **options)
+    return cast(EvaluationReport, report)
+
+
+def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:
+    """Fly the policy both ways; return what evaluation.json says of each."""
+    written: dict[str, Any] = {}
+    for name in MODES:
         result = report.evaluate(deterministic=name == "deterministic")
         report.write(name, result)
-        results[name] = result.to_dict()
+        written[name] = result.to_dict()
         print(f"\n{name} policy, {len(result.episodes)} episodes\n{result.summary()}")
-    (directory / "evaluation.json").write_text(json.dumps(results, indent=2))
-    print(f"\nwritten to {directory}")
     report.close()
+    return written
 
 
-def build(config: EvaluateConfig) -> tuple[EvaluationReport, Path]:
-    """Restore the learner of a checkpoint and make the races that its policy is to fly."""
-    device = choose_device(config.device)
-    checkpoint = latest_checkpoint(config.checkpoint)
-    run_dir = checkpoint.parent.parent
-    trained = trained_config(run_dir)
-    torch.manual_seed(config.seed)
-    if not is_race(trained):
-        raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
-    trained.track, trained.env.preset = config.track or trained.track, config.preset or trained.env.preset
-    trained.env.renderer = config.renderer
-    learner, counters = restore_learner(trained, checkpoint, device)
-    directory = ensure_writable(config.run_dir or run_dir / "evaluation")
-    print(f"checkpoint: {checkpoint} ({trained.algorithm}, {counters['env_steps']:,} env_steps)")
-    print(f"race: {trained.track}, {trained.env.preset}, {config.episodes} episodes")
-    options = {"num_envs": config.num_envs, "seed": config.seed}
-    report = make_report(trained, directory, learner, config.episodes, config.video_steps, **options)
-    return cast(EvaluationReport, report), directory
+def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) -> list[Result]:
+    """Fly the policy under all conditions and write each one's episodes, plot and, for some, video."""
+    if config.episodes < EPISODES:
+        print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
+    trained = restored.trained
+    worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
+    policy = restored.learner.policy()
+    results = []
+    for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
+        results.append(result)
+        print(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
+        if result.preset == trained.env.preset:
+            write_flight(directory, result, config.video_steps)
+        path = directory / "evaluations" / f"{result.name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(result.evaluation.to_json())
+    return results
+
+
+def write_flight(directory: Path, result: Result, video_steps: int) -> None:
+    """Draw the first flight of a condition from above; film it, if the agent sees and acts without noise."""
+    trajectory = result.evaluation.trajectories[0]
+    plot_top_down(result.track, trajectory, directory / "plots" / f"{result.name}.png")
+    if trajectory.pixels is not None and result.mode == "deterministic":
+        frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
+        write_video(directory / "videos" / f"{result.name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+
+
+def describe(results: list[Result], preset: str) -> dict[str, Any]:
+    """Return what evaluation.json says: the nominal race as with protocol=nominal, and a record of each condition."""
+    nominal = {r.mode: r.evaluation.to_dict() for r in results if r.preset == preset and r.condition == "nominal"}
+    return {**nominal, "conditions": [result.to_dict() for result in results]}
+
+
+def write_markdown(directory: Path, results: list[Result], provenance: dict[str, Any]) -> None:
+    """Write the table of conditions with its two plots."""
+    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
+    plot_conditions(results, directory / "plots" / "conditions.png", title)
+    for preset in dict.fromkeys(result.preset for result in results):
+        flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
+        plot_crashes(flown, directory / "plots" / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
+    meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
+    plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
+    text = f"{heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
+    (directory / "evaluation.md").write_text(text)
 
 
 if __name__ == "__main__":

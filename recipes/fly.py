@@ -8,7 +8,7 @@ images: it shows what a track asks for, and what lap times are in reach.
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -123,10 +123,7 @@ def second_lap(trajectory: Trajectory) -> Trajectory:
     gate = trajectory.target_gate
     ends = (torch.nonzero((gate[1:] == 0) & (gate[:-1] != 0)).flatten() + 1).tolist()
     first, last = ends[:2] if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
-    names = ("position", "attitude", "linear_velocity", "target_gate", "pixels")
-    rows = {name: getattr(trajectory, name)[first : last + 1] for name in names}
-    outcome = trajectory.outcome if last == len(gate) - 1 else None
-    return replace(trajectory, **rows, action=trajectory.action[first:last], outcome=outcome)
+    return trajectory.part(first, last)
 
 
 def watch(config: FlyConfig) -> None:

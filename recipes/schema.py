@@ -142,6 +142,7 @@ class RunConfig:
 
     algorithm: str = MISSING  # the recipe
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
+    decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
     total_env_steps: int = 1_000_000  # control steps summed over environments
@@ -221,12 +222,30 @@ class EvaluateConfig:
     """`recipes/evaluate.py`."""
 
     checkpoint: str = MISSING  # run directory or checkpoint
-    episodes: int = 100
+    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    episodes: int = 100  # of each condition
     num_envs: int = 20
     track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper | none; null: as it was trained
     preset: str | None = None  # null: the physics it was trained on
     run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
     video_steps: int = 500
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = 0
+
+
+@dataclass
+class PerceptionConfig:
+    """`recipes/perception.py`."""
+
+    checkpoint: str = MISSING  # run directory or checkpoint
+    episodes: int = 100  # of each kind of flight
+    num_envs: int = 100  # the first flight in each is looked at
+    track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: <run of the checkpoint>/perception
     device: str = "auto"
     renderer: str = "auto"
     seed: int = 0
@@ -275,6 +294,7 @@ def register() -> None:
     store.store(name="sac_schema", node=SACRunConfig)
     store.store(name="experiment_schema", node=ExperimentConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="perception_schema", node=PerceptionConfig)
     store.store(name="export_schema", node=ExportConfig)
     store.store(name="plot_schema", node=PlotConfig)
     for group, node in (

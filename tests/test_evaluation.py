@@ -13,9 +13,10 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transf
 
 from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.evaluation import CRASHES, FINISHED, TIMEOUT, evaluate
+from dreamer_racing.evaluation import CRASHES, FINISHED, TIMEOUT, Evaluation, evaluate
 
 DT = 0.02
+STATE_KEY = ("privileged", "position")
 
 
 class ScriptedRace(EnvBase):
@@ -23,12 +24,14 @@ class ScriptedRace(EnvBase):
 
     Every step has the reward 1 and speed `length` of its episode, except that the drone of a crash ends with an
     infinite speed; every second step passes a gate at offset 0.1 · i, and every fourth completes a lap of length · DT.
+    The gates are three.
     """
 
     def __init__(self, script: list[list[tuple[int, str]]]) -> None:
         super().__init__(batch_size=[len(script)])
         self.script = script
-        self.worlds = SimpleNamespace(evaluation=True, parameters=SimpleNamespace(control_dt=DT))
+        parameters, track = SimpleNamespace(control_dt=DT), SimpleNamespace(num_gates=3)
+        self.worlds = SimpleNamespace(evaluation=True, parameters=parameters, track=track)
         n = self.batch_size
         self.action_spec = Bounded(-1.0, 1.0, (*n, 4))
         self.reward_spec = Unbounded((*n, 1))
@@ -68,6 +71,7 @@ class ScriptedRace(EnvBase):
             data["race", "crash"][i] = CrashCause[outcome.upper()] if crashes else 0
             data["race", "finished"][i] = ends and outcome == FINISHED
             data["race", "gates_passed"][i] = age // 2
+            data["privileged", "target_gate"][i] = age // 2 % 3
             data["race", "gate_offset"][i] = 0.1 * i * (age % 2 == 0)
             data["race", "lap_time"][i] = length * DT * (age % 4 == 0)
             data["privileged", "position"][i] = self.number[i]
@@ -142,6 +146,46 @@ def test_statistics_by_hand():
     assert result.gate_offset_mean == pytest.approx(sum(offsets) / len(offsets))
 
 
+def test_crashes_by_gate():
+    """Environment 0 crashes after one gate, 1 after seven (2 laps and 1), 2 before any; 3 finishes."""
+    script = [[(2, "ground")], [(14, "ground")], [(1, "gate_frame")], [(9, FINISHED)]]
+    result = evaluate(ScriptedRace(script), idle(4), 8)
+    assert [episode.crash_gate for episode in result.episodes] == [1, 1, 0, None] * 2
+    assert result.crashes_by_gate == {cause: [0, 0, 0] for cause in CRASHES} | {
+        "ground": [0, 4, 0],
+        "gate_frame": [2, 0, 0],
+    }
+
+
+def test_action_change_by_hand():
+    """Steps of ‖(0.3, 0.4, 0, 0)‖ = 0.5 up and down; beyond [−1, 1] nothing changes; episodes do not touch."""
+    actions = {0: (0.0, 0.3, 0.0), 1: (1.0, 3.0, 1.0, -1.0)}  # of each environment, step by step
+    scale = torch.tensor([[1.0, 4 / 3, 0, 0], [1.0, 0, 0, 0]])
+    steps = iter(range(100))
+
+    def act(position):
+        step = next(steps)
+        rows = [torch.full((4,), actions[index][step % len(actions[index])]) for index in range(2)]
+        return torch.stack(rows) * scale
+
+    result = evaluate(ScriptedRace([[(3, TIMEOUT)], [(4, TIMEOUT)]]), TensorDictModule(act, [STATE_KEY], ["action"]), 4)
+    assert [episode.action_change_mean for episode in result.episodes] == pytest.approx([0.5, 2 / 3, 0.5, 2 / 3])
+    assert result.action_change_mean == pytest.approx((4 * 0.5 + 6 * 2 / 3) / 10)
+
+
+def test_an_action_that_is_not_finite_counts_as_zero_and_one_step_has_no_change():
+    act = TensorDictModule(lambda position: torch.full((1, 4), float("nan")), [STATE_KEY], ["action"])
+    assert evaluate(ScriptedRace([[(2, "invalid_action")]]), act, 1).action_change_mean == 0.0
+    assert evaluate(ScriptedRace([[(1, "invalid_action")]]), act, 2).action_change_mean == 0.0
+
+
+def test_joined_evaluations_have_all_episodes():
+    first, second = evaluate(ScriptedRace(SCRIPT), idle(), 2), evaluate(ScriptedRace(SCRIPT), idle(), 3)
+    joined = Evaluation.join([first, second])
+    assert [episode.length for episode in joined.episodes] == [2, 30, 2, 30, 4]
+    assert joined.num_gates == 3 and len(joined.trajectories) == 2
+
+
 def test_json_has_the_promised_keys_and_nothing_that_is_not_json():
     text = evaluate(ScriptedRace(SCRIPT), idle(), 4).to_json()
     read = json.loads(text, parse_constant=pytest.fail)
@@ -167,6 +211,24 @@ def test_records_the_first_episode_only():
     assert stopped.pixels[:, 0, 0, 0].tolist() == list(range(21))
     assert (crashed.position == 0).all()
     assert stopped.speed.tolist() == [0.0] + [30.0] * 20
+
+
+def test_records_without_images_and_none_at_all():
+    result = evaluate(ScriptedRace(SCRIPT), idle(), 3, num_trajectories=3, record_pixels=False)
+    assert [(len(flight.position), flight.pixels) for flight in result.trajectories] == [
+        (3, None),
+        (31, None),
+        (5, None),
+    ]
+    assert [flight.outcome for flight in result.trajectories] == ["ground", TIMEOUT, "gate_frame"]
+    assert evaluate(ScriptedRace(SCRIPT), idle(), 3, num_trajectories=0).trajectories == []
+
+
+def test_part_of_a_flight():
+    flight = evaluate(ScriptedRace(SCRIPT), idle(), 1).trajectories[0]
+    assert flight.part(0, 2).outcome == "ground"
+    part = flight.part(1, 1)
+    assert (len(part.position), len(part.action), part.pixels[0, 0, 0, 0], part.outcome) == (1, 0, 1, None)
 
 
 def test_recurrent_policy_starts_every_episode_afresh():

@@ -17,6 +17,8 @@ from omegaconf import OmegaConf
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.lesions import LESIONS
 from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
 SMALL = [
@@ -48,8 +50,9 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
 def test_every_group_composes(path: Path) -> None:
+    append = "+" if path.parent.name == "decoys" else ""  # not among the defaults
     recipe_with_group = {"network": "ppo"}.get(path.parent.name, "dreamer_v3")
-    config = compose(recipe_with_group, f"{path.parent.name}={path.stem}")
+    config = compose(recipe_with_group, f"{append}{path.parent.name}={path.stem}")
     assert OmegaConf.select(config, path.parent.name) is not None
 
 
@@ -94,9 +97,75 @@ def test_evaluate_reports_both_policies(run_dir: Path) -> None:
         assert policy in done.stdout
         assert len(report[policy]["episodes"]) == 3
         for key in ("success_rate", "gates_per_episode", "lap_time_best", "lap_time_mean", "speed_max",
-                    "gate_offset_mean", "crashes"):  # fmt: skip
+                    "gate_offset_mean", "crashes", "crashes_by_gate", "action_change_mean"):  # fmt: skip
             assert key in report[policy]
         assert (run_dir / "evaluation" / "videos" / f"{policy}.mp4").stat().st_size > 0
+
+
+def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fresh = recipe_module("restoring").fresh_directory
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation"
+    assert capsys.readouterr().out == ""
+    for number in (1, 2):
+        holding = tmp_path / ("evaluation" if number == 1 else f"evaluation_{number}")
+        (holding / "evaluation.json").write_text("{}")
+        assert fresh(tmp_path / "evaluation", "evaluation.json").name == f"evaluation_{number + 1}"
+        assert f"evaluation_{number + 1}" in capsys.readouterr().out
+
+
+def test_decoys_are_a_config_group() -> None:
+    arena, dreamer = recipe_module("arena"), recipe_module("dreamer_v3")
+    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=figure8", "+decoys=paper")))
+    assert arena.worlds_of(config)["track"] == load_track("figure8_decoys")
+    config.track = "circle"
+    with pytest.raises(ValueError, match=r"decoys=paper is for track=figure8; track 'circle'"):
+        arena.worlds_of(config)
+    assert OmegaConf.to_object(compose("evaluate", "checkpoint=x", "+decoys=none")).decoys == "none"
+
+
+@pytest.mark.slow
+def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
+    done = recipe("evaluate", f"checkpoint='{run_dir}'", "protocol=full", "episodes=2", "num_envs=2", "video_steps=20",
+                  "run_dir=full", cwd=tmp_path)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "asks for 100 episodes" in done.stdout
+    report = json.loads((tmp_path / "full" / "evaluation.json").read_text())
+    assert all(len(report[policy]["episodes"]) == 2 for policy in ("deterministic", "stochastic"))
+    assert len(report["conditions"]) == 4 * 2 * 2
+    origin = report["provenance"]
+    assert (
+        origin["command"].endswith("run_dir=full") and origin["env_steps"] >= 800 and origin["wall_clock_seconds"] > 0
+    )
+    assert (origin["algorithm"], origin["track"], origin["episodes"]) == ("Dreamer", "circle", 2)
+    table = (tmp_path / "full" / "evaluation.md").read_text()
+    assert table.count("| faithful | ") == 8
+    for plot in ("conditions", "crashes_easy", "crashes_faithful", "easy_nominal_deterministic"):
+        assert (tmp_path / "full" / "plots" / f"{plot}.png").exists()
+    assert len(list((tmp_path / "full" / "videos").glob("*.mp4"))) == 4
+
+
+@pytest.mark.slow
+def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
+    options = ["episodes=2", "num_envs=2", "run_dir=seen"]
+    done = recipe("perception", f"checkpoint='{run_dir}'", "track=figure8", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "seen" / "perception.json").read_text())
+    assert set(report["flights"]) == {"without decoys", "with decoys"}
+    for flights in report["flights"].values():
+        assert {"next gate", "nearest visible gate", "decoy 1", "decoy 2"} <= set(flights["sights"])
+    lesions = [(record["start_noise"], record["images"], record["policy"]) for record in report["lesions"]]
+    modes = ("deterministic", "stochastic")
+    assert lesions == [(noise, name, mode) for noise in (0.0, 1.0) for name in LESIONS for mode in modes]
+    assert (tmp_path / "seen" / "perception.png").exists() and (tmp_path / "seen" / "perception.md").exists()
+    refused = recipe("perception", f"checkpoint='{run_dir}'", "+decoys=paper", *options, cwd=tmp_path)
+    assert refused.returncode == 2 and "Traceback" not in refused.stderr
+    assert "decoys=paper is for track=figure8" in refused.stderr
+
+
+def test_an_unknown_protocol_is_refused() -> None:
+    config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=quick"))
+    with pytest.raises(ValueError, match="protocol=quick: there are nominal, full"):
+        recipe_module("evaluate").check(config)
 
 
 def test_checkpoint_of_another_size_is_refused(run_dir: Path) -> None:
@@ -208,6 +277,7 @@ def test_a_run_is_not_begun_over_another(run_dir: Path, capsys: pytest.CaptureFi
     [
         (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
         (["env=dmc", "track=circle"], "track=circle is for races"),
+        (["env=dmc", "+decoys=paper"], "decoys=paper are for races"),
     ],
 )
 def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:

@@ -216,7 +216,8 @@ class StartPose:
 class StartSampler:
     """Draws the poses in which episodes begin [choice].
 
-    Evaluation starts at the track's start pose, at rest. In training half of the drones start there too and half
+    Evaluation starts at the track's start pose, at rest; ``start_noise`` adds that many times the noise of training. In
+    training half of the drones start there too and half
     1–3 m before a random race gate, facing it and flying towards its centre at 1.5–2.5 m/s; all of them with uniform
     noise of ±0.5/0.5/0.3 m (forward/left/up of the pose), ±5° roll and pitch, ±10° yaw. Positions are then moved into
     the free box, 0.3 m from its sides. ``load_track`` accepts only tracks on which neither the noise nor this move can
@@ -232,9 +233,11 @@ class StartSampler:
         device: where the poses are wanted.
         dtype: floating-point type of the poses.
         beyond_gate: share of training episodes that begin beyond a gate; the others are as above.
+        start_noise: of evaluation starts, as a multiple of the noise of training.
 
     Raises:
-        ValueError: ``beyond_gate`` is not a share.
+        ValueError: ``beyond_gate`` is not a share, or ``start_noise`` is negative or could carry a drone across the
+            plane of its first gate.
 
     Example:
         >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
@@ -256,10 +259,13 @@ class StartSampler:
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
         beyond_gate: float = 0.0,
+        start_noise: float = 0.0,
     ):
         if not 0.0 <= beyond_gate <= 1.0:
             raise ValueError(f"beyond_gate={beyond_gate}: a share of episodes lies between 0 and 1.")
+        _check_start_noise(start_noise, track)
         self._beyond_gate = beyond_gate
+        self._start_noise = start_noise
         self._generator = generator
         self._device, self._dtype = device, dtype
         self._gate_positions = track.gate_positions(device, dtype)
@@ -278,17 +284,20 @@ class StartSampler:
 
         Args:
             num: number of poses N.
-            evaluation: the track's start pose without noise, which draws nothing from the generator.
+            evaluation: the track's start pose; without noise it draws nothing from the generator.
         """
         return self._start(num) if evaluation else self._training_start(num)
 
     def _start(self, num: int) -> StartPose:
-        """Return the track's start pose, at rest."""
-        yaw = self._start_yaw.expand(num)
-        level = torch.zeros_like(yaw)
+        """Return the track's start pose, at rest, with the noise of evaluation."""
+        origin, yaw = self._start_position.expand(num, 3), self._start_yaw.expand(num)
+        noise = torch.zeros(num, 6, device=self._device, dtype=self._dtype)
+        if self._start_noise:
+            noise = noise.uniform_(-self._start_noise, self._start_noise, generator=self._generator)
+        position, attitude = self._disturb(origin, yaw, noise)
         return StartPose(
-            position=self._start_position.expand(num, 3).clone(),
-            attitude=from_roll_pitch_yaw(level, level, yaw),
+            position=position,
+            attitude=attitude,
             linear_velocity=torch.zeros(num, 3, device=self._device, dtype=self._dtype),
             target_gate=torch.zeros(num, dtype=torch.int64, device=self._device),
         )
@@ -307,18 +316,46 @@ class StartSampler:
         before_gate = self._gate_positions[gate] - distance.unsqueeze(-1) * self._gate_normals[gate]
         origin = torch.where(at_gate.unsqueeze(-1), before_gate, self._start_position)  # (N, 3)
         yaw = torch.where(at_gate, self._gate_yaws[gate], self._start_yaw)  # (N,)
-        level = torch.zeros_like(yaw)
-        position = origin + rotate(from_roll_pitch_yaw(level, level, yaw), noise[:, :3] * self._position_noise)
-        position = torch.minimum(torch.maximum(position, self._low), self._high)
-        roll, pitch, yaw_noise = (noise[:, 3:] * self._attitude_noise).unbind(-1)
+        position, attitude = self._disturb(origin, yaw, noise)
         towards = torch.nn.functional.normalize(self._gate_positions[gate] - position, dim=-1)
         direction = torch.where(beyond.unsqueeze(-1), self._gate_normals[gate], towards)
         target = (gate + beyond) % len(self._gate_yaws)
         return StartPose(
             position=position,
-            attitude=from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise),
+            attitude=attitude,
             linear_velocity=torch.where(at_gate, speed, 0.0).unsqueeze(-1) * direction,
             target_gate=torch.where(at_gate, target, 0),
+        )
+
+    def _disturb(
+        self, origin: torch.Tensor, yaw: torch.Tensor, noise: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Move level poses by noise (N, 6) in units of training's, and into the free box.
+
+        Args:
+            origin: (N, 3) m.
+            yaw: (N,) rad.
+            noise: forward, left, up, roll, pitch, yaw.
+
+        Returns:
+            Positions (N, 3) and attitudes (N, 4).
+        """
+        level = torch.zeros_like(yaw)
+        position = origin + rotate(from_roll_pitch_yaw(level, level, yaw), noise[:, :3] * self._position_noise)
+        position = torch.minimum(torch.maximum(position, self._low), self._high)
+        roll, pitch, yaw_noise = (noise[:, 3:] * self._attitude_noise).unbind(-1)
+        return position, from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise)
+
+
+def _check_start_noise(start_noise: float, track: Track) -> None:
+    """Refuse noise that could carry a drone from the start across the plane of the first gate."""
+    gate, start = track.gates[0], track.start_position
+    ahead = sum((a - b) * c for a, b, c in zip(gate.position, start, gate.forward, strict=True))
+    most = ahead / math.hypot(*StartSampler.POSITION_NOISE[:2])
+    if not 0.0 <= start_noise < most:
+        raise ValueError(
+            f"start_noise={start_noise}: on track {track.name!r}, whose start is {ahead:.2f} m before the plane of the "
+            f"first gate, at least 0 and below {most:.2f} times the noise of training."
         )
 
 

@@ -30,7 +30,7 @@ class RaceWorlds:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
+        evaluation: start at the start pose, at rest, and finish after the track's laps.
         episode_steps: control steps until an episode is truncated; if None 1000 (20 s), in evaluation 1500 (30 s).
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
@@ -43,6 +43,7 @@ class RaceWorlds:
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
+        start_noise: of evaluation starts, as a multiple of the noise of training starts.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -73,6 +74,7 @@ class RaceWorlds:
         backend: str = "auto",
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
+        start_noise: float = 0.0,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
@@ -107,7 +109,9 @@ class RaceWorlds:
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
-        self._starts = StartSampler(self.track, self._generator, self.device, self.dtype, start_beyond_gate)
+        self._starts = StartSampler(
+            self.track, self._generator, self.device, self.dtype, start_beyond_gate, start_noise
+        )
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them

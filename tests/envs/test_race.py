@@ -14,6 +14,7 @@ from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.race import Race, RaceStep, StartSampler
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
+from dreamer_racing.envs.worlds import RaceWorlds
 
 CIRCLE = load_track("circle")
 CENTRES = CIRCLE.gate_positions(dtype=torch.float64)
@@ -313,6 +314,33 @@ def test_evaluation_starts_at_rest_at_the_start(name):
     to_gate = torch.tensor(track.gates[0].position, dtype=torch.float64) - start
     to_gate[:, 2] = 0  # the start is level
     torch.testing.assert_close(heading, to_gate / to_gate.norm(dim=-1, keepdim=True))
+
+
+def test_evaluation_starts_with_noise_are_level_poses_moved_by_so_many_times_the_noise_of_training():
+    track = load_track("circle")  # starts at (4, −2.5, 1.35) and heads along y
+    starts = StartSampler(track, torch.Generator().manual_seed(0), dtype=torch.float64, start_noise=2.0)
+    pose = starts.sample(2000, evaluation=True)
+    moved = (pose.position - torch.tensor(track.start_position, dtype=torch.float64)).abs().amax(0)
+    limits = torch.tensor([1.0, 1.0, 0.6], dtype=torch.float64)
+    assert (moved <= limits).all() and (moved > 0.98 * limits).all()
+    nose = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(2000, 3))
+    yaw = torch.rad2deg(torch.atan2(-nose[:, 0], nose[:, 1])).abs().max()
+    pitch = torch.rad2deg(torch.asin(nose[:, 2])).abs().max()
+    assert 19.5 < yaw <= 20.0 and 9.7 < pitch <= 10.0
+    assert pose.linear_velocity.eq(0).all() and pose.target_gate.eq(0).all()
+
+
+def test_worlds_start_with_the_noise_of_evaluation():
+    worlds = RaceWorlds("circle", 50, evaluation=True, from_pixels=False, start_noise=1.0, seed=0)
+    worlds.reset()
+    spread = worlds.privileged()["position"].std(0)
+    torch.testing.assert_close(spread, torch.tensor([0.5, 0.5, 0.3]) / 3**0.5, rtol=0.2, atol=0)
+
+
+@pytest.mark.parametrize("noise", [-1.0, 2.5 / 0.5**0.5, float("nan")])
+def test_start_noise_across_the_first_gate_is_refused(noise):
+    with pytest.raises(ValueError, match=r"start_noise=.*2\.50 m before the plane.*below 3\.54"):
+        StartSampler(load_track("circle"), start_noise=noise)
 
 
 @pytest.mark.parametrize("name", BUILTIN_TRACKS)

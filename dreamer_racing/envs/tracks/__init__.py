@@ -3,6 +3,7 @@
 from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS, load_track
 from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, make_track
 from dreamer_racing.envs.tracks.validation import validate_track
+from dreamer_racing.envs.tracks.variants import decoys_for, displace_gates, with_decoys
 
 __all__ = [
     "BUILTIN_TRACKS",
@@ -11,7 +12,10 @@ __all__ = [
     "GateShape",
     "Track",
     "TrackError",
+    "decoys_for",
+    "displace_gates",
     "load_track",
     "make_track",
     "validate_track",
+    "with_decoys",
 ]

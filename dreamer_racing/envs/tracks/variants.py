@@ -1,0 +1,115 @@
+"""Tracks made from other tracks: with decoys, and with their gates displaced."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import torch
+
+from dreamer_racing.envs.tracks.loading import load_track
+from dreamer_racing.envs.tracks.track import Gate, Track, TrackError
+from dreamer_racing.envs.tracks.validation import validate_track
+
+DECOYS = {"paper": {"figure8": "figure8_decoys"}}
+"""Sets of decoys: for each the tracks that have it, and the built-in track that shows where its decoys stand."""
+
+ATTEMPTS = 1000
+"""Displacements drawn until one can be flown [choice]."""
+
+
+def with_decoys(track: str | Path | Track, decoys: str | None) -> Track:
+    """Return a track with a set of decoys, gates that are drawn and nothing else, or as it is.
+
+    Args:
+        track: what `load_track` takes; one that has these decoys already is returned as it is.
+        decoys: name of the set; None to leave the track alone, ``"none"`` to take away the decoys that it has.
+
+    Raises:
+        TrackError: unknown track or set, or a track without this set.
+
+    Example:
+        >>> len(with_decoys("figure8", "paper").decoys)
+        2
+    """
+    loaded = load_track(track)
+    if decoys is None:
+        return loaded
+    if decoys == "none":
+        return _without_decoys(loaded)
+    if decoys not in DECOYS:
+        raise TrackError(f"decoys={decoys}: there are {', '.join(DECOYS)}, and none.")
+    places = DECOYS[decoys]
+    decorated = {plain: load_track(name) for plain, name in places.items()}
+    for plain, target in decorated.items():
+        if loaded in (target, load_track(plain)):
+            return target
+    raise TrackError(
+        f"decoys={decoys} is for track={', '.join(places)}; track {loaded.name!r} has no place for them. A track file "
+        "may list decoys of its own."
+    )
+
+
+def decoys_for(track: Track) -> str | None:
+    """Return the name of the set of decoys of a track, which may be without them; None if there is none."""
+    for name, places in DECOYS.items():
+        if any(track in (load_track(plain), load_track(decorated)) for plain, decorated in places.items()):
+            return name
+    return None
+
+
+def _without_decoys(track: Track) -> Track:
+    """Take away the decoys; the rest of a built-in track is the track that it was made from."""
+    for places in DECOYS.values():
+        for plain, decorated in places.items():
+            if track == load_track(decorated):
+                return load_track(plain)
+    return dataclasses.replace(track, decoys=())
+
+
+def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -> Track:
+    """Move and turn every race gate at random; start, bounding box and decoys stay.
+
+    A displacement that cannot be flown is drawn again as a whole.
+
+    Args:
+        track: the track.
+        shift: radius of the ball from which each gate's displacement is drawn evenly, m.
+        turn_degrees: half-width of the uniform draw of each gate's turn about the vertical, degrees.
+        seed: of the draw; the same one gives the same track.
+
+    Raises:
+        TrackError: no displacement was found that can be flown.
+
+    Example:
+        >>> displaced = displace_gates(load_track("circle"), shift=0.3, turn_degrees=10.0, seed=0)
+        >>> displaced.start_position == load_track("circle").start_position
+        True
+    """
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(ATTEMPTS):
+        displaced = dataclasses.replace(
+            track,
+            name=f"{track.name}_displaced",
+            gates=tuple(_displace(gate, shift, turn_degrees, generator) for gate in track.gates),
+        )
+        try:
+            validate_track(displaced, source=displaced.name)
+        except TrackError:
+            continue
+        return displaced
+    raise TrackError(
+        f"track {track.name!r}: none of {ATTEMPTS} displacements by up to {shift} m and {turn_degrees}° can be flown. "
+        "Smaller ones would do, or gates that stand farther from each other and from the bounding box."
+    )
+
+
+def _displace(gate: Gate, shift: float, turn_degrees: float, generator: torch.Generator) -> Gate:
+    """Draw the displacement of one gate."""
+    direction = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    radius, turn = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    x, y, z = (
+        old + shift * radius ** (1 / 3) * new for old, new in zip(gate.position, direction.tolist(), strict=True)
+    )
+    yaw_degrees = gate.yaw_degrees + turn_degrees * (2.0 * turn - 1.0)
+    return dataclasses.replace(gate, position=(x, y, z), yaw_degrees=yaw_degrees)

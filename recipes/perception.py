@@ -1,0 +1,161 @@
+"""Measure what a trained policy looks at, and whether it needs to.
+
+    python recipes/perception.py checkpoint=runs/dreamer_v3_figure8_20260101-120000
+    python recipes/perception.py checkpoint=runs/dreamer_v3_figure8_20260101-120000 track=figure8 +decoys=paper
+
+Flies without and with decoys, measures the angle between the camera's axis and gates and decoys and how long each is in
+view, then flies with frozen, blank and noise images. Writes perception.json, perception.md and perception.png; an
+earlier report is never overwritten. docs/evaluation.md says what is measured.
+"""
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from arena import worlds_of
+from command_line import plain_errors, start_logging
+from omegaconf import DictConfig, OmegaConf
+from restoring import Restored, fresh_directory, heading, restore
+from schema import PerceptionConfig, RunConfig, register
+
+from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
+from dreamer_racing.evaluation import Trajectory
+from dreamer_racing.lesions import LESIONS, LesionedPolicy
+from dreamer_racing.perception import Sight, measure_sight, sight_table
+from dreamer_racing.protocol import MODES, Result, fly, results_table
+from dreamer_racing.report_plots import plot_sight
+
+RESULT = "perception.json"
+WITHOUT, WITH = "without decoys", "with decoys"
+NO_NOISE, START_NOISE = 0.0, 1.0  # of starts, in units of training's; with it no two flights are the same
+START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
+
+register()
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="perception")
+def main(config: DictConfig) -> None:
+    """Restore the policy, fly it with and without decoys and lesions, report."""
+    start_logging()
+    started = time.monotonic()
+    with plain_errors():
+        settings = cast(PerceptionConfig, OmegaConf.to_object(config))
+        restored = restore(settings)
+        if not restored.trained.env.from_pixels:
+            raise ValueError(f"{restored.checkpoint} sees numbers, not images: there is nothing to measure.")
+        tracks = tracks_to_fly(restored.trained)
+        directory = fresh_directory(settings.run_dir or restored.run_dir / "perception", RESULT)
+    looked = fly_and_look(settings, restored, tracks)
+    lesions = {noise: fly_lesioned(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
+    provenance = restored.provenance(settings, time.monotonic() - started)
+    write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
+    print(f"\nwritten to {directory}")
+
+
+@dataclass
+class Looked:
+    """Flights of one kind, and what the camera was turned to in them."""
+
+    track: Track
+    gates_per_episode: float
+    success_rate: float
+    trajectory: Trajectory  # the first of them
+    sights: dict[str, Sight]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers; nothing but what JSON knows."""
+        return {
+            "gates_per_episode": self.gates_per_episode,
+            "success_rate": self.success_rate,
+            "sights": {thing: sight.to_dict() for thing, sight in self.sights.items()},
+        }
+
+
+def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
+    """The track without decoys and, if it has a place for them, with them."""
+    track = with_decoys(trained.track, trained.decoys)
+    if trained.decoys is None and not track.decoys:
+        track = with_decoys(track, decoys_for(track))
+    plain = {WITHOUT: with_decoys(track, "none")}
+    if not track.decoys:
+        print(f"decoys: none, {track.name} has no place for them")
+        return plain
+    return plain | {WITH: track}
+
+
+def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str, Track]) -> dict[str, Looked]:
+    """Fly the deterministic policy without and with decoys from the same noisy starts; measure what it looked at."""
+    worlds = worlds_of(restored.trained) | {"start_noise": START_NOISE, "seed": config.seed}
+    decoys = next(reversed(tracks.values())).decoys  # without them too: where they would stand
+    looked = {}
+    for name, track in tracks.items():
+        flown = fly(
+            restored.learner.policy(),
+            {**worlds, "track": track},
+            config.episodes,
+            num_envs=config.num_envs,
+            num_trajectories=config.episodes,
+            record_pixels=False,
+        )
+        print(f"\n{name}, {len(flown.trajectories)} flights recorded\n{flown.summary()}")
+        sights = measure_sight(flown.trajectories, track, worlds["camera"], decoys)
+        looked[name] = Looked(track, flown.gates_per_episode, flown.success_rate, flown.trajectories[0], sights)
+    return looked
+
+
+def fly_lesioned(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
+    """Fly the policy in both modes on the track as it was asked for, with every lesion of its camera."""
+    trained = restored.trained
+    worlds = worlds_of(trained) | {"start_noise": start_noise, "seed": config.seed}
+    results = []
+    for name, lesion in LESIONS.items():
+        for mode in MODES:
+            policy = LesionedPolicy(restored.learner.policy(), lesion())
+            flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
+            results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
+            print(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
+    return results
+
+
+def write(
+    directory: Path,
+    looked: dict[str, Looked],
+    lesions: dict[float, list[Result]],
+    provenance: dict[str, Any],
+    camera: Camera,
+) -> None:
+    """Write numbers, tables and the plot; lesions are by the noise of starts."""
+    title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
+    flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
+    plot_sight(flights, camera, directory / "perception.png", title)
+    (directory / "perception.md").write_text(to_markdown(title, looked, lesions, provenance))
+    numbers = {
+        "flights": {name: kind.to_dict() for name, kind in looked.items()},
+        "lesions": [
+            {"images": result.condition, "start_noise": noise, **result.to_dict()}
+            for noise, results in lesions.items()
+            for result in results
+        ],
+        "provenance": provenance,
+    }
+    (directory / RESULT).write_text(json.dumps(numbers, indent=2, allow_nan=False) + "\n")
+
+
+def to_markdown(
+    title: str, looked: dict[str, Looked], lesions: dict[float, list[Result]], provenance: dict[str, Any]
+) -> str:
+    """Return the tables as a page."""
+    parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
+    parts += [sight_table({name: kind.sights for name, kind in looked.items()}), "![perception](perception.png)\n"]
+    parts.append("## Lesions of the camera\n")
+    for noise, results in lesions.items():
+        parts += [START_TEXT[noise], results_table(results, "images")]
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    main()
