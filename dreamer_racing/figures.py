@@ -36,6 +36,7 @@ from dreamer_racing.plotting import (
     draw_track,
     flight_legend,
     save,
+    speed_scale,
 )
 from dreamer_racing.recording import CONTEXT_COLOR, OPEN_LOOP_COLOR
 from dreamer_racing.runs import CurveKey
@@ -242,7 +243,7 @@ def plot_flights(flights: Sequence[Flight], path: str | Path, over: str = "dista
     size = (4.6 * columns + 0.7, rows * (top + 1.9) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=[top, 1.5] * rows)
-    speed = Normalize(0.0, max(1.0, max(math.ceil(float(np.nanmax(flight.trajectory.speed))) for flight in flights)))
+    speed = speed_scale([flight.trajectory for flight in flights])
     above, below = [], []
     for index, flight in enumerate(flights):
         row, column = divmod(index, columns)
