@@ -25,13 +25,9 @@ network = {"num_cells": [128, 128], "activation_class": nn.ReLU}
 actor = Actor(nn.Sequential(MLP(21, 4, **network), nn.Tanh()), in_keys=["vector"])
 critic = ValueOperator(MLP(21 + 4, 1, **network), in_keys=["vector", "action"])
 noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.1, annealing_num_steps=arguments.rollouts)
-collector = Collector(
-    env,
-    TensorDictSequential(actor, noise),
-    frames_per_batch=512,
-    total_frames=512 * arguments.rollouts,
-    init_random_frames=512 * arguments.random_rollouts,
-)
+policy = TensorDictSequential(actor, noise)
+steps = {"total_frames": 512 * arguments.rollouts, "init_random_frames": 512 * arguments.random_rollouts}
+collector = Collector(env, policy, frames_per_batch=512, **steps)
 loss = TD3Loss(actor, critic, action_spec=env.action_spec_unbatched)
 loss.make_value_estimator(gamma=0.98)
 targets = SoftUpdate(loss, tau=0.005)
@@ -56,8 +52,6 @@ for index, rollout in enumerate(collector):  # (64, 8)
     episodes.append(rollout["next"][rollout["next", "done"].squeeze(-1)])
     if (index + 1) % 50 == 0 or index + 1 == arguments.rollouts:
         ended, episodes = torch.cat(episodes), []
-        scores = (
-            f"return {ended['episode_reward'].mean():.1f}, {ended['race', 'gates_passed'].float().mean():.1f} gates"
-        )
-        print(f"{512 * (index + 1)} steps: {len(ended)} episodes, {scores}", flush=True)
+        gates = ended["race", "gates_passed"].float().mean()
+        print(f"{512 * (index + 1)} steps: return {ended['episode_reward'].mean():.1f}, {gates:.1f} gates an episode")
 collector.shutdown()

@@ -103,7 +103,7 @@ class DroneRaceVecEnv(VecEnv):
         """Begin episodes where masked (N,) bool; return the observations with their first ones in place."""
         self.race.worlds.reset(torch.from_numpy(mask))
         info = self.race.info(None)
-        for index in np.flatnonzero(mask):
+        for index in np.flatnonzero(mask).tolist():
             self.reset_infos[index] = row_of(info, index)
         return _with_rows(observation, mask, self.race.observe(mask))
 
@@ -138,10 +138,15 @@ class DroneRaceVecEnv(VecEnv):
 
 
 def _with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
-    """A copy of observations of N environments, the M masked ones of which are these rows."""
+    """Return observations of N environments, the M masked ones of which are these rows."""
     if isinstance(batch, dict):
         assert isinstance(rows, dict)
-        return {name: _with_rows(batch[name], mask, rows[name]) for name in batch}
-    merged = batch.copy()
+        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
+    assert isinstance(rows, np.ndarray)
+    return _merged(batch, mask, rows)
+
+
+def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    merged = batch.copy()  # `terminal_observation` is a view of the batch
     merged[mask] = rows
     return merged
