@@ -43,7 +43,7 @@ def test_torchrl_loops(tmp_path: Path, name: str, arguments: tuple[str, ...], st
 
 @pytest.mark.slow
 def test_stable_baselines3_loop(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install 'dreamer_racing[sb3]'")
+    pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
     *table, last = run("sb3", "--env-steps", "2048", cwd=tmp_path).splitlines()
     assert any(re.fullmatch(r"\|\s+total_timesteps\s*\| 2048\s+\|", line) for line in table)
     assert re.fullmatch(r"gates passed: \d+, finished: False, crash: [a-z_]+", last), last

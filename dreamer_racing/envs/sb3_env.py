@@ -1,7 +1,7 @@
 """The race for Stable-Baselines3: N drones in one process as one of its vector environments.
 
 Spaces and the entries of `info` are those of `dreamer_racing.envs.gym_env`. Stable-Baselines3 is not among the
-package's own dependencies: `pip install 'dreamer_racing[sb3]'`. Shapes: N environments.
+package's own dependencies: `pip install -e '.[sb3]'`. Shapes: N environments.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ _ONE_OBJECT = (
 
 
 class DroneRaceVecEnv(VecEnv):
-    """N drones racing at once, many times faster than N single environments in a `DummyVecEnv`.
+    """N drones racing at once, much faster than N single environments in a `DummyVecEnv`.
 
     As Stable-Baselines3 has it, a drone whose episode ends begins the next one in the same step: `info` then holds
     `terminal_observation`, and `TimeLimit.truncated` says that it was no crash. One seed, that of `seed`, makes all

@@ -7,7 +7,7 @@ import pytest
 import dreamer_racing
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 
-pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install 'dreamer_racing[sb3]'")
+pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
