@@ -21,7 +21,7 @@ torch.manual_seed(0)
 race = DroneRacingEnv("circle", num_envs=64, from_pixels=False, privileged=False, seed=0)
 env = TransformedEnv(race, Compose(RewardSum(), InitTracker()))  # adds `episode_reward` and `is_init`
 network = {"num_cells": [64, 64], "activation_class": nn.Tanh}
-normal = nn.Sequential(MLP(21, 4, **network), AddStateIndependentNormalScale(4, init_value=-1.0))
+normal = nn.Sequential(MLP(21, 4, **network), AddStateIndependentNormalScale(4))
 actor = ProbabilisticActor(
     TensorDictModule(normal, ["vector"], ["loc", "scale"]),
     in_keys=["loc", "scale"],
