@@ -123,6 +123,48 @@ class ObservationNetwork(nn.Module):
         return self.mlp(inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1))
 
 
+class GaussianNetwork(nn.Module):
+    """An ``ObservationNetwork`` whose outputs become the parameters of a normal distribution.
+
+    Args:
+        network: Its outputs go to ``parameters``.
+        parameters: Returns ``loc`` and ``scale``.
+    """
+
+    def __init__(self, network: ObservationNetwork, parameters: nn.Module) -> None:
+        super().__init__()
+        self.in_keys = network.in_keys
+        self.network = network
+        self.parameters_of = parameters
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Map the tensors under ``in_keys`` to ``loc`` and ``scale``, ``(..., A)``."""
+        return self.parameters_of(self.network(*inputs))
+
+
+class NetworkModule(TensorDictModuleBase):
+    """A network between keys of a TensorDict.
+
+    As ``TensorDictModule``, which looks for pandas on the disk at every write (tensordict 0.14.3), a tenth of SAC's time.
+
+    Args:
+        network: Has ``in_keys``; returns a tensor for each of ``out_keys``.
+        out_keys: What its outputs are called.
+    """
+
+    def __init__(self, network: ObservationNetwork | GaussianNetwork, out_keys: list[str]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(network.in_keys), list(out_keys)
+        self.network = network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the outputs."""
+        outputs = self.network(*(tensordict.get(key) for key in self.in_keys))
+        for key, value in zip(self.out_keys, outputs if isinstance(outputs, tuple) else (outputs,), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
 class BaselinePolicy(TensorDictModuleBase):
     """The acting step of an actor without memory.
 

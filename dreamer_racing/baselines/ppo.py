@@ -5,18 +5,27 @@ Shape legend: N environments, T steps of a rollout, M records of a minibatch, A 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
+from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size, size_of
+from dreamer_racing.baselines.networks import (
+    BaselinePolicy,
+    GaussianNetwork,
+    NetworkModule,
+    NetworkSize,
+    ObservationNetwork,
+    check_size,
+    size_of,
+)
 from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.metrics import RunningMean
 from dreamer_racing.modules import Interface
@@ -92,8 +101,7 @@ class PPOLearner:
             if seed is not None:
                 torch.manual_seed(seed)
             self.actor = _make_actor(interface, size, self.config.initial_std).to(self.device)
-            critic = ObservationNetwork(interface, 1, size)
-            self.critic = TensorDictModule(critic, critic.in_keys, ["state_value"]).to(self.device)
+            self.critic = NetworkModule(ObservationNetwork(interface, 1, size), ["state_value"]).to(self.device)
         self._loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -220,11 +228,9 @@ class PPOLearner:
 def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
     """Make a normal whose mean depends on what is seen, and whose deviation does not."""
     network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
-    deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=torch.tensor(initial_std).log().item())
+    deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=math.log(initial_std))
     return ProbabilisticActor(
-        TensorDictSequential(
-            TensorDictModule(network, network.in_keys, ["loc"]), TensorDictModule(deviation, ["loc"], ["loc", "scale"])
-        ),
+        NetworkModule(GaussianNetwork(network, deviation), ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,

@@ -10,12 +10,20 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from dreamer_racing.baselines.networks import BaselinePolicy, NetworkSize, ObservationNetwork, check_size, size_of
+from dreamer_racing.baselines.networks import (
+    BaselinePolicy,
+    GaussianNetwork,
+    NetworkModule,
+    NetworkSize,
+    ObservationNetwork,
+    check_size,
+    size_of,
+)
 from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
@@ -35,11 +43,11 @@ class SACConfig:
         reward_scale: Factor on rewards.
 
     Reference: Haarnoja et al. 2018, "Soft actor-critic algorithms and applications"; numbers of Stable-Baselines3, but
-    for the replay ratio, temperature and scale of rewards [choice].
+    for batch size and replay ratio (there are many worlds), temperature and scale of rewards [choice].
     """
 
     learning_rate: float = 3e-4
-    batch_size: int = 256
+    batch_size: int = 1024
     replay_ratio: float = 4.0
     discount: float = 0.99
     target_rate: float = 0.005
@@ -82,7 +90,7 @@ class SACLearner:
             critic = ObservationNetwork(interface, 1, size, with_action=True)
             self._loss = SACLoss(
                 self.actor,
-                TensorDictModule(critic, critic.in_keys, ["state_action_value"]),
+                NetworkModule(critic, ["state_action_value"]),
                 alpha_init=self.config.initial_alpha,
                 target_entropy=-float(interface.action_dim),
                 loss_function="l2",
@@ -184,10 +192,7 @@ def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
     """Make a normal whose mean and deviation depend on what is seen, squashed into [−1, 1]."""
     network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
     return ProbabilisticActor(
-        TensorDictSequential(
-            TensorDictModule(network, network.in_keys, ["parameters"]),
-            TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
-        ),
+        NetworkModule(GaussianNetwork(network, NormalParamExtractor()), ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         return_log_prob=True,

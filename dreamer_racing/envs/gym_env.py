@@ -5,6 +5,7 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 | `observation` | space |
 |---|---|
 | `"pixels"` | `Box(0, 255, (height, width, 3), uint8)`, the nose camera, 64 × 64 by default |
+| `"vector"` | `Box(-inf, inf, (21,), float32)`, the race in the drone's own frame, see `RaceVector` |
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
 
@@ -29,6 +30,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dreamer_racing.envs.gates import CrashCause
+from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.race import RaceStep
 from dreamer_racing.envs.scene import build_scene
@@ -36,11 +38,19 @@ from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 
-OBSERVATIONS = ("pixels", "state", "both")
+OBSERVATIONS = ("pixels", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
 CRASH_NAMES = np.array([cause.name.lower() for cause in CrashCause], dtype=object)
 
 Observation = np.ndarray | dict[str, np.ndarray]
+
+
+def row_of(batch: Any, index: int) -> Any:
+    """One environment's part of observations or `info` of N, with NumPy's scalars as Python's."""
+    if isinstance(batch, dict):
+        return {name: row_of(value, index) for name, value in batch.items()}
+    row = batch[index]
+    return row.item() if isinstance(row, np.generic) else row
 
 
 class GymWorlds:
@@ -49,7 +59,7 @@ class GymWorlds:
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        observation: `pixels`, `state` or `both`.
+        observation: `pixels`, `vector`, `state` or `both`.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
@@ -81,7 +91,7 @@ class GymWorlds:
         self.observation = observation
         self.privileged = privileged
         self.renderer_name = worlds.get("renderer", "auto")
-        self.worlds = RaceWorlds(track, num_envs, from_pixels=observation != "state", **worlds)
+        self.worlds = RaceWorlds(track, num_envs, from_pixels=observation in ("pixels", "both"), **worlds)
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
@@ -97,6 +107,8 @@ class GymWorlds:
         pixels = Box(0, 255, (camera.height, camera.width, 3), np.uint8)
         if self.observation == "pixels":
             return pixels
+        if self.observation == "vector":
+            return Box(-np.inf, np.inf, (RACE_VECTOR_SIZE,), np.float32)
         spaces: dict[str, gymnasium.Space] = {
             name: Box(-np.inf, np.inf, (size,), np.float32)
             for name, size in (("position", 3), ("attitude", 4), ("linear_velocity", 3), ("body_rates", 3))
@@ -109,12 +121,16 @@ class GymWorlds:
         outcome = self.worlds.step(torch.as_tensor(np.asarray(actions, np.float64)))
         return outcome, (outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm).numpy()
 
-    def observe(self) -> Observation:
-        """The observations of all environments."""
-        if self.observation == "pixels":
-            return self.worlds.render().numpy()
-        state = self.state()
-        return state if self.observation == "state" else {"pixels": self.worlds.render().numpy(), **state}
+    def observe(self, mask: np.ndarray | None = None) -> Observation:
+        """The observations of all environments, or of the M masked ones (N,) bool in order."""
+        rows = slice(None) if mask is None else mask
+        if self.observation == "vector":
+            return self.worlds.vector().numpy()[rows]
+        state = {name: value[rows] for name, value in self.state().items()}
+        if self.observation == "state":
+            return state
+        pixels = self.worlds.render(None if mask is None else torch.from_numpy(mask)).numpy()
+        return pixels if self.observation == "pixels" else {"pixels": pixels, **state}
 
     def state(self) -> dict[str, np.ndarray]:
         """The privileged state of all environments; `target_gate` is (N,)."""
@@ -168,7 +184,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        observation: `pixels`, `state` or `both`.
+        observation: `pixels`, `vector`, `state` or `both`.
         render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
@@ -214,7 +230,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         if seed is not None:
             self.race.worlds.seed(seed)
         self.race.worlds.reset()
-        return self._first(self.race.observe()), self._first(self.race.info(None))
+        return row_of(self.race.observe(), 0), row_of(self.race.info(None), 0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Fly one control step of 20 ms.
@@ -232,11 +248,11 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
             )
         outcome, reward = self.race.step(np.asarray(action)[None])
         return (
-            self._first(self.race.observe()),
+            row_of(self.race.observe(), 0),
             float(reward[0]),
             bool(outcome.terminated[0]),
             bool(outcome.truncated[0]),
-            self._first(self.race.info(outcome)),
+            row_of(self.race.info(outcome), 0),
         )
 
     def render(self) -> np.ndarray | None:
@@ -246,13 +262,6 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     def close(self) -> None:
         """Free rendering contexts and threads."""
         self.race.close()
-
-    def _first(self, batch: Any) -> Any:
-        """The only row of a batch, with NumPy's scalars as Python's."""
-        if isinstance(batch, dict):
-            return {name: self._first(value) for name, value in batch.items()}
-        row = batch[0]
-        return row.item() if isinstance(row, np.generic) else row
 
 
 class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
@@ -265,7 +274,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     Args:
         num_envs: N.
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        observation: `pixels`, `state` or `both`.
+        observation: `pixels`, `vector`, `state` or `both`.
         render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.

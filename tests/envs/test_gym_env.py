@@ -15,6 +15,7 @@ import dreamer_racing
 from dreamer_racing.envs.gym_env import DroneRaceGymEnv, DroneRaceVectorEnv
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.rewards import RewardWeights
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
 
 IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
@@ -35,7 +36,7 @@ def test_checker_finds_nothing(identifier: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("observation", ["state", "both"])
+@pytest.mark.parametrize("observation", ["vector", "state", "both"])
 def test_checker_finds_only_that_states_are_unbounded(observation: str) -> None:
     env = gymnasium.make(IDS[0], observation=observation, privileged=True).unwrapped
     with warnings.catch_warnings():
@@ -101,6 +102,16 @@ def test_single_environment_is_one_of_the_worlds() -> None:
         assert (terminated, truncated, info["crash"]) == (False, False, "none")
 
 
+def test_vector_is_what_torchrl_agents_see() -> None:
+    env, envs = DroneRaceGymEnv("circle", observation="vector"), make_vec(2, observation="vector")
+    (single, _), (batch, _) = env.reset(seed=0), envs.reset(seed=0)
+    assert (single.shape, single.dtype, batch.shape) == ((21,), np.float32, (2, 21))
+    for observation, num_envs in ((single[None], 1), (batch, 2)):
+        expected = DroneRacingEnv("circle", num_envs, from_pixels=False, seed=0).reset()["vector"]
+        np.testing.assert_array_equal(observation, expected.numpy())
+    assert env.race.worlds.simulator.renderer is None
+
+
 def test_body_rate_weight_follows_the_reward_weights_unless_given() -> None:
     weights = RewardWeights(body_rate=0.5)
     assert DroneRaceGymEnv(observation="state").race.body_rate_weight == RewardWeights().body_rate
@@ -148,7 +159,7 @@ def test_wrong_arguments_are_explained() -> None:
         envs.step(np.zeros((2, 4)))
     with pytest.raises(ValueError, match="seed=\\[1, 2, 3\\]: one number"):
         envs.reset(seed=[1, 2, 3])
-    with pytest.raises(ValueError, match="observation='image': choose one of pixels, state, both"):
+    with pytest.raises(ValueError, match="observation='image': choose one of pixels, vector, state, both"):
         DroneRaceGymEnv(observation="image")
     with pytest.raises(ValueError, match="render_mode='human'"):
         DroneRaceVectorEnv(2, render_mode="human")

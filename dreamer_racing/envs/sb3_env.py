@@ -1,0 +1,152 @@
+"""The race for Stable-Baselines3: N drones in one process as one of its vector environments.
+
+Spaces and the entries of `info` are those of `dreamer_racing.envs.gym_env`. Stable-Baselines3 is not among the
+package's own dependencies: `pip install -e '.[sb3]'`. Shapes: N environments.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
+from dreamer_racing.envs.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.tracks import Track
+
+_ONE_OBJECT = (
+    "the drones of DroneRaceVecEnv share one object, so that there is none to each. Arguments go to its constructor; "
+    "what may change meanwhile is `race.body_rate_weight`, for all of them."
+)
+
+
+class DroneRaceVecEnv(VecEnv):
+    """N drones racing at once, much faster than N single environments in a `DummyVecEnv`.
+
+    As Stable-Baselines3 has it, a drone whose episode ends begins the next one in the same step: `info` then holds
+    `terminal_observation`, and `TimeLimit.truncated` says that it was no crash. One seed, that of `seed`, makes all
+    drones reproducible from the next `reset` on.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        num_envs: N.
+        observation: `pixels`, `vector`, `state` or `both`.
+        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        privileged: whether `info` has the state.
+        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        worlds: further arguments of `RaceWorlds`, as for `DroneRaceGymEnv`.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+
+    Example:
+        >>> env = DroneRaceVecEnv("circle", num_envs=16, observation="vector")
+        >>> env.reset().shape
+        (16, 21)
+    """
+
+    def __init__(
+        self,
+        track: str | Track = "kidney",
+        num_envs: int = 16,
+        observation: str = "pixels",
+        render_mode: str | None = None,
+        privileged: bool = False,
+        body_rate_weight: float | None = None,
+        preset: str | QuadrotorParameters = "easy",
+        **worlds: Any,
+    ) -> None:
+        worlds["preset"] = preset
+        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.render_mode = render_mode
+        self._actions = np.zeros((num_envs, *self.race.action_space().shape), np.float32)
+        super().__init__(num_envs, self.race.observation_space(), self.race.action_space())
+
+    def reset(self) -> Observation:
+        """Begin an episode everywhere."""
+        if self._seeds[0] is not None:
+            self.race.worlds.seed(self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        self.race.worlds.reset()
+        self.reset_infos = self._rows(self.race.info(None))
+        return self.race.observe()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions (N, 4) of the step that `step_wait` flies; values beyond [-1, 1] are clipped."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Fly one control step of 20 ms; return observations, rewards (N,), ends (N,) and N `info`.
+
+        Raises:
+            ValueError: actions of the wrong shape.
+        """
+        outcome, rewards = self.race.step(self._actions)
+        terminated, truncated = outcome.terminated.numpy(), outcome.truncated.numpy()
+        ended = terminated | truncated
+        observation, infos = self.race.observe(), self._rows(self.race.info(outcome))
+        for index, info in enumerate(infos):
+            info["TimeLimit.truncated"] = bool(truncated[index])
+            if ended[index]:
+                info["terminal_observation"] = row_of(observation, index)
+        if ended.any():
+            observation = self._begin(ended, observation)
+        return observation, rewards.astype(np.float32), ended, infos
+
+    def _begin(self, mask: np.ndarray, observation: Observation) -> Observation:
+        """Begin episodes where masked (N,) bool; return the observations with their first ones in place."""
+        self.race.worlds.reset(torch.from_numpy(mask))
+        info = self.race.info(None)
+        for index in np.flatnonzero(mask).tolist():
+            self.reset_infos[index] = row_of(info, index)
+        return _with_rows(observation, mask, self.race.observe(mask))
+
+    def _rows(self, info: dict[str, Any]) -> list[dict[str, Any]]:
+        return [row_of(info, index) for index in range(self.num_envs)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
+        return list(self.race.frames()) if self.render_mode == "rgb_array" else [None] * self.num_envs
+
+    def close(self) -> None:
+        """Free rendering contexts and threads."""
+        self.race.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """This object's attribute, once for each of these drones."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Refused: the drones share one object."""
+        raise NotImplementedError(f"set_attr({attr_name!r}): {_ONE_OBJECT}")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> Any:
+        """Refused: the drones share one object."""
+        raise NotImplementedError(f"env_method({method_name!r}): {_ONE_OBJECT}")
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """No drone is wrapped on its own."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def _with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
+    """Return observations of N environments, the M masked ones of which are these rows."""
+    if isinstance(batch, dict):
+        assert isinstance(rows, dict)
+        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
+    assert isinstance(rows, np.ndarray)
+    return _merged(batch, mask, rows)
+
+
+def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    merged = batch.copy()  # `terminal_observation` is a view of the batch
+    merged[mask] = rows
+    return merged

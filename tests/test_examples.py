@@ -1,0 +1,72 @@
+"""The examples, run as a user runs them, and the page that shows them."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
+PAGE = (ROOT / "docs" / "library.md").read_text()
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def run(name: str, *arguments: str, cwd: Path) -> str:
+    """What an example prints; it must succeed and write nothing where it runs."""
+    command = [sys.executable, str(EXAMPLES[name]), *arguments]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr, done.stderr
+    assert not list(cwd.iterdir())
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "arguments", "steps"),
+    [
+        ("td3", ("--rollouts", "6", "--random-rollouts", "4"), 3072),  # two rollouts with updates
+        ("a2c", ("--rollouts", "3"), 3072),
+    ],
+)
+def test_torchrl_loops(tmp_path: Path, name: str, arguments: tuple[str, ...], steps: int) -> None:
+    line = run(name, *arguments, cwd=tmp_path).splitlines()[-1]  # TorchRL logs there too
+    match = re.fullmatch(rf"{steps} steps: return (-?\d+\.\d), (\d+\.\d) gates an episode", line)
+    assert match, line
+    # Whoever has not learnt yet crashes: -4, and in some metres of progress at most a few gates.
+    assert -30.0 < float(match[1]) < 30.0 and float(match[2]) < 3.0
+
+
+@pytest.mark.slow
+def test_stable_baselines3_loop(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
+    *table, last = run("sb3", "--env-steps", "2048", cwd=tmp_path).splitlines()
+    assert any(re.fullmatch(r"\|\s+total_timesteps\s*\| 2048\s+\|", line) for line in table)
+    assert re.fullmatch(r"gates passed: \d+, finished: False, crash: [a-z_]+", last), last
+
+
+@pytest.mark.slow
+def test_dm_control_loop(tmp_path: Path) -> None:
+    lines = run("dm_control_wrapper", "--env-steps", "1000", cwd=tmp_path).splitlines()
+    assert lines[0].endswith("steps, crashed: True")
+    assert "'target_gate'" in lines[1] and "'terminated'" in lines[1]
+    assert [bool(re.match(r"\d+ episodes, returns \[", line)) for line in lines[2:]] == [True, True]
+
+
+def test_the_page_shows_the_files() -> None:
+    sources = {name: path.read_text() for name, path in EXAMPLES.items()}
+    shown = [[name for name, source in sources.items() if block in source] for block in BLOCKS]
+    strays = [block for block, names in zip(BLOCKS, shown, strict=True) if not names]
+    assert not strays, f"docs/library.md shows code that no file of examples/ has:\n{strays[0]}"
+    assert {name for names in shown for name in names} == set(EXAMPLES)
+    for name in EXAMPLES:
+        assert f"python examples/{name}.py" in PAGE
+
+
+@pytest.mark.parametrize("name", ["td3", "a2c"])
+def test_torchrl_loops_are_short(name: str) -> None:
+    assert len(EXAMPLES[name].read_text().splitlines()) < 60
