@@ -14,6 +14,7 @@ from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.dreams import record_dream
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
 from dreamer_racing.flights import write_trajectory
 from dreamer_racing.learner import DreamerLearner, Learner
@@ -50,7 +51,8 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
-        self._track = str(worlds["track"])
+        track = worlds["track"]
+        self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
         self._policy = learner.policy()
         self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
         self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))

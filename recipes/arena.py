@@ -61,7 +61,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run."""
     env = config.env
     return {
-        "track": with_decoys(config.track, config.decoys),
+        "track": with_decoys(config.track, config.decoys) if config.decoys else config.track,
         "preset": env.preset,
         "renderer": env.renderer,
         "camera": camera_of(config),

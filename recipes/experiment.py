@@ -9,6 +9,7 @@ Runs land in <directory>/<name>/<algorithm>_<track>_<variant>_seed<k>; recipes/p
 command continues an experiment that was interrupted: finished runs are skipped, others resume from their checkpoints.
 """
 
+import os
 import signal
 import subprocess
 import sys
@@ -24,8 +25,12 @@ from schema import ExperimentConfig, RunConfig, register
 
 from dreamer_racing.checkpoint import CHECKPOINTS, latest_checkpoint
 
+RECIPES = Path(__file__).resolve().parent
 LOG = "log.txt"
 OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
+
+# Launchers send configurations to processes of theirs, which must find the modules of this folder.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(RECIPES), os.environ.get("PYTHONPATH")]))
 
 register()
 
@@ -71,7 +76,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     overrides = merge_overrides(chosen, [override for override in given if override_key(override) not in OWN])
     overrides += [*config.variants[config.variant], *config.overrides]
     wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
-    recipe = [sys.executable, str(Path(__file__).with_name(f"{config.algorithm}.py"))]
+    recipe = [sys.executable, str(RECIPES / f"{config.algorithm}.py")]
     try:
         reached = latest_checkpoint(run_dir / CHECKPOINTS)
     except FileNotFoundError:

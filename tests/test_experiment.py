@@ -100,3 +100,6 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
             assert any(row[column] for row in table), f"{algorithm}: {column}"
         assert list((run_dir / "videos").glob("*.mp4")) and list((run_dir / "plots").glob("*.png"))
         assert OmegaConf.load(run_dir / "config.yaml").algorithm == algorithm
+    figures = {path.name for path in (tmp_path / "runs" / "smoke" / "figures").iterdir()}
+    assert figures >= {"learning_curves.png", "trajectories.png", "comparison.md", "comparison.png"}
+    assert "imagined_dreamer_v3_circle_default_seed0.png" in figures
