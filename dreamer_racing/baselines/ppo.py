@@ -152,33 +152,33 @@ class PPOLearner:
     @torch.no_grad()
     def with_advantages(self, rollout: TensorDictBase) -> TensorDict:
         """Return the records of a rollout ``[N T]`` with ``advantage`` and ``value_target`` ``(N T, 1)``."""
-        keys = [*self._keys, "action", "action_log_prob"]
-        records = rollout.select(*keys).to(self.device)
-        following = rollout["next"].to(self.device)
-        reward = following["reward"] * self.config.reward_scale
-        value, next_value = self._values(records, following)
+        records = rollout.select(*self._keys, "action", "action_log_prob").to(self.device)
+        outcome = rollout["next"].select("reward", "done", "terminated").to(self.device)
+        value, next_value = self._values(records, rollout["next"])
         advantage, target = vec_generalized_advantage_estimate(
             self.config.discount,
             self.config.lambda_,
             value,
             next_value,
-            reward,
-            following["done"],
-            following["terminated"],
+            outcome["reward"] * self.config.reward_scale,
+            outcome["done"],
+            outcome["terminated"],
         )
         return records.update({"advantage": advantage, "value_target": target}).flatten()
 
     def _values(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the values of what was seen and of what came next, ``(N, T, 1)`` each.
 
-        What comes next is what is seen in the next step, but for the last step and where an episode was cut off.
+        What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
+        a crash it counts for nothing. So hardly any image is looked at twice.
         """
         value = self.critic(records.select(*self._keys))["state_value"]
         next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
         apart = following["done"].squeeze(-1).clone()
         apart[:, -1] = True
         apart &= ~following["terminated"].squeeze(-1)  # (N, T)
-        next_value[apart] = self.critic(following.select(*self._keys)[apart])["state_value"]
+        others = following.select(*self._keys)[apart].to(self.device)
+        next_value[apart.to(self.device)] = self.critic(others)["state_value"]
         return value, next_value
 
     def _step(self, batch: TensorDictBase) -> dict[str, Tensor]:
