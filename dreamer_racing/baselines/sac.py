@@ -48,7 +48,7 @@ class SACConfig:
 
     learning_rate: float = 3e-4
     batch_size: int = 1024
-    replay_ratio: float = 4.0
+    replay_ratio: float = 16.0
     discount: float = 0.99
     target_rate: float = 0.005
     initial_alpha: float = 0.1
