@@ -8,6 +8,7 @@ process leaves behind has a name with a leading dot, is never read, and is remov
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import shutil
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "checkpoints"
 _PREFIX = "checkpoint"
+FINISHED = "finished.json"
 
 
 class RandomState(GlobalRNGState):
@@ -248,6 +250,21 @@ def latest_checkpoint(path: str | Path) -> Path:
         f"No complete checkpoint at {path}: the path {found}. Give a run directory (with a subfolder "
         f"'{CHECKPOINTS}'), a folder of '{_PREFIX}-<env_steps>' folders, or one of these."
     )
+
+
+def mark_finished(run_dir: str | Path, env_steps: int) -> None:
+    """Note in a run directory that all that the run was asked for is done, evaluation and metrics included."""
+    partial = Path(run_dir) / f".{FINISHED}.partial"
+    partial.write_text(json.dumps({"env_steps": env_steps}) + "\n", encoding="utf-8")
+    os.replace(partial, Path(run_dir) / FINISHED)
+
+
+def finished_env_steps(run_dir: str | Path) -> int:
+    """Return the env_steps that a run was finished at; 0 if it was not."""
+    try:
+        return int(json.loads((Path(run_dir) / FINISHED).read_text(encoding="utf-8"))["env_steps"])
+    except FileNotFoundError:
+        return 0
 
 
 def ensure_writable(directory: str | Path) -> Path:

@@ -34,7 +34,7 @@ class EvaluationReport:
         episodes: episodes of an evaluation.
         video_steps: control steps K that the video shows at most.
         num_envs: episodes flown side by side.
-        seed: of the evaluation's environment.
+        seed: of the evaluation's environment, anew at each evaluation: all meet the same starts and drones.
     """
 
     def __init__(
@@ -51,6 +51,7 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
+        self._seed = seed
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
         self._policy = learner.policy()
@@ -77,6 +78,7 @@ class EvaluationReport:
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
         self._policy.deterministic = deterministic
+        self._base.worlds.seed(self._seed)
         return evaluate(self._env, self._act, self.episodes, max_recorded_steps=1000)
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:

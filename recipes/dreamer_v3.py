@@ -21,6 +21,7 @@ from schema import Collection, DreamerConfig, register
 from training import (
     ReplayRun,
     assemble,
+    claim,
     launch,
     make_collector,
     make_curriculum,
@@ -103,6 +104,7 @@ def resolve(config: DictConfig) -> DictConfig:
 def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check_dreamer(config)
+    lock = claim(config)
     env = make_env(config)
     learner = make_learner(config, Interface.of(env), config.device)
     seed_generators(config.seed)
@@ -115,6 +117,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         DreamerRun,
         config,
         overrides,
+        lock,
         env,
         learner,
         collector,

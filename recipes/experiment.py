@@ -13,20 +13,27 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import hydra
+import yaml
 from checks import check_variant
-from command_line import merge_overrides, override_key, plain_errors
+from command_line import merge_overrides, override_key
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from report import FAILURES
 from schema import ExperimentConfig, RunConfig, register
 
-from dreamer_racing.checkpoint import CHECKPOINTS, latest_checkpoint
+from dreamer_racing.checkpoint import CHECKPOINTS, finished_env_steps, latest_checkpoint
+from dreamer_racing.run_lock import RunLock
 
 RECIPES = Path(__file__).resolve().parent
 LOG = "log.txt"
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
 
 # Launchers send configurations to processes of theirs, which must find the modules of this folder.
@@ -37,27 +44,46 @@ register()
 
 @hydra.main(version_base="1.3", config_path="config", config_name="experiment")
 def main(config: DictConfig) -> None:
-    """Run one of the experiment's runs, or what is left of it."""
-    with plain_errors():
-        settings = cast(ExperimentConfig, config)
-        command = next_command(settings, list(HydraConfig.get().overrides.task))
+    """Run one of the experiment's runs, or what is left of it; what fails is noted, so that the others are made."""
+    settings = cast(ExperimentConfig, config)
     run_dir = directory_of(settings)
-    if command is None:
-        print(f"{run_dir}: finished, skipped")
-        return
-    print(f"{run_dir}: {'resumed' if any('resume=' in word for word in command) else 'started'}", flush=True)
-    if status := run(command, run_dir):
-        last = "\n".join((run_dir / LOG).read_text(errors="replace").replace("\r", "\n").splitlines()[-5:])
-        raise RuntimeError(
-            f"{run_dir}: {settings.algorithm} ended with status {status}; {run_dir / LOG} ends with:\n{last}"
-        )
-    print(f"{run_dir}: done", flush=True)
+    note = run_dir.parent / FAILURES / f"{run_dir.name}.txt"
+    note.unlink(missing_ok=True)
+    try:
+        bring_to_its_end(settings, run_dir, list(HydraConfig.get().overrides.task))
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"{run_dir}: failed: {error}", file=sys.stderr, flush=True)
+        if HydraConfig.get().mode == RunMode.RUN:
+            raise SystemExit(1) from None
+        note.parent.mkdir(parents=True, exist_ok=True)
+        note.write_text(f"{error}\n", encoding="utf-8")
 
 
 def directory_of(config: ExperimentConfig) -> Path:
     """The directory of one run."""
     name = f"{config.algorithm}_{Path(config.track).stem}_{config.variant}_seed{config.seed}"
     return Path(config.directory).absolute() / config.name / name
+
+
+def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) -> None:
+    """Start, resume or skip a run, and say which.
+
+    Raises:
+        ValueError: the run is refused.
+        RuntimeError: its recipe failed.
+    """
+    command = next_command(config, given)
+    if command is None:
+        print(f"{run_dir}: finished, skipped", flush=True)
+        return
+    run_dir.mkdir(parents=True, exist_ok=True)
+    RunLock(run_dir).release()  # refuses here, rather than into the log of a live run
+    print(f"{run_dir}: {'resumed' if any('resume=' in word for word in command) else 'started'}", flush=True)
+    if status := run(command, run_dir):
+        log = run_dir / LOG
+        last = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-5:])
+        raise RuntimeError(f"{config.algorithm} ended with status {status}; {log} ends with:\n{last}")
+    print(f"{run_dir}: {'done' if next_command(config, given) is None else 'interrupted'}", flush=True)
 
 
 def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None:
@@ -78,12 +104,11 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
     recipe = [sys.executable, str(RECIPES / f"{config.algorithm}.py")]
     try:
-        reached = latest_checkpoint(run_dir / CHECKPOINTS)
+        latest_checkpoint(run_dir / CHECKPOINTS)
     except FileNotFoundError:
         return [*recipe, f"run_dir={run_dir}", *overrides]
     refuse_other_settings(run_dir, overrides)
-    env_steps = int(reached.name.rpartition("-")[2])
-    if env_steps >= wanted.total_env_steps:
+    if finished_env_steps(run_dir) >= wanted.total_env_steps:
         return None
     return [*recipe, f"resume={run_dir}", f"total_env_steps={wanted.total_env_steps}"]
 
@@ -94,27 +119,60 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
     Raises:
         ValueError: the message names the overrides that differ.
     """
-    saved = {str(override) for override in OmegaConf.load(run_dir / "overrides.yaml")}
-    differing = sorted(o for o in saved ^ set(overrides) if override_key(o) not in ("run_dir", "total_env_steps"))
+    saved, wanted = settings_of(OmegaConf.load(run_dir / "overrides.yaml")), settings_of(overrides)
+    differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:
+        values = ", ".join(
+            f"{name}: {saved.get(name, 'not given')} and {wanted.get(name, 'not given')}" for name in differing
+        )
         raise ValueError(
-            f"{run_dir} holds a run with other settings; these are in one of the two only: {', '.join(differing)}. "
-            "Choose another name=, or take that run away."
+            f"{run_dir} holds a run with other settings, there and asked for: {values}. Choose another name=, or take "
+            "that run away."
         )
 
 
+def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
+    """Overrides by name, their values as YAML understands them; without those that do not change what a run is."""
+    values = {override_key(str(override)): yaml.safe_load(str(override).partition("=")[2]) for override in overrides}
+    return {name: value for name, value in values.items() if name not in ("run_dir", "total_env_steps")}
+
+
 def run(command: list[str], run_dir: Path) -> int:
-    """Run a recipe in a process of its own, which gets this one's signals; its output goes to a file."""
-    run_dir.mkdir(parents=True, exist_ok=True)
+    """Run a recipe in a process of its own, its output in a file; return its exit status.
+
+    Signals reach it as one SIGTERM, so that it saves and ends. Then this process ends too, or does what it would have
+    done at once: that of a Slurm job puts itself into the queue again.
+    """
+    received: list[signal.Signals] = []
+    before = {number: signal.getsignal(number) for number in SIGNALS} if is_main_thread() else {}
+    for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
+        signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, for Slurm sends them to every process
     with (
         (run_dir / LOG).open("a", encoding="utf-8") as log,
-        subprocess.Popen(command, stdout=log, stderr=log) as process,
+        subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process,
     ):
-        previous = signal.signal(signal.SIGTERM, lambda number, frame: process.send_signal(number))
-        try:
-            return process.wait()
-        finally:
-            signal.signal(signal.SIGTERM, previous)
+
+        def pass_on(number: int, frame: object) -> None:
+            received.append(signal.Signals(number))
+            process.send_signal(signal.SIGTERM)
+
+        for number in before:
+            signal.signal(number, pass_on)
+        status = process.wait()
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    if received:
+        print(f"{run_dir}: interrupted by {received[0].name}", flush=True)
+        handler = before[received[0]]
+        if received[0] in (signal.SIGUSR1, signal.SIGUSR2) and callable(handler):
+            handler(received[0], None)
+        raise SystemExit(128 + received[0])
+    return status
+
+
+def is_main_thread() -> bool:
+    """Whether this is the thread that may handle signals."""
+    return threading.current_thread() is threading.main_thread()
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from training import (
     Run,
     assemble,
+    claim,
     launch,
     make_collector,
     make_curriculum,
@@ -69,11 +70,12 @@ def resolve(config: DictConfig) -> DictConfig:
 def build(config: PPORunConfig, overrides: list[str]) -> PPORun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check(config)
+    lock = claim(config)
     env = make_env(config)
     learner = make_learner(config, Interface.of(env), config.device)
     seed_generators(config.seed)
     collector = make_collector(config, env, learner.policy())
-    return assemble(PPORun, config, overrides, env, learner, collector, make_curriculum(config))
+    return assemble(PPORun, config, overrides, lock, env, learner, collector, make_curriculum(config))
 
 
 if __name__ == "__main__":

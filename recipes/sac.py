@@ -18,6 +18,7 @@ from schema import SACRunConfig, register
 from training import (
     ReplayRun,
     assemble,
+    claim,
     launch,
     make_collector,
     make_curriculum,
@@ -63,13 +64,14 @@ def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check(config)
     check_replay(config)
+    lock = claim(config)
     env = make_env(config)
     learner = make_learner(config, Interface.of(env), config.device)
     seed_generators(config.seed)
     collector = make_collector(config, env, learner.policy())
     curriculum = make_curriculum(config)
     replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
-    return assemble(SACRun, config, overrides, env, learner, collector, curriculum, replay=replay)
+    return assemble(SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay)
 
 
 if __name__ == "__main__":

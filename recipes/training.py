@@ -28,7 +28,9 @@ from dreamer_racing.checkpoint import (
     GracefulExit,
     RunCheckpoints,
     ensure_writable,
+    finished_env_steps,
     latest_checkpoint,
+    mark_finished,
 )
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.partial_reset import TransformedPixelEnv
@@ -100,6 +102,7 @@ class Run:
         """Evaluate, without a trace in the random numbers of training."""
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
+            torch.manual_seed(self.config.seed)
             metrics = self.report.make(self.counters["env_steps"], self.config.evaluation.stochastic)
         self.metrics.push(metrics)
         self.evaluated = self.counters["updates"]
@@ -310,10 +313,22 @@ def make_run_replay(
     )
 
 
+def claim(config: RunConfig) -> RunLock:
+    """Take a run directory before anything large is made.
+
+    Raises:
+        ValueError: it holds another run, or is in use by a live one.
+    """
+    refuse_to_replace(config)
+    assert config.run_dir is not None, "resolve_common() names it"
+    return RunLock(ensure_writable(config.run_dir))
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
     overrides: list[str],
+    lock: RunLock,
     env: Environment,
     learner: Learner,
     collector: Collector,
@@ -327,6 +342,7 @@ def assemble(
         kind: the recipe's class of runs.
         config: resolved.
         overrides: from which it was composed.
+        lock: of its directory.
         env: to train in.
         learner: what learns.
         collector: of its rollouts.
@@ -334,10 +350,7 @@ def assemble(
         rollouts: an iterator over the collector; None for its own.
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
-    refuse_to_replace(config)
-    assert config.run_dir is not None, "resolve_common() names it"
-    directory = ensure_writable(config.run_dir)
-    lock = RunLock(directory)
+    directory = lock.directory
     tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
@@ -389,9 +402,9 @@ def train(run: Run) -> None:
         GracefulExit() as stop,
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
-        if counters["env_steps"] >= config.total_env_steps:
+        if finished_env_steps(run.directory) >= config.total_env_steps:
             bar.write(f"complete already: raise total_env_steps={config.total_env_steps} to go on")
-        run.learn(None, stop)
+        run.learn(None, stop)  # what an interrupted run still owes
         while counters["env_steps"] < config.total_env_steps and not stop.requested:
             with run.clock.timed("collect"):
                 rollout = next(run.rollouts)
@@ -413,6 +426,8 @@ def train(run: Run) -> None:
         if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
             run.evaluate()
         run.metrics.write(counters["env_steps"])
+        if not stop.requested:
+            mark_finished(run.directory, counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from dreamer_racing.checkpoint import latest_checkpoint, mark_finished
+from dreamer_racing.run_lock import RunLock
 from tests.running_recipes import ROOT, compose, recipe_module, rows
 
 
@@ -27,14 +31,16 @@ def next_command(directory: Path, *overrides: str) -> list[str] | None:
     return None if command is None else [Path(command[1]).name, *command[2:]]
 
 
-def leave_run(directory: Path, env_steps: int, overrides: list[str]) -> Path:
-    """Leave what a run leaves that got so far: a checkpoint without parts, and its overrides."""
+def leave_run(directory: Path, env_steps: int, overrides: list[str], finished: bool = True) -> Path:
+    """Leave what a run leaves that got so far: a checkpoint without parts, its overrides, the mark of its end."""
     from torchrl.checkpoint import Checkpoint
 
     path = directory / "checkpoints" / f"checkpoint-{env_steps:012d}"
     path.parent.mkdir(parents=True)
     Checkpoint().save(path, metadata={"env_steps": env_steps})
     OmegaConf.save(OmegaConf.create([f"run_dir={directory}", *overrides]), directory / "overrides.yaml")
+    if finished:
+        mark_finished(directory, env_steps)
     return directory
 
 
@@ -48,9 +54,21 @@ def test_a_run_starts_with_what_was_given_and_what_its_variant_adds(tmp_path: Pa
 
 
 def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path) -> None:
-    run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES)
+    run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
+    mark_finished(run_dir, 1_000_000)
+    assert next_command(tmp_path, *CHOSEN) is None
     assert next_command(tmp_path, *CHOSEN, "total_env_steps=900000") is None
+
+
+def test_a_run_that_was_killed_in_its_last_evaluation_is_not_finished(tmp_path: Path) -> None:
+    run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES, finished=False)
+    assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
+
+
+def test_an_override_may_be_spelt_in_several_ways(tmp_path: Path) -> None:
+    leave_run(tmp_path / RUN, 1_000_000, [*OVERRIDES[:-1], "env.from_pixels=False"])
+    assert next_command(tmp_path, *CHOSEN) is None
 
 
 def test_a_finished_run_goes_on_when_more_is_asked_for(tmp_path: Path) -> None:
@@ -62,7 +80,7 @@ def test_a_finished_run_goes_on_when_more_is_asked_for(tmp_path: Path) -> None:
 
 def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
     leave_run(tmp_path / RUN, 1000, OVERRIDES)
-    with pytest.raises(ValueError, match=r"holds a run with other settings.*: env\.num_envs=16, env\.num_envs=8\."):
+    with pytest.raises(ValueError, match=r"other settings, there and asked for: env\.num_envs: 8 and 16\."):
         next_command(tmp_path, *CHOSEN[:-1], "env.num_envs=16")
 
 
@@ -103,3 +121,51 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     figures = {path.name for path in (tmp_path / "runs" / "smoke" / "figures").iterdir()}
     assert figures >= {"learning_curves.png", "trajectories.png", "comparison.md", "comparison.png"}
     assert "imagined_dreamer_v3_circle_default_seed0.png" in figures
+
+
+STATES = ["--multirun", "budget=smoke", "name=few", "algorithm=ppo", "variant=state", "track=circle", "device=cpu"]
+
+
+def experiment(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start an experiment, as a user does."""
+    command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), *STATES, *overrides]
+    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Path) -> None:
+    runs = tmp_path / "runs" / "few"
+    for seed in (0, 1):
+        (runs / f"ppo_circle_state_seed{seed}").mkdir(parents=True)
+    (runs / "ppo_circle_state_seed0" / "checkpoints").write_text("in the way")
+    lock = RunLock(runs / "ppo_circle_state_seed1")
+    process = experiment("seed=0,1,2", cwd=tmp_path)
+    output, _ = process.communicate(timeout=300)
+    lock.release()
+    assert process.returncode == 1, output
+    assert "failed: ppo_circle_state_seed0: ppo ended with status 2" in output
+    assert "failed: ppo_circle_state_seed1:" in output and "in use by a live run" in output
+    assert not (runs / "ppo_circle_state_seed1" / "log.txt").exists(), "a live run's log is its own"
+    assert f"{runs / 'ppo_circle_state_seed2'}: done" in output
+    assert (runs / "figures" / "learning_curves.png").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+    runs = tmp_path / "runs" / "few"
+    length = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
+    process = experiment(*length, "total_env_steps=100000000", cwd=tmp_path)
+    metrics = runs / "ppo_circle_state_seed0" / "metrics.csv"
+    deadline = time.monotonic() + 200
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, output
+    assert "interrupted" in output and "seed1" not in output and "done" not in output
+    reached = int(latest_checkpoint(runs / "ppo_circle_state_seed0").name.rpartition("-")[2])
+    process = experiment(*length, f"total_env_steps={reached + 500}", "seed=0", cwd=tmp_path)
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output

@@ -136,7 +136,7 @@ def test_the_full_protocol(run_dir: Path, tmp_path: Path) -> None:
     assert (
         origin["command"].endswith("run_dir=full") and origin["env_steps"] >= 800 and origin["wall_clock_seconds"] > 0
     )
-    assert (origin["algorithm"], origin["track"], origin["episodes"]) == ("Dreamer", "circle", 2)
+    assert (origin["algorithm"], origin["track"], origin["episodes"]) == ("dreamer_v3", "circle", 2)
     table = (tmp_path / "full" / "evaluation.md").read_text()
     assert table.count("| faithful | ") == 8
     for plot in ("conditions", "crashes_easy", "crashes_faithful", "easy_nominal_deterministic"):

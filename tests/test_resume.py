@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import subprocess
 import sys
@@ -54,6 +55,13 @@ def learner_updates(checkpoint: dict[str, Any]) -> int:
     return next(value["updates"] for name, value in checkpoint.items() if "learner" in name)
 
 
+def evaluations(run_dir: Path) -> list[dict[str, str]]:
+    """What the evaluations of a run came to, by env_steps."""
+    with (run_dir / "metrics.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["evaluation/return_mean"]]
+    return [{name: row[name] for name in row if name.startswith(("env_steps", "evaluation"))} for row in rows]
+
+
 def assert_same(first: Any, second: Any, where: str) -> None:
     if isinstance(first, torch.Tensor):
         assert torch.equal(first, second), where
@@ -101,3 +109,6 @@ def test_a_resumed_baseline_equals_an_uninterrupted_one(recipe: str, overrides: 
     whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
     assert learner_updates(whole) - learner_updates(before) >= 200
     assert_same(whole, parted, "checkpoint")
+    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "parted")
+    best = [latest_checkpoint(tmp_path / name / "best").name for name in ("whole", "parted")]
+    assert best[0] == best[1]

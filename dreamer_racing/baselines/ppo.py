@@ -27,7 +27,6 @@ from dreamer_racing.baselines.networks import (
     size_of,
 )
 from dreamer_racing.finite_guard import FiniteGuard
-from dreamer_racing.metrics import RunningMean
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
 
@@ -141,13 +140,12 @@ class PPOLearner:
         """
         with timed("advantages"):
             records = self.with_advantages(rollout)
-        mean = RunningMean()
+        steps: list[dict[str, Tensor]] = []
         with timed("optimise"):
             for _ in range(self.config.epochs):
                 order = torch.randperm(len(records), device=self.device)
-                for indices in order.chunk(self.config.minibatches):
-                    mean.push(self._step(records[indices]))
-        return {name: torch.tensor(value) for name, value in mean.pop().items()}
+                steps += [self._step(records[indices]) for indices in order.chunk(self.config.minibatches)]
+        return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
 
     @torch.no_grad()
     def with_advantages(self, rollout: TensorDictBase) -> TensorDict:
@@ -172,14 +170,20 @@ class PPOLearner:
         What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
         a crash it counts for nothing. So hardly any image is looked at twice.
         """
-        value = self.critic(records.select(*self._keys))["state_value"]
+        value = self._judge(records.flatten()).view(*records.shape, 1)
         next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
         apart = following["done"].squeeze(-1).clone()
         apart[:, -1] = True
         apart &= ~following["terminated"].squeeze(-1)  # (N, T)
         others = following.select(*self._keys)[apart].to(self.device)
-        next_value[apart.to(self.device)] = self.critic(others)["state_value"]
+        next_value[apart.to(self.device)] = self._judge(others)
         return value, next_value
+
+    def _judge(self, records: TensorDictBase) -> Tensor:
+        """Return the values of records ``[N]``, ``(N, 1)``, in parts, for a rollout of images is large."""
+        seen, size = records.select(*self._keys), max(1, math.ceil(len(records) / self.config.minibatches))
+        starts = range(0, max(1, len(records)), size)
+        return torch.cat([self.critic(seen[start : start + size])["state_value"] for start in starts])
 
     def _step(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make one gradient step on a minibatch ``[M]``."""

@@ -28,6 +28,8 @@ from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
 
+NO_WEIGHT = 1e-30
+
 
 @dataclass
 class SACConfig:
@@ -144,7 +146,8 @@ class SACLearner:
     def transitions(self, windows: TensorDictBase) -> TensorDict:
         """Make transitions ``[B]`` of windows of two records.
 
-        Where the second record begins an episode there was no transition from the first: its weight is 0.
+        Where the second record begins an episode there was no transition from the first: it has next to no weight (not
+        none, for a batch of nothing else would have no mean).
         """
         before, after = windows[:, 0], windows[:, 1]
         following = {key: after.get(key) for key in self._keys}
@@ -157,7 +160,7 @@ class SACLearner:
                 **observation,
                 "action": after.get("previous_action"),
                 "next": following,
-                "priority_weight": (~after.get("is_init").squeeze(-1)).float(),
+                "priority_weight": (~after.get("is_init").squeeze(-1)).float().clamp(min=NO_WEIGHT),
             },
             windows.batch_size[:1],
         )

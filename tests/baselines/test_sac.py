@@ -35,7 +35,14 @@ def test_a_transition_leads_from_one_record_to_the_next() -> None:
     assert torch.equal(batch["next", "reward"], 0.5 * windows["reward"][:, 1])
     assert batch["next", "terminated"].flatten().tolist() == [False, False, True, False, False, False]
     assert batch["next", "done"].flatten().tolist() == [False, False, True, True, False, False]
-    assert batch["priority_weight"].tolist() == [1, 0, 1, 1, 1, 1]
+    assert batch["priority_weight"].tolist() == pytest.approx([1, 0, 1, 1, 1, 1], abs=1e-20)
+
+
+def test_a_batch_without_a_transition_is_survived() -> None:
+    windows = make_windows()
+    windows["is_init"][:, 1] = True
+    metrics = SACLearner(SMALL, NUMBERS, seed=0).update(windows)
+    assert all(value.isfinite() for value in metrics.values())
 
 
 def test_what_is_no_transition_has_no_influence() -> None:
