@@ -53,8 +53,8 @@ class SACConfig:
     replay_ratio: float = 16.0
     discount: float = 0.99
     target_rate: float = 0.005
-    initial_alpha: float = 0.1
-    reward_scale: float = 0.1
+    initial_alpha: float = 0.05
+    reward_scale: float = 1.0
 
 
 class SACLearner:
