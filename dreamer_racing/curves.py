@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from dreamer_racing.runs import CurveKey, RunData, group_runs
 
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
+GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
 ENDS_EARLY = 0.98  # of the longest run of a curve: one that ends before is mentioned
 WEIGHT = "curriculum/body_rate_weight"
 ALL_TRACKS = "all tracks"
@@ -36,13 +38,21 @@ class Quantity:
 
 QUANTITIES = {
     "return": Quantity("Return (training episodes)", "episode/return"),
-    "evaluation_return": Quantity("Return (evaluation)", "evaluation/return_mean"),
-    "success_rate": Quantity("Success rate", "evaluation/success_rate", comparable=True),
-    "gates": Quantity("Gates per episode", "evaluation/gates_per_episode"),
+    "evaluation_return": Quantity("Return (deterministic)", "evaluation/return_mean"),
+    "success_rate": Quantity("Success rate (deterministic)", "evaluation/success_rate", comparable=True),
+    "stochastic_success_rate": Quantity(
+        "Success rate (stochastic)", "evaluation_stochastic/success_rate", comparable=True
+    ),
+    "gates": Quantity("Gates per episode (deterministic)", "evaluation/gates_per_episode"),
+    "stochastic_gates": Quantity("Gates per episode (stochastic)", "evaluation_stochastic/gates_per_episode"),
     "training_gates": Quantity("Gates (training episodes)", "episode/gates_passed"),
-    "lap_time": Quantity("Mean lap time (s)", "evaluation/lap_time_mean"),
-    "lap_time_best": Quantity("Best lap time (s)", "evaluation/lap_time_best"),
+    "lap_time": Quantity("Mean lap time (s, deterministic)", "evaluation/lap_time_mean"),
+    "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best"),
+    "image_error": Quantity("Image error (held out)", "held_out/image_error"),
 }
+"""Those of evaluations are of the deterministic or of the sampling (stochastic) policy, both paid at b₂ = 0."""
+PRESENCE = ("num_episodes", "return_mean")
+"""Columns, after `evaluation/` or `evaluation_stochastic/`, that have a value in the row of every evaluation."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +64,7 @@ class Curve:
     env_steps: np.ndarray
     centre: np.ndarray
     low: np.ndarray
+    """NaN, like `high`, where there is a single seed."""
     high: np.ndarray
     seeds: np.ndarray
     """int: how many runs have a value there."""
@@ -82,7 +93,14 @@ def wanted_columns(quantities: Sequence[str]) -> list[str]:
     for name in quantities:
         if name not in QUANTITIES:
             raise ValueError(f"quantities={name}: there are {', '.join(QUANTITIES)}.")
-    return [*(QUANTITIES[name].column for name in quantities), WEIGHT]
+    columns = [QUANTITIES[name].column for name in quantities]
+    return [*dict.fromkeys([*columns, *(name for column in columns for name in _presence(column)), WEIGHT])]
+
+
+def _presence(column: str) -> list[str]:
+    """Name the columns that tell in which rows this one could have had a value; none if it is no evaluation's."""
+    prefix = column.partition("/")[0]
+    return [f"{prefix}/{name}" for name in PRESENCE] if prefix.startswith("evaluation") else []
 
 
 def learning_curves(
@@ -97,7 +115,7 @@ def learning_curves(
     Args:
         runs: of any algorithms and tracks.
         quantities: names out of `QUANTITIES`.
-        aggregate: ``mean`` (with the standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
+        aggregate: ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
         window: of the running mean, env_steps; None for 2 % of the longest run.
         problems: what was left out already.
 
@@ -115,19 +133,19 @@ def learning_curves(
     grid = np.linspace(0.0, longest, POINTS)
     missing, curves = [*problems, *_short_runs(groups)], []
     for name in quantities:
-        column = QUANTITIES[name].column
-        values: dict[CurveKey, np.ndarray] = {}
+        sampled: dict[CurveKey, Sampled] = {}
         for key, group in groups.items():
-            tables = [run.metrics.columns[column] for run in group if column in run.metrics.columns]
-            absent = [run.name for run in group if column not in run.metrics.columns]
+            absent = [run.name for run in group if QUANTITIES[name].column not in run.metrics.columns]
             if absent:
-                who = ", ".join(absent) if tables else f"all runs of {key}"
-                missing.append(f"no values of {column}: {who}")
-            if tables:
-                values[key] = np.stack([resample(*table, grid, width) for table in tables])
-        curves += [_aggregate(key, name, grid, [value], aggregate) for key, value in values.items()]
+                who = ", ".join(absent) if len(absent) < len(group) else f"all runs of {key}"
+                missing.append(f"no values of {QUANTITIES[name].column}: {who}")
+            if len(absent) < len(group):
+                sampled[key] = sample(group, QUANTITIES[name].column, grid, width)
+        gaps = sum(value.has_gaps for value in sampled.values())
+        missing += [f"{QUANTITIES[name].label}: {GAPS} ({gaps} of {len(sampled)} curves)"] if gaps else []
+        curves += [_aggregate(key, name, grid, [value], aggregate) for key, value in sampled.items()]
         if aggregate == "iqm" and QUANTITIES[name].comparable:
-            pooled = _pool(values).items()
+            pooled = _pool(sampled).items()
             curves += [_aggregate(key, name, grid, strata, aggregate) for key, strata in pooled]
     if not curves:
         raise ValueError(f"no run has values of {', '.join(quantities)}. {'; '.join(missing)}")
@@ -135,23 +153,66 @@ def learning_curves(
     return LearningCurves(curves, raises, aggregate, width, missing)
 
 
+class Sampled(NamedTuple):
+    """The runs of one curve on the common axis, (S, P) each."""
+
+    values: np.ndarray
+    """NaN where a run has none."""
+    reached: np.ndarray
+    """bool: whether the run was being measured there, with a value or without."""
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether some run has a value where another one was measured without."""
+        present = np.isfinite(self.values)
+        return bool((present.any(0) & (self.reached & ~present).any(0)).any())
+
+
+def sample(group: Sequence[RunData], column: str, grid: np.ndarray, window: float) -> Sampled:
+    """Take the running means of runs on the common axis (P,), each as far as the run was measured."""
+    tables = [measurements(run, column) for run in group]
+    values = np.stack([resample(*table, grid, window) for table in tables])
+    ends = np.array([(steps[0], steps[-1]) if len(steps) else (np.inf, -np.inf) for steps, _ in tables])  # (S, 2)
+    reached = (grid + window / 2 >= ends[:, :1]) & (grid - window / 2 <= ends[:, 1:])
+    return Sampled(values, reached)
+
+
+def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a column, with NaN for every evaluation that left no value of it: a lap time without a lap.
+
+    Returns:
+        env_steps, rising, and values, (R,) each; empty if there is nothing.
+    """
+    columns = run.metrics.columns
+    steps, values = columns.get(column, (np.empty(0), np.empty(0)))
+    evaluated = [columns[name][0] for name in _presence(column) if name in columns]
+    without = np.setdiff1d(np.concatenate([*evaluated, np.empty(0)]), steps)
+    order = np.argsort(np.concatenate((steps, without)), kind="stable")
+    filled = np.concatenate((values, np.full(len(without), np.nan)))
+    return np.concatenate((steps, without))[order], filled[order]
+
+
 def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: float) -> np.ndarray:
     """Take the running mean of a metric at other env_steps.
 
     Args:
         steps: (R,) env_steps of the values, rising.
-        values: (R,).
+        values: (R,); NaN where the metric was looked for and not found.
         grid: (P,) env_steps to return values for.
         window: env_steps around each, over which to average.
 
     Returns:
-        (P,): the mean within the window; where there is no value, between the neighbours; NaN beyond the
-        ends.
+        (P,): the mean of the values within the window; without any, between the neighbours, or NaN if one of them is;
+        NaN beyond the ends.
     """
+    if not len(steps):
+        return np.full(len(grid), np.nan)
     first = np.searchsorted(steps, grid - window / 2, "left")
     last = np.searchsorted(steps, grid + window / 2, "right")
-    sums = np.concatenate(([0.0], np.cumsum(values)))
-    count = last - first
+    found = np.isfinite(values)
+    sums = np.concatenate(([0.0], np.cumsum(np.where(found, values, 0.0))))
+    counts = np.concatenate(([0], np.cumsum(found)))
+    count = counts[last] - counts[first]
     mean = (sums[last] - sums[first]) / np.maximum(count, 1)
     return np.where(count > 0, mean, np.interp(grid, steps, values, left=np.nan, right=np.nan))
 
@@ -203,37 +264,42 @@ def bootstrap_interval(
     return np.percentile(statistic(np.concatenate(pooled)), (2.5, 97.5), axis=0)  # of (D, P)
 
 
-def _mean(strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _deviation(strata: Sequence[np.ndarray]) -> np.ndarray:
     pooled = np.concatenate(strata)
-    centre, spread = pooled.mean(0), pooled.std(0)
-    return centre, centre - spread, centre + spread
+    return pooled.mean(0) + np.array([[-1.0], [1.0]]) * pooled.std(0, ddof=1)
 
 
-def _iqm(strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return interquartile_mean(np.concatenate(strata)), *bootstrap_interval(strata)
+def _mean(scores: np.ndarray) -> np.ndarray:
+    return scores.mean(0)
 
 
-AGGREGATES = {"mean": _mean, "iqm": _iqm}
+AGGREGATES = {"mean": (_mean, _deviation), "iqm": (interquartile_mean, bootstrap_interval)}
+"""The centre of runs (S, P), and the band (2, P) around it of runs by track."""
 
 
-def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[np.ndarray], aggregate: str) -> Curve:
-    """Aggregate the runs (S, P) of each stratum, at every point those that have a value there."""
-    present = np.isfinite(np.concatenate(strata))  # (S, P)
+def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[Sampled], aggregate: str) -> Curve:
+    """Aggregate the runs of each stratum, at every point those that have a value there, if that is half of them."""
+    present = np.isfinite(np.concatenate([stratum.values for stratum in strata]))  # (S, P)
+    reached = np.concatenate([stratum.reached for stratum in strata])  # (S, P)
+    shown = present & (2 * present.sum(0) >= (present | reached).sum(0))
     result = np.full((3, len(grid)), np.nan)  # centre, low, high
-    for pattern in np.unique(present, axis=1).T:
-        points = (present == pattern[:, None]).all(0)
-        kept = [stratum[np.isfinite(stratum[:, points]).all(1)][:, points] for stratum in strata]
-        if any(len(stratum) for stratum in kept):
-            result[:, points] = AGGREGATES[aggregate]([stratum for stratum in kept if len(stratum)])
-    centre, low, high = result
-    return Curve(key, quantity, grid, centre, low, high, present.sum(0))
+    centre, band = AGGREGATES[aggregate]
+    for pattern in np.unique(shown, axis=1).T:
+        points = (shown == pattern[:, None]).all(0)
+        chosen = np.split(pattern, np.cumsum([len(stratum.values) for stratum in strata])[:-1])
+        kept = [stratum.values[runs][:, points] for stratum, runs in zip(strata, chosen, strict=True) if runs.any()]
+        if kept:
+            result[0, points] = centre(np.concatenate(kept))
+        if max(map(len, kept), default=0) > 1:  # one run knows of no spread
+            result[1:, points] = band(kept)
+    return Curve(key, quantity, grid, result[0], result[1], result[2], present.sum(0))
 
 
-def _pool(values: dict[CurveKey, np.ndarray]) -> dict[CurveKey, list[np.ndarray]]:
+def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
     """Put the tracks of an algorithm together, if it has been run on all of several."""
-    tracks = {key.track for key in values}
-    pooled: dict[CurveKey, list[np.ndarray]] = defaultdict(list)
-    for key, value in values.items():
+    tracks = {key.track for key in sampled}
+    pooled: dict[CurveKey, list[Sampled]] = defaultdict(list)
+    for key, value in sampled.items():
         pooled[key._replace(track=ALL_TRACKS)].append(value)
     return {key: strata for key, strata in pooled.items() if len(strata) == len(tracks) > 1}
 

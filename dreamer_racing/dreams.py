@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,7 @@ class Dream:
             with np.load(path) as file:
                 real, reconstructed, predicted = (file[name] for name in ("real", "reconstructed", "imagined"))
                 context, frame_dt = int(file["context"]), float(file["frame_dt"])
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"{path} holds no dream, or half of one.") from error
         imagined = np.concatenate((reconstructed[:, :context], predicted), axis=1)
         return cls(real, reconstructed, imagined, context, frame_dt)

@@ -1,14 +1,12 @@
-"""The paper's figures: learning curves, flights side by side, and what the world model sees and imagines.
+"""Figures of what evaluations have stored: flights side by side, and what the world model sees and imagines.
 
-Each is drawn from what runs store (`metrics.csv`, `evaluations/`), without a simulator or a network.
+Each is drawn from files in `evaluations/`, without a simulator or a network.
 Shapes: K control steps of an episode.
 """
 
 from __future__ import annotations
 
 import math
-import re
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,38 +15,29 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
-from dreamer_racing.curves import ALL_TRACKS, QUANTITIES, Curve, LearningCurves
 from dreamer_racing.dreams import Dream, film_strip, shown_frames
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation import Trajectory
 from dreamer_racing.plotting import (
     CRASH_COLOR,
-    FAINT,
     INK,
     MUTED,
     SPEED_COLORS,
     draw_flight,
     draw_track,
+    dress,
     flight_legend,
     save,
     speed_scale,
 )
 from dreamer_racing.recording import CONTEXT_COLOR, OPEN_LOOP_COLOR
-from dreamer_racing.runs import CurveKey
 
-ALGORITHMS = {"dreamer_v3": ("DreamerV3", "#1c7ed6"), "ppo": ("PPO", "#f76707"), "sac": ("SAC", "#e03131")}
-"""Names and the paper's colours; another algorithm is drawn in grey under its own name."""
-TRACKS = ("circle", "kidney", "figure8")  # columns of the paper, in its order; others follow
-VARIANT_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
-VARIANT_SHADES = (0.0, -0.5, 0.45, -0.25)  # of an algorithm's colour: darker below 0, lighter above
-BANDS = {"mean": "mean and standard deviation", "iqm": "interquartile mean and 95 % bootstrap interval"}
-MAX_WARNINGS = 8  # lines in the figure; the CSV file beside it has all
-NOTE_LETTERS = 14  # of a warning, an inch of the figure's width
+PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
 
 
 class Flight(NamedTuple):
@@ -59,167 +48,13 @@ class Flight(NamedTuple):
     trajectory: Trajectory
 
 
-def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
-    """Draw a column a track and a row a quantity, a colour an algorithm and a line style a variant.
-
-    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named in the legend.
-
-    Reference: paper, Fig. "Reward evolution".
-
-    Args:
-        curves: what to draw.
-        path: the file to write; missing folders are made.
-    """
-    tracks = _in_order({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, TRACKS)
-    quantities = [name for name in QUANTITIES if any(curve.quantity == name for curve in curves.curves)]
-    keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
-    longest = max(curve.env_steps[-1] for curve in curves.curves)
-    width = max(7.0, 0.6 + 3.9 * len(tracks))
-    notes = _warning_lines(curves.problems, width)
-    columns = int(width / 2.3)
-    lines = 1 + math.ceil((len(keys) + any(map(len, curves.raises.values()))) / columns)
-    legend_height = 0.1 + 0.2 * lines + 0.16 * len(notes)  # inches
-    figure = Figure(figsize=(width, 2.7 * len(quantities) + 0.5 + legend_height), layout="constrained")
-    grid = figure.add_gridspec(
-        len(quantities) + 1, len(tracks), height_ratios=[2.7] * len(quantities) + [legend_height]
-    )
-    for row, quantity in enumerate(quantities):
-        for column, track in enumerate(tracks):
-            axes = figure.add_subplot(grid[row, column])
-            if row == 0:
-                axes.set_title(_track_title(track), fontsize=11, color=INK)
-            shown = [curve for curve in curves.curves if curve.quantity == quantity and curve.key.track == track]
-            if track == ALL_TRACKS and not shown:
-                axes.set_axis_off()  # the tracks have no common scale
-                continue
-            _draw_panel(axes, shown, keys, longest)
-            _draw_raises(axes, curves, track, keys)
-            if column == 0:
-                axes.set_ylabel(QUANTITIES[quantity].label, color=INK)
-            if row == len(quantities) - 1:
-                axes.set_xlabel("env_steps", color=INK)
-    _draw_legend(figure.add_subplot(grid[-1, :]), curves, keys, notes, columns)
-    save(figure, path)
-
-
-def _draw_panel(axes: Axes, curves: Sequence[Curve], keys: Sequence[CurveKey], longest: float) -> None:
-    for curve in curves:
-        line = _line(curve.key._replace(track=""), keys)
-        axes.fill_between(curve.env_steps, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
-        axes.plot(curve.env_steps, curve.centre, linewidth=1.7, **line)
-    if not curves:
-        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=MUTED)
-        axes.set_yticks([])
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlim(0.0, longest)
-    _dress(axes)
-
-
-def _dress(axes: Axes) -> None:
-    axes.grid(color=FAINT, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=MUTED, labelsize=8, length=0)
-    axes.spines[:].set_visible(False)
-
-
-def _draw_raises(axes: Axes, curves: LearningCurves, track: str, keys: Sequence[CurveKey]) -> None:
-    """Draw a short tick for every rise of b₂, a level above the axis for each curve that has any."""
-    raised = [key for key in keys if len(curves.raises.get(key._replace(track=track), ()))]
-    for level, key in enumerate(raised):
-        bottom = 0.012 + 0.05 * level
-        steps = curves.raises[key._replace(track=track)]
-        axes.vlines(
-            steps,
-            bottom,
-            bottom + 0.04,
-            colors=[_line(key, keys)["color"]],
-            linewidth=1.0,
-            alpha=0.8,
-            transform=axes.get_xaxis_transform(),
-        )
-
-
-def _draw_legend(
-    axes: Axes, curves: LearningCurves, keys: Sequence[CurveKey], notes: Sequence[str], columns: int
+def plot_flights(
+    flights: Sequence[Flight],
+    path: str | Path,
+    over: str = "distance",
+    columns: int = 3,
+    problems: Sequence[str] = (),
 ) -> None:
-    """Fill the space below the panels: what was aggregated how, the curves' names, and what was left out."""
-    handles = [
-        Line2D([], [], linewidth=2.0, label=f"{_label(key)} ({_seed_count(curves, key)})", **_line(key, keys))
-        for key in keys
-    ]
-    if any(map(len, curves.raises.values())):
-        tick: dict[str, Any] = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
-        handles.append(Line2D([], [], label="the curriculum raises b₂", **tick))
-    axes.set_axis_off()
-    style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
-    how = f"{BANDS[curves.aggregate]} over seeds; running mean over {_steps(curves.window)} env_steps"
-    legend = axes.legend(handles=handles, loc="upper left", ncols=columns, title=how, alignment="left", **style)
-    legend.get_title().set(fontsize=9, color=MUTED)
-    if notes:
-        axes.add_artist(legend)
-        empty = [Line2D([], [], linestyle="", label=note) for note in notes]
-        style |= {"fontsize": 8, "labelcolor": CRASH_COLOR, "handlelength": 0.0, "handletextpad": 0.0}
-        axes.legend(handles=empty, loc="lower left", labelspacing=0.2, **style)
-
-
-def _warning_lines(problems: Sequence[str], width: float) -> list[str]:
-    shown = list(problems[:MAX_WARNINGS])
-    if len(problems) > len(shown):
-        shown.append(f"and {len(problems) - len(shown)} more, in the CSV file")
-    return [
-        line
-        for problem in shown
-        for line in textwrap.wrap(f"! {problem}", int(NOTE_LETTERS * width), subsequent_indent="   ")
-    ]
-
-
-def _steps(env_steps: float) -> str:
-    """Write a number of env_steps shortly: 24k, 1.5M."""
-    return EngFormatter(sep="")(float(f"{env_steps:.2g}"))
-
-
-def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
-    """Say over how many seeds, one number if it is the same on every track."""
-    own = [curve for curve in curves.curves if curve.key._replace(track="") == key and curve.key.track != ALL_TRACKS]
-    counts = sorted({int(curve.seeds.max()) for curve in own})
-    text = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]}–{counts[-1]}"
-    return f"{text} seed{'s' if counts[-1] > 1 else ''}"
-
-
-def _label(key: CurveKey) -> str:
-    name = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))[0]
-    return f"{name}, {key.variant}" if key.variant else name
-
-
-def _line(key: CurveKey, keys: Sequence[CurveKey]) -> dict[str, Any]:
-    """Choose colour and style: the algorithm's colour; the more variants it has, the lighter and darker they are."""
-    own = [other.variant for other in keys if other.algorithm == key.algorithm]
-    index = own.index(key.variant)
-    color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
-    shade = VARIANT_SHADES[index % len(VARIANT_SHADES)]
-    mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
-    return {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % len(VARIANT_LINES)]}
-
-
-def _rank(key: CurveKey) -> tuple[int, CurveKey]:
-    names = list(ALGORITHMS)
-    return names.index(key.algorithm) if key.algorithm in names else len(names), key
-
-
-def _in_order(names: set[str], first: Sequence[str]) -> list[str]:
-    """Sort names: those that come first, the others by the alphabet, the pool of all at the end."""
-    return sorted(
-        names,
-        key=lambda name: (name == ALL_TRACKS, name not in first, *([first.index(name)] if name in first else []), name),
-    )
-
-
-def _track_title(track: str) -> str:
-    return re.sub(r"(?<=[a-z])(?=\d)", " ", track.replace("_", " ")).capitalize()
-
-
-def plot_flights(flights: Sequence[Flight], path: str | Path, over: str = "distance", columns: int = 3) -> None:
     """Draw flights from above, side by side, with the camera's direction, and the speed of each below it.
 
     Reference: paper, Figs. "emergent" (with decoys and without) and "real world" (simulated and real).
@@ -229,6 +64,7 @@ def plot_flights(flights: Sequence[Flight], path: str | Path, over: str = "dista
         path: the file to write; missing folders are made.
         over: axis of the speed profile: ``distance`` flown (m) or ``time`` (s).
         columns: flights in a row at most.
+        problems: what was left out, a line each.
 
     Raises:
         ValueError: no flights, or an unknown axis.
@@ -261,7 +97,7 @@ def plot_flights(flights: Sequence[Flight], path: str | Path, over: str = "dista
     decoys, crash = any(f.track.decoys for f in flights), any(f.trajectory.crashed for f in flights)
     handles = flight_legend(decoys, crash)
     figure.legend(handles=handles, loc="outside lower left", ncols=3 if columns == 1 else 6, frameon=False, fontsize=9)
-    save(figure, path)
+    save(figure, path, problems)
 
 
 def _proportion(track: Track) -> float:
@@ -275,9 +111,6 @@ def _outcome(flight: Flight) -> str:
     gates = int((np.diff(flight.trajectory.target_gate) != 0).sum())
     outcome = (flight.trajectory.outcome or "recording stopped").replace("_", " ")
     return f"{flight.track.name}: {gates} gates in {seconds:.2f} s ({outcome})"
-
-
-PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
 
 
 def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
@@ -308,10 +141,12 @@ def _draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str)
     axes.set(xlim=(0.0, max(along[-1], 1e-6)), ylim=(0.0, 1.05 * float(speed.vmax or 1.0)), xlabel=PROFILE_AXES[over])
     axes.set_ylabel("speed (m/s)")
     axes.yaxis.set_major_locator(MaxNLocator(4))
-    _dress(axes)
+    dress(axes)
 
 
-def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: int = 6) -> None:
+def plot_dreams(
+    dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: int = 6, problems: Sequence[str] = ()
+) -> None:
     """Draw real, reconstructed and imagined observations of several stages of training, time from left to right.
 
     Reference: paper, Fig. "imagined".
@@ -320,6 +155,7 @@ def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: 
         dreams: the stages, each with its name; the first window of each is shown.
         path: the file to write; missing folders are made.
         columns: points in time.
+        problems: what was left out, a line each.
 
     Raises:
         ValueError: no dreams.
@@ -351,4 +187,4 @@ def plot_dreams(dreams: Sequence[tuple[str, Dream]], path: str | Path, columns: 
         for (red, green, blue), label in phases
     ]
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False, fontsize=9)
-    save(figure, path)
+    save(figure, path, problems)

@@ -61,7 +61,10 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, str]:
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     lines = text.splitlines()
     head = dict(line[2:].partition(": ")[::2] for line in lines if line.startswith("# "))
-    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    try:
+        rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    except csv.Error as error:
+        raise ValueError(f"{path} holds no trajectory: {error}.") from error
     expected = ["t", *(column for names in STATE.values() for column in names)]
     if not head.keys() >= set(HEAD) or not rows or rows[0][: len(expected)] != expected:
         raise ValueError(f"{path} holds no trajectory: its columns should be {', '.join(expected)}, a0 ...")

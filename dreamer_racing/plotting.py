@@ -7,6 +7,7 @@ Shapes: K control steps of an episode.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -22,6 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MultipleLocator
+from matplotlib.transforms import Bbox
 
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.scene import Camera
@@ -38,6 +40,8 @@ SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
 )
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
+MAX_WARNINGS = 8  # below a figure
+NOTE_LETTERS = 14  # of a note below a figure, an inch of its width
 HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is worth its space
 
 DEFAULT_PANELS: dict[str, tuple[str, ...]] = {
@@ -124,7 +128,7 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
             _number_gate(axes, track, number)
     margin = 0.02 * max(x_high - x_low, y_high - y_low)
     axes.set(xlim=(x_low - margin, x_high + margin), ylim=(y_low - margin, y_high + margin))
-    _dress(axes, "y (m)" if labels else None)
+    _dress_map(axes, "y (m)" if labels else None)
     if labels:
         axes.set_xlabel("x (m)")
 
@@ -165,10 +169,42 @@ def plot_curve(
     save(figure, path)
 
 
-def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure; missing folders are made."""
+def save(figure: Figure, path: str | Path, warnings: Sequence[str] = ()) -> None:
+    """Write a figure.
+
+    Args:
+        figure: which.
+        path: the file; missing folders are made.
+        warnings: what a reader must know, a line each; they are written below the figure, which grows by them.
+    """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150, facecolor="white")
+    width, height = figure.get_size_inches()
+    lines = _warning_lines(warnings, width)
+    below = 0.16 * len(lines) + 0.12 if lines else 0.0  # inches
+    if lines:
+        style: dict[str, Any] = {"fontsize": 8, "color": CRASH_COLOR, "linespacing": 1.35}
+        figure.text(0.08 / width, -0.02 / height, "\n".join(lines), va="top", **style)
+    whole = Bbox.from_bounds(0.0, -below, width, height + below)
+    figure.savefig(path, dpi=150, facecolor="white", bbox_inches=whole if lines else None)
+
+
+def _warning_lines(warnings: Sequence[str], width: float) -> list[str]:
+    shown = list(warnings[:MAX_WARNINGS])
+    if len(warnings) > len(shown):
+        shown.append(f"and {len(warnings) - len(shown)} more")
+    return [
+        line
+        for warning in shown
+        for line in textwrap.wrap(f"! {warning}", int(NOTE_LETTERS * width), subsequent_indent="   ")
+    ]
+
+
+def dress(axes: Axes) -> None:
+    """Draw a faint grid, and neither frame nor ticks."""
+    axes.set_axisbelow(True)
+    axes.grid(color=FAINT, linewidth=0.6)
+    axes.tick_params(colors=MUTED, labelsize=8, length=0)
+    axes.spines[:].set_visible(False)
 
 
 def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
@@ -213,14 +249,11 @@ def _layout(track: Track, side_view: bool) -> tuple[Figure, Axes, Axes | None]:
     return figure, axes, side
 
 
-def _dress(axes: Axes, y_label: str | None) -> None:
+def _dress_map(axes: Axes, y_label: str | None) -> None:
     axes.set_aspect("equal")
     axes.xaxis.set_major_locator(MultipleLocator(2.0))
     axes.yaxis.set_major_locator(MultipleLocator(2.0))
-    axes.set_axisbelow(True)
-    axes.grid(color=FAINT, linewidth=0.6)
-    axes.tick_params(colors=MUTED, labelsize=8, length=0)
-    axes.spines[:].set_visible(False)
+    dress(axes)
     if y_label:
         axes.set_ylabel(y_label)
 
@@ -268,7 +301,7 @@ def _draw_track_side(axes: Axes, track: Track) -> None:
         labels.append((x, z))
         axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
     axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
-    _dress(axes, "z (m)")
+    _dress_map(axes, "z (m)")
 
 
 def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed: Normalize) -> None:
@@ -370,9 +403,7 @@ def _draw_curves(axes: Axes, title: str, curves: Mapping[str, tuple[np.ndarray, 
         if max(sizes) > 50 * min(sizes):
             axes.set_yscale("log" if values.min() > 0 else "symlog")
     axes.set_title(title, loc="left", fontsize=10, color=INK)
-    axes.grid(color=FAINT, linewidth=0.6)
-    axes.tick_params(colors=MUTED, labelsize=8, length=0)
-    axes.spines[:].set_visible(False)
+    dress(axes)
 
 
 def _smooth(values: np.ndarray, window: int) -> np.ndarray:

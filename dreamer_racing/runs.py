@@ -7,17 +7,23 @@ import json
 import math
 import os
 import re
+import textwrap
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import yaml
 
 from dreamer_racing.metrics_file import MetricsTable, read_metrics
 
+T = TypeVar("T")
+
 DEFAULT_ALGORITHM = "dreamer_v3"  # of configurations from before there was a choice
+REFERENCE = "default"  # the variant that others are compared with; so is one without a name
+REASON_LETTERS = 160  # of why a file cannot be read
 SAME_CURVE = (
     "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
     "replay.device", "evaluation.every", "evaluation.stochastic", "evaluation.video_steps", "model.compile",
@@ -33,6 +39,11 @@ class CurveKey(NamedTuple):
     algorithm: str
     variant: str
     """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``; empty otherwise."""
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether the other variants are compared with this one."""
+        return self.variant in ("", REFERENCE)
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -151,42 +162,45 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
     Raises:
         ValueError: runs of one curve differ in a setting that changes what is learned, or not even in the seed; the
-            message names the settings and both values.
+            message names the settings and both values. What one of them does not have, because it was started by an
+            older version, is no difference.
     """
-    groups: dict[CurveKey, list[RunData]] = defaultdict(list)
-    for run in sorted(runs, key=lambda run: (run.key, run.seed, str(run.directory))):
-        groups[run.key].append(run)
+    groups = _by_curve(runs)
     for key, group in groups.items():
-        _check_alike(key, group)
-    return dict(groups)
-
-
-def _check_alike(key: CurveKey, group: Sequence[RunData]) -> None:
-    first, seeds = group[0], {group[0].seed: group[0]}
-    for other in group[1:]:
-        names = sorted(first.config.keys() | other.config.keys())
-        different = [
-            f"{name}: {first.config.get(name, 'absent')} and {other.config.get(name, 'absent')}"
-            for name in names
-            if not name.startswith(SAME_CURVE) and first.config.get(name, "absent") != other.config.get(name, "absent")
-        ]
-        if different:
-            raise ValueError(
-                f"{first.directory} and {other.directory} would be one curve ({key}), but "
-                f"were not configured alike: {'; '.join(different)}. Plot them apart, or name their folders "
-                "<algorithm>_<track>_<variant>_seed<k> with different variants."
-            )
-        if other.seed in seeds:
-            raise ValueError(
-                f"{seeds[other.seed].directory} and {other.directory} are the same run twice: the same settings, and "
-                f"seed: {other.seed} in both. Plot one of them."
-            )
-        seeds[other.seed] = other
+        for first, second in combinations(group, 2):
+            _check_alike(key, first, second)
+    return groups
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:
-    """Take the run of the lowest seed of each curve."""
-    return [group[0] for group in group_runs(runs).values()]
+    """Take the run of the lowest seed of each curve, alike or not."""
+    return [group[0] for group in _by_curve(runs).values()]
+
+
+def _by_curve(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
+    groups: dict[CurveKey, list[RunData]] = defaultdict(list)
+    for run in sorted(runs, key=lambda run: (run.key, run.seed, str(run.directory))):
+        groups[run.key].append(run)
+    return dict(groups)
+
+
+def _check_alike(key: CurveKey, first: RunData, second: RunData) -> None:
+    different = [
+        f"{name}: {first.config[name]} and {second.config[name]}"
+        for name in sorted(first.config.keys() & second.config.keys())
+        if not name.startswith(SAME_CURVE) and first.config[name] != second.config[name]
+    ]
+    if different:
+        raise ValueError(
+            f"{first.directory} and {second.directory} would be one curve ({key}), but "
+            f"were not configured alike: {'; '.join(different)}. Plot them apart, or name their folders "
+            "<algorithm>_<track>_<variant>_seed<k> with different variants."
+        )
+    if first.seed == second.seed:
+        raise ValueError(
+            f"{first.directory} and {second.directory} are the same run twice: the same settings, and "
+            f"seed: {first.seed} in both. Plot one of them."
+        )
 
 
 def evaluation_files(directory: Path, ending: str) -> dict[int, Path]:
@@ -208,5 +222,34 @@ def evaluation_score(directory: Path, env_steps: int) -> tuple[float, float]:
     try:
         numbers = json.loads((directory / "evaluations" / f"{env_steps:09d}.json").read_text(encoding="utf-8"))
         return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return -math.inf, -math.inf
+
+
+def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
+    """Read the first of some files of a run's evaluations that can be read.
+
+    Args:
+        files: which, in the order of preference.
+        read: raises ValueError or OSError at what it cannot read.
+        problems: gets a line if files were passed over, with the run, the first of them and why.
+
+    Returns:
+        The file and what is in it; None if none of them can be read.
+    """
+    failures: list[tuple[Path, Exception]] = []
+    found = None
+    for file in files:
+        try:
+            found = file, read(file)
+            break
+        except (ValueError, OSError) as error:
+            failures.append((file, error))
+    if failures:
+        file, error = failures[0]
+        more = len(failures) - 1
+        others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
+        reason = textwrap.shorten(str(error).replace(f"{file.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
+        line = f"{file.parent.parent.name} without {file.name}{others}: {reason}"
+        problems += [line] if line not in problems else []
+    return found

@@ -4,13 +4,14 @@
     python recipes/plot.py runs='runs/*_kidney_*' figure=learning_curves quantities=[return,success_rate] aggregate=iqm
 
 Runs of one algorithm, track and variant become one curve if they differ in their seeds alone; others are refused with
-the settings in which they differ. Runs that cannot be read are left out, and named in the figure. `learning_curves.csv`
-beside a figure holds what it shows, and `runs=learning_curves.csv` draws it again.
+the settings in which they differ. Runs and files that cannot be read are left out, and named in the figure. With
+`figure=all` one that cannot be drawn is named, and does not cost the others. `learning_curves.csv` beside a figure
+holds what it shows, and `runs=learning_curves.csv` draws it again.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import hydra
 from command_line import plain_errors, start_logging
@@ -18,18 +19,37 @@ from omegaconf import DictConfig, OmegaConf
 from schema import PlotConfig, register
 
 from dreamer_racing.checkpoint import ensure_writable
-from dreamer_racing.comparison import COLUMNS, WALL_CLOCK, compare_variants, comparison_table, plot_comparison
+from dreamer_racing.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
 from dreamer_racing.dreams import Dream, dream_video
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.figures import Flight, plot_dreams, plot_flights, plot_learning_curves
+from dreamer_racing.figures import PROFILE_AXES, Flight, plot_dreams, plot_flights
 from dreamer_racing.flights import read_trajectory
+from dreamer_racing.learning_figures import plot_comparison, plot_learning_curves
 from dreamer_racing.recording import write_gif, write_video
-from dreamer_racing.runs import RunData, evaluation_files, evaluation_score, find_runs, first_of_each_curve, read_runs
+from dreamer_racing.runs import (
+    RunData,
+    evaluation_files,
+    evaluation_score,
+    find_runs,
+    first_of_each_curve,
+    first_readable,
+    read_runs,
+)
 
 register()
 
 VIDEO_SLOWER = 2  # than the flight, so that one can look
+FLIGHTS = ("last", "best")  # of the evaluations of a run
+
+
+class Drawn(NamedTuple):
+    """What became of a figure."""
+
+    files: list[str]
+    """Names, in the output folder; none if nothing is stored for it."""
+    problems: list[str]
+    """What was left out, a line each."""
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="plot")
@@ -44,87 +64,158 @@ def draw(config: PlotConfig) -> None:
     """Make one figure, or all for which there is something to draw.
 
     Raises:
-        ValueError: bad setting, nothing to draw, or runs that do not belong into one curve.
+        ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
-    if config.figure != "all" and config.figure not in FIGURES:
-        raise ValueError(f"figure={config.figure}: there are {', '.join(FIGURES)} and all.")
-    wanted_columns(config.quantities)
+    check_settings(config)
     output = ensure_writable(config.output)
     places = config.runs if isinstance(config.runs, list) else [config.runs]
     if [Path(str(place)).suffix for place in places] == [".csv"]:
         draw_curves(read_curves(places[0]), output)
         return
     explicit = config.figure != "all" and (config.flights or config.dreams)
-    columns = {*wanted_columns(config.quantities), *(column for _, column in COLUMNS.values()), WALL_CLOCK}
+    columns = {*wanted_columns(config.quantities), *COLUMNS}
     runs, problems = ([], []) if explicit else read_runs(find_runs(places), columns)
+    warn(problems)
+    if config.figure == "all":
+        draw_all(config, output, runs, problems)
+    elif not draw_one(config.figure, config, output, runs, problems):
+        raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
+
+
+def check_settings(config: PlotConfig) -> None:
+    """Refuse what no figure can be drawn with.
+
+    Raises:
+        ValueError: the value of a setting is not one of those there are.
+    """
+    for name, value, allowed in (
+        ("figure", config.figure, (*FIGURES, "all")),
+        ("flight", config.flight, FLIGHTS),
+        ("over", config.over, PROFILE_AXES),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")
+    wanted_columns(config.quantities)
+
+
+def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> None:
+    """Make every figure for which there is something to draw; one that fails does not cost the others.
+
+    Raises:
+        ValueError: nothing could be drawn.
+        Exception: of the first figure that failed for a reason that the runs cannot have, after the others were drawn.
+    """
+    drawn = False
+    failures: dict[str, Exception] = {}
+    for name in FIGURES:
+        try:
+            drawn |= draw_one(name, config, output, runs, problems)
+        except Exception as error:
+            failures[name] = error
+            warn([f"figure={name} failed: {error}"])
+    defects = [failure for failure in failures.values() if not isinstance(failure, (ValueError, OSError))]
+    if defects:
+        raise defects[0]
+    if not drawn:
+        reasons = "\n".join(f"figure={name}: {failure}" for name, failure in failures.items())
+        raise ValueError(f"figure=all: nothing could be drawn. {reasons or 'These runs have stored nothing for it.'}")
+
+
+def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> bool:
+    """Make a figure and say what it has left out; return whether there was anything to draw."""
+    files, found = FIGURES[name](config, output, runs, problems)
+    warn([problem for problem in found if problem not in problems])
+    print(f"{name + ':':<17} {', '.join(files) or 'none of these runs has stored anything for it'}")
+    return bool(files)
+
+
+def warn(problems: list[str]) -> None:
+    """Print a line each."""
     for problem in problems:
         print(f"warning: {problem}")
-    for name, figure in FIGURES.items():
-        if config.figure in (name, "all"):
-            made = figure(config, output, runs, problems)
-            if not made and config.figure == name:
-                raise ValueError(f"figure={name}: none of these runs has stored anything for it.")
-            print(f"{name + ':':<17} {', '.join(made) or 'none of these runs has stored anything for it'}")
 
 
-def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> list[str]:
+def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `learning_curves.png` and `.csv`."""
     curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems)
     write_curves(output / "learning_curves.csv", curves)
-    return [*draw_curves(curves, output), "learning_curves.csv"]
+    draw_curves(curves, output)
+    return Drawn(["learning_curves.png", "learning_curves.csv"], curves.problems)
 
 
-def draw_curves(curves: LearningCurves, output: Path) -> list[str]:
+def draw_curves(curves: LearningCurves, output: Path) -> None:
     """Make `learning_curves.png`."""
     plot_learning_curves(curves, output / "learning_curves.png")
-    return ["learning_curves.png"]
 
 
-def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> list[str]:
+def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make a grid, a video and a small GIF of three stages of training of each curve's first seed that has dreams."""
-    stages = {"imagined": config.dreams} if config.dreams else dict(dreaming_runs(runs))
-    made = []
-    for name, files in stages.items():
-        dreams = [(stage_name(file), Dream.load(file)) for file in files]
-        plot_dreams(dreams, output / f"{name}.png")
-        fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
-        write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
-        write_gif(output / f"{name}.gif", film, fps=fps)
-        made += [f"{name}.png", f"{name}.mp4", f"{name}.gif"]
-    return made
-
-
-def dreaming_runs(runs: list[RunData]) -> Iterator[tuple[str, list[Path]]]:
-    """Choose the first, the middle and the last dream of the runs that have three or more, or what there is."""
+    if config.dreams:
+        return draw_dreams("imagined", {Path(file): Dream.load(file) for file in config.dreams}, [], output)
+    files, missing = [], []
     for run in first_of_each_curve(runs):
-        files = list(evaluation_files(run.directory, "_dream.npz").values())
-        if files:
-            chosen = {files[0]: None, files[len(files) // 2]: None, files[-1]: None}
-            yield f"imagined_{run.name}", list(chosen)
+        stages, left_out = stages_of_training(run)
+        missing += left_out
+        if stages:
+            files += draw_dreams(f"imagined_{run.name}", stages, left_out, output).files
+    return Drawn(files, missing)
 
 
-def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> list[str]:
-    """Make `trajectories.png` of the files named, or of one evaluation of each curve's first seed."""
-    flights = [named_flight(file) for file in config.flights or chosen_flights(runs, config.flight)]
-    if not flights:
-        return []
-    plot_flights(flights, output / "trajectories.png", config.over)
-    return ["trajectories.png"]
+def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
+    """Read the first, the middle and the last dream of a run; instead of one that cannot be read the one before it.
 
-
-def chosen_flights(runs: list[RunData], which: str) -> Iterator[Path]:
-    """Choose the last or the best flight of the first seed of each curve.
-
-    Raises:
-        ValueError: neither of them is asked for.
+    Returns:
+        The dreams, each once, by file, and what was left out.
     """
-    if which not in ("last", "best"):
-        raise ValueError(f"flight={which}: there are last and best.")
+    files = list(evaluation_files(run.directory, "_dream.npz").values())
+    problems: list[str] = []
+    choices = (files, files[len(files) // 2 :: -1], files[::-1])  # before the first there is none: the one after it
+    found = [first_readable(choice, Dream.load, problems) for choice in choices]
+    return dict(sorted(filter(None, found), key=lambda pair: pair[0])), problems
+
+
+def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], output: Path) -> Drawn:
+    """Make a grid, a video and a small GIF."""
+    dreams = [(stage_name(file), dream) for file, dream in stages.items()]
+    plot_dreams(dreams, output / f"{name}.png", problems=problems)
+    fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
+    write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
+    write_gif(output / f"{name}.gif", film, fps=fps)
+    return Drawn([f"{name}.png", f"{name}.mp4", f"{name}.gif"], problems)
+
+
+def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
+    """Make `trajectories.png` of the files named, or of one evaluation of each curve's first seed."""
+    missing: list[str] = []
+    flights = [named_flight(file) for file in config.flights] or chosen_flights(runs, config.flight, missing)
+    if not flights:
+        return Drawn([], missing)
+    plot_flights(flights, output / "trajectories.png", config.over, problems=missing)
+    return Drawn(["trajectories.png"], missing)
+
+
+def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[Flight]:
+    """Read the last or the best flight of the first seed of each curve; of those that cannot be read, the next one.
+
+    Args:
+        runs: of any curves.
+        which: ``last`` or ``best``.
+        problems: gets a line for every file that cannot be read.
+    """
+    flights = []
     for run in first_of_each_curve(runs):
-        files = evaluation_files(run.directory, "_trajectory.csv")
-        if files:
-            best = max(files, key=lambda env_steps: evaluation_score(run.directory, env_steps))
-            yield files[best if which == "best" else max(files)]
+        found = first_readable(stored_flights(run, which), named_flight, problems)
+        flights += [found[1]] if found else []
+    return flights
+
+
+def stored_flights(run: RunData, which: str) -> list[Path]:
+    """List the flights of a run, the last or the best first."""
+    files = evaluation_files(run.directory, "_trajectory.csv")
+    order = sorted(files, reverse=which == "last")
+    if which == "best":
+        order.sort(key=lambda env_steps: evaluation_score(run.directory, env_steps), reverse=True)
+    return [files[env_steps] for env_steps in order]
 
 
 def named_flight(file: str | Path) -> Flight:
@@ -140,17 +231,17 @@ def stage_name(file: str | Path) -> str:
     return f"{int(name):,} env_steps" if name.isdigit() else name.replace("_", " ")
 
 
-def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> list[str]:
+def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
-    results = compare_variants(runs) if runs else []
-    if len(results) < 2:
-        return []
-    (output / "comparison.md").write_text(comparison_table(results), encoding="utf-8")
-    plot_comparison(results, output / "comparison.png")
-    return ["comparison.md", "comparison.png"]
+    if len({run.key for run in runs}) < 2:
+        return Drawn([], [])
+    comparison = compare_variants(runs, problems)
+    (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")
+    plot_comparison(comparison, output / "comparison.png")
+    return Drawn(["comparison.md", "comparison.png"], comparison.problems)
 
 
-FIGURES: dict[str, Callable[[PlotConfig, Path, list[RunData], list[str]], list[str]]] = {
+FIGURES: dict[str, Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]] = {
     "learning_curves": draw_learning_curves,
     "imagined": draw_imagined,
     "trajectories": draw_trajectories,

@@ -11,6 +11,7 @@ import yaml
 
 from dreamer_racing.curves import (
     ALL_TRACKS,
+    QUANTITIES,
     bootstrap_interval,
     interquartile_mean,
     learning_curves,
@@ -60,6 +61,9 @@ def test_running_mean_between_and_beyond_rows():
     grid = np.array([-1.0, 0, 20, 45, 60, 71])
     expected = [np.nan, 1, (1 + 2 + 6) / 3, 9, 12, np.nan]  # 45: halfway between the rows at 30 and 60
     np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
+    values[2] = np.nan  # looked for at 30, and not found
+    expected = [np.nan, 1, (1 + 2) / 2, np.nan, 12, np.nan]
+    np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
 
 
 def test_mean_and_standard_deviation_over_seeds(tmp_path):
@@ -67,8 +71,79 @@ def test_mean_and_standard_deviation_over_seeds(tmp_path):
         write_run(tmp_path, f"dreamer_v3_circle_paper_seed{seed}", [value] * 4, seed=seed)
     (curve,) = curves_of(tmp_path).curves
     assert curve.key == CurveKey("circle", "dreamer_v3", "paper")
-    spread = np.sqrt((4 + 1 + 9) / 3)
+    spread = np.sqrt((4 + 1 + 9) / 2)  # of a sample: n − 1
     np.testing.assert_allclose(at(curve, 2500), (3.0, 3 - spread, 3 + spread, 3))
+
+
+@pytest.mark.parametrize("aggregate", ["mean", "iqm"])
+def test_a_single_seed_has_no_band(tmp_path, aggregate):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", [5.0] * 10, seed=0)
+    write_run(tmp_path, "dreamer_v3_circle_seed1", [5.0] * 5, seed=1)
+    (curve,) = curves_of(tmp_path, aggregate=aggregate).curves
+    assert at(curve, 4000) == (5.0, 5.0, 5.0, 2)
+    np.testing.assert_array_equal(at(curve, 8000), (5.0, np.nan, np.nan, 1))
+
+
+# --- evaluations without a value ---
+
+
+def write_laps(folder: Path, seed: int, laps: list[float | None]) -> Path:
+    """A run with an evaluation after 1000, 2000 ... env_steps, some without a lap."""
+    run = write_run(folder, f"ppo_circle_seed{seed}", algorithm="ppo", seed=seed)
+    rows = [f"{1000 * (i + 1)},20,{'' if lap is None else lap}\n" for i, lap in enumerate(laps)]
+    rows = [row for i, line in enumerate(rows) for row in (f"{1000 * i + 500},,\n", line)]  # and rows of training
+    (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes,evaluation/lap_time_mean\n" + "".join(rows))
+    return run
+
+
+def test_no_lap_is_drawn_where_none_was_flown(tmp_path):
+    write_laps(tmp_path, 0, [None, 6.0, None, 5.0, 4.0])
+    result = curves_of(tmp_path, quantities=["lap_time"], window=100.0)
+    (curve,) = result.curves
+    for env_steps, value in ((1000, np.nan), (1500, np.nan), (2000, 6.0), (2500, np.nan), (3000, np.nan),
+                             (3500, np.nan), (4000, 5.0), (4500, 4.5), (5000, 4.0)):  # fmt: skip
+        np.testing.assert_allclose(at(curve, env_steps)[0], value, rtol=0.01, err_msg=str(env_steps))
+    assert result.problems == []
+
+
+def test_laps_of_fewer_than_half_of_the_seeds_are_not_drawn(tmp_path):
+    write_laps(tmp_path, 0, [7.0, 6.0, 6.0, 5.0])
+    write_laps(tmp_path, 1, [None, 4.0, 4.0])  # ends early: then it does not count
+    write_laps(tmp_path, 2, [None, None, 2.0, 3.0])
+    result = curves_of(tmp_path, quantities=["lap_time"], window=100.0)
+    (curve,) = result.curves
+    np.testing.assert_array_equal(at(curve, 1000), (np.nan, np.nan, np.nan, 1))  # 1 of 3
+    np.testing.assert_allclose(at(curve, 2000), (5.0, 5 - np.sqrt(2), 5 + np.sqrt(2), 2))  # 2 of 3
+    np.testing.assert_allclose(at(curve, 3000), (4.0, 2.0, 6.0, 3))
+    np.testing.assert_allclose(at(curve, 4000), (4.0, 4 - np.sqrt(2), 4 + np.sqrt(2), 2), atol=0.02)
+    assert [problem for problem in result.problems if "left no value" in problem] == [
+        "Mean lap time (s, deterministic): where an evaluation left no value, mean of the seeds that have one, and "
+        "nothing where fewer than half do (1 of 1 curves)"
+    ]
+
+
+def test_a_seed_that_never_flew_a_lap_counts_as_one_without(tmp_path):
+    write_laps(tmp_path, 0, [None, 6.0])
+    for seed in (1, 2):
+        run = write_laps(tmp_path, seed, [None, None])
+        (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes\n1000,20\n2000,20\n")
+    result = curves_of(tmp_path, quantities=["lap_time"])
+    assert np.isnan(result.curves[0].centre).all() and result.curves[0].seeds.max() == 1
+    assert "no values of evaluation/lap_time_mean: ppo_circle_seed1, ppo_circle_seed2" in result.problems
+
+
+def test_both_policies_can_be_drawn(tmp_path):
+    run = write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
+    names = [
+        f"evaluation{policy}/{name}" for policy in ("", "_stochastic") for name in ("success_rate", "gates_per_episode")
+    ]
+    (run / "metrics.csv").write_text(f"env_steps,{','.join(names)}\n1000,1,12,0.5,7\n2000,1,12,0.5,7\n")
+    quantities = ["success_rate", "gates", "stochastic_success_rate", "stochastic_gates"]
+    curves = curves_of(tmp_path, quantities=quantities).curves
+    assert [(curve.quantity, curve.centre[-1]) for curve in curves] == list(
+        zip(quantities, (1, 12, 0.5, 7), strict=True)
+    )
+    assert QUANTITIES["stochastic_success_rate"].comparable
 
 
 def test_interquartile_mean_is_that_of_scipy():
@@ -170,8 +245,16 @@ def test_mixed_configurations_are_refused_with_both_values(tmp_path):
     write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0, device="cpu", logger={"every": 10})
     other = {"preset": "faithful", "looks": "randomised"}
     write_run(tmp_path, "dreamer_v3_circle_seed1", seed=1, device="cuda", logger={"every": 20}, env=other)
-    message = r"seed0 and .*seed1 .*alike: env.looks: absent and randomised; env.preset: easy and faithful\. "
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"seed0 and .*seed1 .*alike: env.preset: easy and faithful\. "):
+        curves_of(tmp_path)
+
+
+def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path):
+    for seed, decoys in enumerate(({}, {"decoys": None}, {"decoys": {"count": 4}})):
+        write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, **decoys)
+    assert curves_of(tmp_path).curves[0].seeds.max() == 3
+    write_run(tmp_path, "dreamer_v3_circle_seed3", seed=3, decoys={"count": 2})
+    with pytest.raises(ValueError, match=r"seed2 and .*seed3 .*alike: decoys\.count: 4 and 2\."):  # not with the first
         curves_of(tmp_path)
 
 
@@ -266,3 +349,5 @@ def test_evaluations_by_env_steps(tmp_path):
     assert list(evaluation_files(tmp_path, "_dream.npz")) == [100, 200]
     (folder / "000000100.json").write_text('{"gates_per_episode": 2, "return_mean": 7.5}')
     assert evaluation_score(tmp_path, 100) == (2.0, 7.5) > evaluation_score(tmp_path, 200)
+    (folder / "000000100.json").write_text('{"gates_per_episode": null, "return_mean": 7.5}')
+    assert evaluation_score(tmp_path, 100) == evaluation_score(tmp_path, 200)

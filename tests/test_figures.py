@@ -1,4 +1,4 @@
-"""The paper's figures: stored flights and dreams come back exactly, and what is drawn is what was stored."""
+"""Figures of evaluations: stored flights and dreams come back exactly, and what is drawn is what was stored."""
 
 from __future__ import annotations
 
@@ -9,19 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from PIL import Image
 
-from dreamer_racing.curves import learning_curves
 from dreamer_racing.dreams import CONTEXT, PREDICTED, STRIDE, Dream, dream_video, film_strip, record_dream, shown_frames
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation import Trajectory
-from dreamer_racing.figures import Flight, plot_dreams, plot_flights, plot_learning_curves, profile_axis
+from dreamer_racing.figures import Flight, plot_dreams, plot_flights, profile_axis
 from dreamer_racing.flights import read_trajectory, write_trajectory
 from dreamer_racing.plotting import CRASH_COLOR
 from dreamer_racing.recording import CONTEXT_COLOR, OPEN_LOOP_COLOR
-from dreamer_racing.runs import find_runs, read_runs
-from tests.test_curves import write_run
 
 
 def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool = False) -> Trajectory:
@@ -41,13 +37,7 @@ def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool 
     )
 
 
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures that were saved, with the canvas drawn."""
-    saved = []
-    savefig = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kw: (saved.append(self), savefig(self, *args, **kw)))
-    return saved
+CRASH_RGB = (224, 49, 49)  # `CRASH_COLOR`
 
 
 # --- stored flights ---
@@ -79,6 +69,9 @@ def test_another_table_is_no_flight(tmp_path):
     (tmp_path / "metrics.csv").write_text("env_steps,loss\n1,2\n")
     with pytest.raises(ValueError, match="holds no trajectory: its columns should be t, x, y, z"):
         read_trajectory(tmp_path / "metrics.csv")
+    (tmp_path / "garbage.csv").write_text('"' + "x" * 200_000)
+    with pytest.raises(ValueError, match="holds no trajectory: field larger than"):
+        read_trajectory(tmp_path / "garbage.csv")
 
 
 # --- stored dreams ---
@@ -121,10 +114,11 @@ def test_short_flights_and_agents_without_decoder_leave_no_dream():
     assert record_dream(DREAMER, random_flight()) is None
 
 
-def test_half_a_dream_is_refused(tmp_path):
+@pytest.mark.parametrize("damage", [lambda data: data[:2000], lambda data: data[:2000] + bytes(99) + data[2099:]])
+def test_half_a_dream_is_refused(tmp_path, damage):
     path = tmp_path / "a_dream.npz"
     record_dream(DREAMER, random_flight(pixels=True)).save(path)
-    path.write_bytes(path.read_bytes()[:2000])
+    path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match="holds no dream, or half of one"):
         Dream.load(path)
 
@@ -164,28 +158,6 @@ def test_dreams_of_three_stages(tmp_path, figures):
 # --- figures ---
 
 
-def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, figures):
-    for algorithm in ("sac", "dreamer_v3"):
-        for track in ("kidney", "circle"):
-            for seed in range(2):
-                write_run(tmp_path, f"{algorithm}_{track}_seed{seed}", track=track, seed=seed, algorithm=algorithm)
-    (write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo") / "metrics.csv").unlink()
-    runs, problems = read_runs(find_runs([tmp_path]))
-    curves = learning_curves(runs, ["return", "success_rate"], problems=problems)
-    plot_learning_curves(curves, tmp_path / "figure.png")
-    *panels, below = figures[0].axes
-    assert [axes.get_title() for axes in panels] == ["Circle", "Kidney", "", ""]
-    assert [axes.get_ylabel() for axes in panels] == ["Return (training episodes)", "", "Success rate", ""]
-    assert all(axes.get_xlim() == (0.0, 2000.0) and len(axes.lines) == 2 for axes in panels)
-    legends = [child for child in below.get_children() if hasattr(child, "get_texts")]
-    names, warnings = ([text.get_text() for text in legend.get_texts()] for legend in legends)
-    assert names == ["DreamerV3 (2 seeds)", "SAC (2 seeds)"]
-    assert warnings == ["! ppo_circle_seed0 left out: it has no metrics.csv"]
-    colors = [line.get_color() for line in legends[0].get_lines()]
-    assert len(set(colors)) == 2
-    assert {line.get_color() for line in panels[0].lines} == set(colors)
-
-
 def test_flights_side_by_side(tmp_path, figures):
     flights = [Flight(name, load_track(name), random_flight()) for name in ("figure8", "figure8_decoys")]
     plot_flights(flights, tmp_path / "flights.png", over="time")
@@ -209,7 +181,19 @@ def test_axis_of_the_speed_profile():
         plot_flights([Flight("a", load_track("circle"), flight)], Path("a.png"), over="height")
 
 
-def test_figures_are_readable_pictures(tmp_path):
-    plot_flights([Flight("lost", load_track("split_s"), random_flight())], tmp_path / "flights.png")
-    with Image.open(tmp_path / "flights.png") as image:
-        assert image.width > 700
+def test_what_was_left_out_is_written_below(tmp_path, figures):
+    flight = Flight("lost", load_track("split_s"), random_flight())
+    plot_flights([flight], tmp_path / "flights.png")
+    plot_flights([flight], tmp_path / "warned.png", problems=["a_run without its last flight"])
+    plot_dreams([("early", flat_dream())], tmp_path / "dreams.png", problems=[f"problem {i}" for i in range(10)])
+    assert [[text.get_text() for text in figure.texts] for figure in figures[:2]] == [
+        [],
+        ["! a_run without its last flight"],
+    ]
+    lines = figures[2].texts[0].get_text().splitlines()
+    assert lines[0] == "! problem 0" and lines[-2:] == ["! problem 7", "! and 2 more"]
+    with Image.open(tmp_path / "flights.png") as plain, Image.open(tmp_path / "warned.png") as warned:
+        assert plain.width > 700 and warned.width == plain.width
+        assert warned.height - plain.height == pytest.approx(150 * (0.16 + 0.12), abs=2)
+        below = warned.crop((0, plain.height, *warned.size)).convert("RGB")
+        assert {color for _, color in below.getcolors(10_000)} > {CRASH_RGB, (255, 255, 255)}

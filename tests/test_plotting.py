@@ -37,15 +37,6 @@ def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> T
     )
 
 
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures that were saved, with the canvas drawn."""
-    saved = []
-    savefig = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kw: (saved.append(self), savefig(self, *args, **kw)))
-    return saved
-
-
 @pytest.mark.parametrize("name", BUILTIN_TRACKS)
 def test_every_track_fits_and_only_different_heights_get_a_side_view(name, tmp_path, figures):
     track = load_track(name)
