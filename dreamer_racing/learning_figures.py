@@ -44,7 +44,7 @@ OTHER_COLOR = "#74c0fc"  # of a variant that is not the reference
 def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     """Draw a column a track and a row a quantity, a colour an algorithm and a line style a variant.
 
-    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named below.
+    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named above.
 
     Reference: paper, Fig. "Reward evolution".
 

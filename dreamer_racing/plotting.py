@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MultipleLocator
-from matplotlib.transforms import Bbox
 
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.scene import Camera
@@ -40,8 +39,8 @@ SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
 )
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
-MAX_WARNINGS = 8  # below a figure
-NOTE_LETTERS = 14  # of a note below a figure, an inch of its width
+MAX_WARNINGS = 8  # above a figure
+NOTE_LETTERS = 14  # of a note beside a figure, an inch of its width
 HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is worth its space
 
 DEFAULT_PANELS: dict[str, tuple[str, ...]] = {
@@ -175,17 +174,15 @@ def save(figure: Figure, path: str | Path, warnings: Sequence[str] = ()) -> None
     Args:
         figure: which.
         path: the file; missing folders are made.
-        warnings: what a reader must know, a line each; they are written below the figure, which grows by them.
+        warnings: what a reader must know, a line each; they are written above the figure, which grows by them.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     width, height = figure.get_size_inches()
-    lines = _warning_lines(warnings, width)
-    below = 0.16 * len(lines) + 0.12 if lines else 0.0  # inches
-    if lines:
+    if lines := _warning_lines(warnings, width):
+        figure.set_size_inches(width, height + 0.16 * len(lines) + 0.1)
         style: dict[str, Any] = {"fontsize": 8, "color": CRASH_COLOR, "linespacing": 1.35}
-        figure.text(0.08 / width, -0.02 / height, "\n".join(lines), va="top", **style)
-    whole = Bbox.from_bounds(0.0, -below, width, height + below)
-    figure.savefig(path, dpi=150, facecolor="white", bbox_inches=whole if lines else None)
+        figure.suptitle("\n".join(lines), x=0.08 / width, ha="left", **style)
+    figure.savefig(path, dpi=150, facecolor="white")
 
 
 def _warning_lines(warnings: Sequence[str], width: float) -> list[str]:

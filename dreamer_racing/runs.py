@@ -246,10 +246,10 @@ def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: l
         except (ValueError, OSError) as error:
             failures.append((file, error))
     if failures:
-        file, error = failures[0]
+        first, failure = failures[0]
         more = len(failures) - 1
         others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
-        reason = textwrap.shorten(str(error).replace(f"{file.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
-        line = f"{file.parent.parent.name} without {file.name}{others}: {reason}"
+        reason = textwrap.shorten(str(failure).replace(f"{first.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
+        line = f"{first.parent.parent.name} without {first.name}{others}: {reason}"
         problems += [line] if line not in problems else []
     return found

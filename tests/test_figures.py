@@ -181,19 +181,16 @@ def test_axis_of_the_speed_profile():
         plot_flights([Flight("a", load_track("circle"), flight)], Path("a.png"), over="height")
 
 
-def test_what_was_left_out_is_written_below(tmp_path, figures):
+def test_what_was_left_out_is_written_above(tmp_path, figures):
     flight = Flight("lost", load_track("split_s"), random_flight())
     plot_flights([flight], tmp_path / "flights.png")
     plot_flights([flight], tmp_path / "warned.png", problems=["a_run without its last flight"])
     plot_dreams([("early", flat_dream())], tmp_path / "dreams.png", problems=[f"problem {i}" for i in range(10)])
-    assert [[text.get_text() for text in figure.texts] for figure in figures[:2]] == [
-        [],
-        ["! a_run without its last flight"],
-    ]
-    lines = figures[2].texts[0].get_text().splitlines()
+    assert [figure.get_suptitle() for figure in figures[:2]] == ["", "! a_run without its last flight"]
+    lines = figures[2].get_suptitle().splitlines()
     assert lines[0] == "! problem 0" and lines[-2:] == ["! problem 7", "! and 2 more"]
     with Image.open(tmp_path / "flights.png") as plain, Image.open(tmp_path / "warned.png") as warned:
         assert plain.width > 700 and warned.width == plain.width
-        assert warned.height - plain.height == pytest.approx(150 * (0.16 + 0.12), abs=2)
-        below = warned.crop((0, plain.height, *warned.size)).convert("RGB")
-        assert {color for _, color in below.getcolors(10_000)} > {CRASH_RGB, (255, 255, 255)}
+        assert warned.height - plain.height == pytest.approx(150 * (0.16 + 0.1), abs=2)
+        above = warned.crop((0, 0, warned.width, warned.height - plain.height)).convert("RGB")
+        assert {color for _, color in above.getcolors(10_000)} > {CRASH_RGB, (255, 255, 255)}

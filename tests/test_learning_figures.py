@@ -39,7 +39,7 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
     assert all(axes.get_xlim() == (0.0, 2000.0) and len(axes.lines) == 2 for axes in panels)
     assert all(len(axes.collections) == 2 for axes in panels)  # bands
     assert legend_texts(figures[0]) == ["DreamerV3 (2 seeds)", "SAC (2 seeds)"]
-    assert [text.get_text() for text in figures[0].texts] == ["! ppo_circle_seed0 left out: it has no metrics.csv"]
+    assert figures[0].get_suptitle() == "! ppo_circle_seed0 left out: it has no metrics.csv"
     (legend,) = [child for child in below.get_children() if hasattr(child, "get_texts")]
     assert "standard deviation (n − 1) (none of one seed); running mean" in legend.get_title().get_text()
     colors = [line.get_color() for line in legend.get_lines()]
@@ -139,7 +139,8 @@ def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, fig
 
 def test_the_picture_says_how_and_what_was_left_out(tmp_path, figures):
     plot_comparison(COMPARISON, tmp_path / "comparison.png")
-    assert [" ".join(text.get_text().split()) for text in figures[0].texts] == [CAPTION, "! late left out"]
+    assert figures[0].get_suptitle() == "! late left out"
+    assert " ".join(figures[0].get_supxlabel().split()) == CAPTION
 
 
 def test_several_algorithms_are_named_and_have_no_common_reference(tmp_path, figures):

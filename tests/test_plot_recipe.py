@@ -96,7 +96,7 @@ def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, c
         f"dreamer_v3_circle_paper_seed0 without 00000{chosen}000_trajectory.csv: 00000{chosen}000_trajectory.csv was"
     )
     assert warning in capsys.readouterr().out
-    assert warning[:60] in " ".join(figures[0].texts[0].get_text().split())
+    assert warning[:60] in " ".join(figures[0].get_suptitle().split())
 
 
 def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
@@ -200,4 +200,4 @@ def test_a_comparison_names_what_was_left_out(runs, recipe, figures):
     recipe.draw(recipe.PlotConfig(figure="comparison", runs=str(runs / "runs"), output=str(runs / "figures")))
     warning = "dreamer_v3_circle_paper_seed0 ends at 2,000 env_steps, compared are 32,000 to 40,000: left out"
     assert f"- {warning}\n" in (runs / "figures" / "comparison.md").read_text()
-    assert warning in " ".join(figures[0].texts[1].get_text().split())
+    assert warning in " ".join(figures[0].get_suptitle().split())
