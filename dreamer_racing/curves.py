@@ -33,7 +33,9 @@ class Quantity:
     column: str
     """Of `metrics.csv`."""
     comparable: bool = False
-    """Whether the same value means the same on every track, so that tracks may be pooled."""
+    """Whether the same value means the same on every track, so that tracks may be pooled: a rate from 0 to 1."""
+    counted: bool = False
+    """Whether it is never negative."""
 
 
 QUANTITIES = {
@@ -43,9 +45,11 @@ QUANTITIES = {
     "stochastic_success_rate": Quantity(
         "Success rate (stochastic)", "evaluation_stochastic/success_rate", comparable=True
     ),
-    "gates": Quantity("Gates per episode (deterministic)", "evaluation/gates_per_episode"),
-    "stochastic_gates": Quantity("Gates per episode (stochastic)", "evaluation_stochastic/gates_per_episode"),
-    "training_gates": Quantity("Gates (training episodes)", "episode/gates_passed"),
+    "gates": Quantity("Gates per episode (deterministic)", "evaluation/gates_per_episode", counted=True),
+    "stochastic_gates": Quantity(
+        "Gates per episode (stochastic)", "evaluation_stochastic/gates_per_episode", counted=True
+    ),
+    "training_gates": Quantity("Gates (training episodes)", "episode/gates_passed", counted=True),
     "lap_time": Quantity("Mean lap time (s, deterministic)", "evaluation/lap_time_mean"),
     "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best"),
     "image_error": Quantity("Image error (held out)", "held_out/image_error"),

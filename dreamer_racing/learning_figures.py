@@ -105,7 +105,18 @@ def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, longest: fl
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(0.0, longest)
+    if curves:
+        axes.set_ylim(*_limits(curves[0].quantity, axes.get_ylim()))
     dress(axes)
+
+
+def _limits(quantity: str, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the ends of an axis: all of 0 to 1 for a rate, and from 0 to 1 at least for what is counted."""
+    if QUANTITIES[quantity].comparable:
+        return -0.02, 1.04
+    if QUANTITIES[quantity].counted:
+        return 0.0, max(1.0, limits[1])
+    return limits
 
 
 def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles) -> None:
@@ -239,6 +250,7 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
             if result.key.is_reference and not several and len(result.values.get(name, ())):
                 axes.axvline(result.values[name].mean(), color=INK, linestyle=(0, (4, 3)), linewidth=0.9)
         axes.set_title(QUANTITIES[name].label, loc="left", fontsize=10, color=INK)
+        axes.set_xlim(*_limits(name, axes.get_xlim()))
         dress(axes)
         axes.grid(axis="y", visible=False)
     names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 import torch
+from omegaconf.errors import MissingMandatoryValue
 from torchrl.checkpoint import CheckpointError
 
 CONFIG_DIR = Path(__file__).parent / "config"
@@ -21,6 +22,9 @@ def plain_errors() -> Iterator[None]:
     """
     try:
         yield
+    except MissingMandatoryValue as error:
+        print(f"error: {error.full_key}= is missing, and there is no default.", file=sys.stderr)
+        raise SystemExit(2) from error
     except (ValueError, OSError, CheckpointError, RendererError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
@@ -56,7 +60,7 @@ def choose_device(device: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ValueError(
-            f"device={device}: {str(error).splitlines()[0]} This machine has: {', '.join(available)}; "
+            f"device={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "
             "device=auto takes the best."
         ) from error
     return chosen

@@ -78,7 +78,8 @@ def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) 
         return
     run_dir.mkdir(parents=True, exist_ok=True)
     RunLock(run_dir).release()  # refuses here, rather than into the log of a live run
-    print(f"{run_dir}: {'resumed' if any('resume=' in word for word in command) else 'started'}", flush=True)
+    began = "resumed" if any("resume=" in word for word in command) else "started"
+    print(f"{run_dir}: {began}, budget={config.budget}", flush=True)
     if status := run(command, run_dir):
         log = run_dir / LOG
         last = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-5:])

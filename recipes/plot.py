@@ -71,6 +71,7 @@ def draw(config: PlotConfig) -> None:
     places = config.runs if isinstance(config.runs, list) else [config.runs]
     if [Path(str(place)).suffix for place in places] == [".csv"]:
         draw_curves(read_curves(places[0]), output)
+        print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
     explicit = config.figure != "all" and (config.flights or config.dreams)
     columns = {*wanted_columns(config.quantities), *COLUMNS}

@@ -21,6 +21,7 @@ class Restored:
 
     checkpoint: Path
     trained: RunConfig  # configuration of its run, with the race asked for in place of the one trained on
+    trained_on: str  # track
     learner: Learner
     counters: dict[str, int]
     machine: dict[str, Any]  # versions and commit too, as they were at the start
@@ -37,6 +38,7 @@ class Restored:
             "checkpoint": config.checkpoint,
             "algorithm": self.trained.algorithm,
             "env_steps": self.counters["env_steps"],
+            "trained_on": self.trained_on,
             "track": self.trained.track,
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
@@ -62,14 +64,17 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
     torch.manual_seed(config.seed)
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
+    trained_on = trained.track
     if config.track:
         trained.track, trained.decoys = config.track, None
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer
     learner, counters = restore_learner(trained, checkpoint, device)
-    print(f"checkpoint: {checkpoint} ({trained.algorithm}, {counters['env_steps']:,} env_steps)")
-    return Restored(checkpoint, trained, learner, counters, machine)
+    print(
+        f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {counters['env_steps']:,} env_steps)"
+    )
+    return Restored(checkpoint, trained, trained_on, learner, counters, machine)
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:

@@ -1,6 +1,7 @@
 """What every training recipe does around its algorithm: build, resume, collect, log, evaluate, save, end."""
 
 import random
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -50,6 +51,7 @@ from dreamer_racing.run_lock import RunLock
 from dreamer_racing.timing import RunClock
 
 R = TypeVar("R", bound="Run")
+TRAINED_ON = ("track", "task", "decoys")  # what a run that is resumed cannot change
 
 
 @dataclass
@@ -98,8 +100,8 @@ class Run:
         self.learner.check_finite()
         return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
 
-    def evaluate(self) -> None:
-        """Evaluate, without a trace in the random numbers of training."""
+    def evaluate(self) -> str:
+        """Evaluate, without a trace in the random numbers of training; return a line on what came of it."""
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
@@ -108,7 +110,13 @@ class Run:
         self.evaluated = self.counters["updates"]
         # Gates first, return where the gates are the same: a return lies far below a million.
         score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
-        self.best.offer(score, self.counters["env_steps"])
+        best = self.best.offer(score, self.counters["env_steps"])
+        names = {"gates": "gates_per_episode", "success": "success_rate", "return": "return_mean"}
+        shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
+        numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
+        return (
+            f"evaluation at {self.counters['env_steps']:,} env_steps: {numbers}{' (the best so far)' if best else ''}"
+        )
 
     @property
     def last_good(self) -> str:
@@ -196,6 +204,13 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
+    for override in overrides:
+        name, _, value = override.partition("=")
+        if name in TRAINED_ON and value != str(saved.get(name)):
+            raise ValueError(
+                f"{run_dir} was trained with {name}={saved.get(name)}, and goes on with it: {override} would be "
+                "another run. Leave it out, or begin anew."
+            )
     merged = merge_overrides([*OmegaConf.load(run_dir / "overrides.yaml"), f"run_dir={run_dir}"], overrides)
     return hydra.compose(algorithm, merged), merged
 
@@ -319,9 +334,10 @@ def claim(config: RunConfig) -> RunLock:
     Raises:
         ValueError: it holds another run, or is in use by a live one.
     """
-    refuse_to_replace(config)
     assert config.run_dir is not None, "resolve_common() names it"
-    return RunLock(ensure_writable(config.run_dir))
+    lock = RunLock(ensure_writable(config.run_dir))
+    refuse_to_replace(config)
+    return lock
 
 
 def assemble(
@@ -393,7 +409,11 @@ def assemble(
 
 
 def train(run: Run) -> None:
-    """Collect and learn until `total_env_steps` or a signal; log, evaluate and save on the way."""
+    """Collect and learn until `total_env_steps`; log, evaluate and save on the way.
+
+    Raises:
+        SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
+    """
     config, counters = run.config, run.counters
     schedule = Schedule(
         counters["env_steps"], log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every
@@ -403,7 +423,9 @@ def train(run: Run) -> None:
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
         if finished_env_steps(run.directory) >= config.total_env_steps:
-            bar.write(f"complete already: raise total_env_steps={config.total_env_steps} to go on")
+            bar.write(
+                f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"
+            )
         run.learn(None, stop)  # what an interrupted run still owes
         while counters["env_steps"] < config.total_env_steps and not stop.requested:
             with run.clock.timed("collect"):
@@ -413,22 +435,27 @@ def train(run: Run) -> None:
             run.learn(rollout, stop)
             if stop.signal_name:
                 break
-            if schedule.due("log", counters["env_steps"]):
+            due = schedule.due("log", counters["env_steps"])
+            if schedule.due("evaluate", counters["env_steps"]):
+                bar.write(run.evaluate())
+                due = True  # so that its numbers stand where they were measured
+            if due:
                 run.measure()
                 show(bar, run.metrics.write(counters["env_steps"]))
-            if schedule.due("evaluate", counters["env_steps"]):
-                run.evaluate()
             if schedule.due("save", counters["env_steps"]):
                 run.save()
         if stop.requested:
-            bar.write(f"{stop.signal_name}: saving; continue with resume={run.directory}")
+            at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
+            bar.write(f"{stop.signal_name} {at}: saving; continue with resume={run.directory}")
         saved = run.save()
         if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
-            run.evaluate()
+            bar.write(run.evaluate())
         run.metrics.write(counters["env_steps"])
         if not stop.requested:
             mark_finished(run.directory, counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
+    if stop.signal_name:
+        raise SystemExit(128 + signal.Signals[stop.signal_name])
 
 
 def show(bar: tqdm, row: dict[str, float]) -> None:

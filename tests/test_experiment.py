@@ -104,7 +104,7 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     assert first.returncode == 0 and second.returncode == 0, first.stderr + second.stderr
     for algorithm in ("dreamer_v3", "ppo", "sac"):
         run_dir = tmp_path / "runs" / "smoke" / f"{algorithm}_circle_default_seed0"
-        assert f"{run_dir}: started" in first.stdout and f"{run_dir}: done" in first.stdout
+        assert f"{run_dir}: started, budget=smoke" in first.stdout and f"{run_dir}: done" in first.stdout
         assert f"{run_dir}: finished, skipped" in second.stdout
         table = rows(run_dir)
         assert int(table[-1]["env_steps"]) >= 1200

@@ -89,6 +89,23 @@ def test_resume_continues_where_the_run_stopped(run_dir: Path) -> None:
     assert config.track == "circle" and config.model.size == "debug" and config.total_env_steps == 1000
 
 
+def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
+    before = (run_dir / "config.yaml").read_text()
+    done = recipe("dreamer_v3", f"resume='{run_dir}'", "track=kidney", cwd=run_dir.parent)
+    assert done.returncode == 2 and "trained with track=circle" in done.stderr and "Traceback" not in done.stderr
+    assert (run_dir / "config.yaml").read_text() == before
+
+
+def test_evaluations_stand_where_they_were_measured(run_dir: Path) -> None:
+    table = {int(row["env_steps"]): row for row in rows(run_dir) if row["evaluation/return_mean"]}
+    files = {int(path.stem): path for path in (run_dir / "evaluations").glob("*[0-9].json")}
+    assert table.keys() == files.keys()
+    for env_steps, path in files.items():
+        assert float(table[env_steps]["evaluation/return_mean"]) == pytest.approx(
+            json.loads(path.read_text())["return_mean"], rel=1e-5
+        )
+
+
 def test_evaluate_reports_both_policies(run_dir: Path) -> None:
     done = recipe("evaluate", f"checkpoint='{run_dir}'", "episodes=3", "num_envs=2", cwd=run_dir.parent)
     assert done.returncode == 0, done.stderr
@@ -187,8 +204,8 @@ def test_a_signal_saves_and_exits_cleanly(number: signal.Signals, tmp_path: Path
             time.sleep(0.2)
         process.send_signal(number)
         output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, output
-    assert number.name in output
+    assert process.returncode == 128 + number, output
+    assert number.name in output and "of 1,000,000 env_steps" in output
     assert list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
 
 
