@@ -14,21 +14,12 @@ from typing import ClassVar
 
 import hydra
 from arena import make_env, make_learner
+from building import assemble, claim, make_collector, make_curriculum, make_run_replay, resolve_common, seed_generators
 from checks import check_dreamer
 from command_line import CONFIG_DIR, computes_bfloat16
 from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, register
-from training import (
-    ReplayRun,
-    assemble,
-    claim,
-    launch,
-    make_collector,
-    make_curriculum,
-    make_run_replay,
-    resolve_common,
-    seed_generators,
-)
+from training import ReplayRun, launch
 
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics

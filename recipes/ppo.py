@@ -12,21 +12,12 @@ from typing import ClassVar
 
 import hydra
 from arena import make_env, make_learner
+from building import assemble, claim, make_collector, make_curriculum, resolve_common, resolve_network, seed_generators
 from checks import check
 from omegaconf import DictConfig
 from schema import PPORunConfig, register
 from tensordict import TensorDictBase
-from training import (
-    Run,
-    assemble,
-    claim,
-    launch,
-    make_collector,
-    make_curriculum,
-    resolve_common,
-    resolve_network,
-    seed_generators,
-)
+from training import Run, launch
 
 from dreamer_racing.baselines import PPOLearner
 from dreamer_racing.checkpoint import GracefulExit

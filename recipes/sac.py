@@ -12,14 +12,9 @@ from typing import ClassVar
 
 import hydra
 from arena import make_env, make_learner
-from checks import check, check_replay
-from omegaconf import DictConfig
-from schema import SACRunConfig, register
-from training import (
-    ReplayRun,
+from building import (
     assemble,
     claim,
-    launch,
     make_collector,
     make_curriculum,
     make_run_replay,
@@ -27,6 +22,10 @@ from training import (
     resolve_network,
     seed_generators,
 )
+from checks import check, check_replay
+from omegaconf import DictConfig
+from schema import SACRunConfig, register
+from training import ReplayRun, launch
 
 from dreamer_racing.baselines import SACLearner
 from dreamer_racing.modules import Interface
