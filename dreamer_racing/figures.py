@@ -17,6 +17,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
@@ -37,6 +38,7 @@ from dreamer_racing.plotting import (
 )
 from dreamer_racing.recording import CONTEXT_COLOR, OPEN_LOOP_COLOR
 
+TITLE_ROOM = 0.35  # inches above the panels
 PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
 
 
@@ -76,8 +78,10 @@ def plot_flights(
     columns = min(columns, len(flights))
     rows = math.ceil(len(flights) / columns)
     top = max(4.6 * _proportion(flight.track) for flight in flights)  # inches
-    size = (4.6 * columns + 0.7, rows * (top + 1.9) + 0.4)
-    figure = Figure(figsize=size, layout="constrained")
+    width, height = 4.6 * columns + 0.7, rows * (top + 1.9) + 0.4 + TITLE_ROOM
+    figure = Figure(figsize=(width, height), layout="none")
+    # The layout forgets the titles of panels whose sides have a fixed proportion.
+    figure.set_layout_engine(ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - TITLE_ROOM / height)))
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=[top, 1.5] * rows)
     speed = speed_scale([flight.trajectory for flight in flights])
     above, below = [], []

@@ -182,7 +182,7 @@ def save(figure: Figure, path: str | Path, warnings: Sequence[str] = ()) -> None
         figure.set_size_inches(width, height + 0.16 * len(lines) + 0.1)
         style: dict[str, Any] = {"fontsize": 8, "color": CRASH_COLOR, "linespacing": 1.35}
         figure.suptitle("\n".join(lines), x=0.08 / width, ha="left", **style)
-    figure.savefig(path, dpi=150, facecolor="white", bbox_inches="tight", pad_inches=0.1)
+    figure.savefig(path, dpi=150, facecolor="white")
 
 
 def _warning_lines(warnings: Sequence[str], width: float) -> list[str]:
