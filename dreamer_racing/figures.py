@@ -79,7 +79,7 @@ def plot_flights(
     rows = math.ceil(len(flights) / columns)
     top = max(4.6 * _proportion(flight.track) for flight in flights)  # inches
     width, height = 4.6 * columns + 0.7, rows * (top + 1.9) + 0.4 + TITLE_ROOM
-    figure = Figure(figsize=(width, height), layout="none")
+    figure = Figure(figsize=(width, height))
     # The layout forgets the titles of panels whose sides have a fixed proportion.
     figure.set_layout_engine(ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - TITLE_ROOM / height)))
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=[top, 1.5] * rows)

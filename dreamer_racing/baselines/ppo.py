@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,16 +16,13 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
+from dreamer_racing.baselines.learner import BaselineLearner, detached, seeded
 from dreamer_racing.baselines.networks import (
-    BaselinePolicy,
     GaussianNetwork,
     NetworkModule,
     NetworkSize,
     ObservationNetwork,
-    check_size,
-    size_of,
 )
-from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
 
@@ -66,7 +62,7 @@ class PPOConfig:
     initial_std: float = 0.6
 
 
-class PPOLearner:
+class PPOLearner(BaselineLearner):
     """Actor and critic with TorchRL's ``ClipPPOLoss``, and one optimiser.
 
     Actions are drawn from a normal that is not bounded: the environment clips them to [−1, 1].
@@ -92,13 +88,9 @@ class PPOLearner:
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
+        super().__init__(size, interface, device)
         self.config = config or PPOConfig()
-        self.device = torch.device(device)
-        self._keys = interface.observation_keys
-        self._size = size_of(size, interface)
-        with torch.random.fork_rng(devices=[], enabled=seed is not None):
-            if seed is not None:
-                torch.manual_seed(seed)
+        with seeded(seed):
             self.actor = _make_actor(interface, size, self.config.initial_std).to(self.device)
             self.critic = NetworkModule(ObservationNetwork(interface, 1, size), ["state_value"]).to(self.device)
         self._loss = ClipPPOLoss(
@@ -111,19 +103,13 @@ class PPOLearner:
             loss_critic_type="l2",
             normalize_advantage=True,
         )
-        self._networks = {"actor": list(self.actor.parameters()), "critic": list(self.critic.parameters())}
+        self.networks = {"actor": list(self.actor.parameters()), "critic": list(self.critic.parameters())}
         self.optimizer = torch.optim.Adam(
-            [p for group in self._networks.values() for p in group],
+            [p for group in self.networks.values() for p in group],
             lr=self.config.learning_rate,
             eps=1e-5,
             fused=True,
         )
-        self.updates = 0
-        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-
-    def policy(self, deterministic: bool = False) -> BaselinePolicy:
-        """Return the acting step, which shares this learner's parameters."""
-        return BaselinePolicy(self.actor, deterministic)
 
     def update(self, rollout: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make ``epochs`` passes of gradient steps over a rollout.
@@ -193,40 +179,16 @@ class PPOLearner:
         total.backward()
         norms = {
             f"gradient_norm/{name}": nn.utils.clip_grad_norm_(parameters, self.config.gradient_clip)
-            for name, parameters in self._networks.items()
+            for name, parameters in self.networks.items()
         }
-        metrics = {name: value.detach() for name, value in ({**outputs} | norms | {"loss": total}).items()}
+        metrics = detached({**outputs, **norms, "loss": total})
         self._guard.check(metrics, batch)
         self.optimizer.step()
         self.updates += 1
         return metrics
 
-    def check_finite(self) -> None:
-        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
-        self._guard.settle()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
-        return {
-            "size": self._size,
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "updates": self.updates,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned.
-
-        Raises:
-            ValueError: If it is that of networks of another size; nothing is changed then.
-        """
-        check_size(state_dict["size"], self._size)
-        self.actor.load_state_dict(state_dict["actor"])
-        self.critic.load_state_dict(state_dict["critic"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
-        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate  # a setting of this learner, not state
-        self.updates = state_dict["updates"]
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"actor": self.actor, "critic": self.critic}
 
 
 def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:

@@ -6,7 +6,6 @@ Shape legend: B batch, A action.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,16 +14,13 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
+from dreamer_racing.baselines.learner import BaselineLearner, detached, seeded
 from dreamer_racing.baselines.networks import (
-    BaselinePolicy,
     GaussianNetwork,
     NetworkModule,
     NetworkSize,
     ObservationNetwork,
-    check_size,
-    size_of,
 )
-from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
 
@@ -57,7 +53,7 @@ class SACConfig:
     reward_scale: float = 1.0
 
 
-class SACLearner:
+class SACLearner(BaselineLearner):
     """Actor and two critics with TorchRL's ``SACLoss``, and one optimiser.
 
     Args:
@@ -81,13 +77,9 @@ class SACLearner:
         device: torch.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
+        super().__init__(size, interface, device)
         self.config = config or SACConfig()
-        self.device = torch.device(device)
-        self._keys = interface.observation_keys
-        self._size = size_of(size, interface)
-        with torch.random.fork_rng(devices=[], enabled=seed is not None):
-            if seed is not None:
-                torch.manual_seed(seed)
+        with seeded(seed):
             self.actor = _make_actor(interface, size).to(self.device)
             critic = ObservationNetwork(interface, 1, size, with_action=True)
             self._loss = SACLoss(
@@ -100,18 +92,12 @@ class SACLearner:
             ).to(self.device)
         self._loss.make_value_estimator(gamma=self.config.discount)
         self._targets = SoftUpdate(self._loss, tau=self.config.target_rate)
-        self._networks = {
+        self.networks = {
             "actor": list(self.actor.parameters()),
             "critic": list(self._loss.qvalue_network_params.values(True, True)),
         }
-        trained = [*self._networks["actor"], *self._networks["critic"], self._loss.log_alpha]
+        trained = [*self.networks["actor"], *self.networks["critic"], self._loss.log_alpha]
         self.optimizer = torch.optim.Adam(trained, lr=self.config.learning_rate, fused=True)
-        self.updates = 0
-        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-
-    def policy(self, deterministic: bool = False) -> BaselinePolicy:
-        """Return the acting step, which shares this learner's parameters."""
-        return BaselinePolicy(self.actor, deterministic)
 
     def update(self, windows: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make one gradient step.
@@ -133,10 +119,10 @@ class SACLearner:
             self.optimizer.zero_grad(set_to_none=True)
             total.backward()
             norms = {
-                f"gradient_norm/{name}": nn.utils.get_total_norm([p.grad for p in parameters])
-                for name, parameters in self._networks.items()
+                f"gradient_norm/{name}": nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+                for name, parameters in self.networks.items()
             }
-            metrics = {name: value.detach() for name, value in ({**outputs} | norms | {"loss": total}).items()}
+            metrics = detached({**outputs, **norms, "loss": total})
             self._guard.check(metrics, batch)
             self.optimizer.step()
             self._targets.step()
@@ -165,30 +151,8 @@ class SACLearner:
             windows.batch_size[:1],
         )
 
-    def check_finite(self) -> None:
-        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
-        self._guard.settle()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
-        return {
-            "size": self._size,
-            "loss": self._loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "updates": self.updates,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned.
-
-        Raises:
-            ValueError: If it is that of networks of another size; nothing is changed then.
-        """
-        check_size(state_dict["size"], self._size)
-        self._loss.load_state_dict(state_dict["loss"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
-        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate  # a setting of this learner, not state
-        self.updates = state_dict["updates"]
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"loss": self._loss}
 
 
 def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
