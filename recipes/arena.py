@@ -5,7 +5,7 @@ from typing import Any, Protocol, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from schema import DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
+from schema import RECIPES, DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.baselines import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.checkpoint import load_components
@@ -157,10 +157,9 @@ def trained_config(run_dir: Path) -> RunConfig:
     """
     saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
     algorithm = saved.get("algorithm", DreamerConfig.algorithm)
-    schemas = {schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)}
-    if algorithm not in schemas:
-        raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(schemas)}.")
-    return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schemas[algorithm]), saved)))
+    if algorithm not in RECIPES:
+        raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
+    return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved)))
 
 
 def restore_learner(config: RunConfig, checkpoint: Path, device: torch.device) -> tuple[Learner, dict[str, int]]:

@@ -1,7 +1,7 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, TypeVar, cast
 
@@ -56,8 +56,14 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     return device
 
 
-def resolve_network(config: DictConfig) -> None:
-    """Choose the size of a baseline's networks by what they see."""
+def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
+    """Fill in what a baseline leaves open, by what it sees (``pixels`` or ``state``), and say what was chosen.
+
+    Args:
+        config: of the recipe.
+        num_envs: worlds flown side by side, of either.
+    """
+    resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
     if config.network.size == "auto":
         sees = "images" if config.env.from_pixels else "numbers"
         config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
@@ -66,6 +72,7 @@ def resolve_network(config: DictConfig) -> None:
     for name in ("layers", "units"):
         if OmegaConf.is_missing(config.network, name):
             config.network[name] = numbers[name]
+    return config
 
 
 def worlds_device(config: DictConfig) -> str:

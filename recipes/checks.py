@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from arena import is_race
 from omegaconf import DictConfig, OmegaConf
-from schema import Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
+from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.modules import get_size
@@ -247,9 +247,6 @@ def check_image_size(image_size: int, size: str) -> None:
         raise ValueError(f"env.{error}") from error
 
 
-ALGORITHMS = ("dreamer_v3", "ppo", "sac")
-
-
 def check_variant(config: ExperimentConfig) -> None:
     """Refuse a run of an experiment that names nothing.
 
@@ -257,7 +254,7 @@ def check_variant(config: ExperimentConfig) -> None:
         ValueError: the message lists what there is.
     """
     for name, value, allowed in (
-        ("algorithm", config.algorithm, ALGORITHMS),
+        ("algorithm", config.algorithm, tuple(RECIPES)),
         ("variant", config.variant, tuple(config.variants)),
     ):
         if value not in allowed:

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import hydra
 from arena import make_env, make_learner
-from building import assemble, claim, make_collector, make_curriculum, resolve_common, resolve_network, seed_generators
+from building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
 from checks import check
 from omegaconf import DictConfig
 from schema import PPORunConfig, register
@@ -53,9 +53,7 @@ def main(config: DictConfig) -> None:
 
 def resolve(config: DictConfig) -> DictConfig:
     """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
-    resolve_common(config, NUM_ENVS["pixels" if config.env.from_pixels else "state"])
-    resolve_network(config)
-    return config
+    return resolve_baseline(config, NUM_ENVS)
 
 
 def build(config: PPORunConfig, overrides: list[str]) -> PPORun:

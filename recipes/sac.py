@@ -18,8 +18,7 @@ from building import (
     make_collector,
     make_curriculum,
     make_run_replay,
-    resolve_common,
-    resolve_network,
+    resolve_baseline,
     seed_generators,
 )
 from checks import check, check_replay
@@ -54,9 +53,7 @@ def main(config: DictConfig) -> None:
 
 def resolve(config: DictConfig) -> DictConfig:
     """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
-    resolve_common(config, NUM_ENVS["pixels" if config.env.from_pixels else "state"])
-    resolve_network(config)
-    return config
+    return resolve_baseline(config, NUM_ENVS)
 
 
 def build(config: SACRunConfig, overrides: list[str]) -> SACRun:

@@ -202,6 +202,12 @@ class SACRunConfig(RunConfig):
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
 
+RECIPES: dict[str, type[RunConfig]] = {
+    schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)
+}
+"""The training recipes by algorithm."""
+
+
 @dataclass
 class ExperimentConfig(RunConfig):
     """`recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.

@@ -11,7 +11,7 @@ import hydra
 import torch
 from arena import Environment, Report
 from checks import ReplayRatio, check_overrides
-from command_line import merge_overrides, plain_errors, start_logging
+from command_line import merge_overrides, override_key, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -185,20 +185,25 @@ def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """The configuration of the run to continue, with the overrides given now on top."""
+    """The configuration of the run to continue, with the overrides given now on top.
+
+    Raises:
+        ValueError: it is another algorithm's run, or an override would make another run of it.
+    """
     run_dir = latest_checkpoint(resume).parent.parent
     saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
     for override in overrides:
-        name, _, value = override.partition("=")
+        name, value = override_key(override), override.partition("=")[2]
         if name in TRAINED_ON and value != str(saved.get(name)):
             raise ValueError(
                 f"{run_dir} was trained with {name}={saved.get(name)}, and goes on with it: {override} would be "
                 "another run. Leave it out, or begin anew."
             )
-    merged = merge_overrides([*OmegaConf.load(run_dir / "overrides.yaml"), f"run_dir={run_dir}"], overrides)
+    begun_with = merge_overrides(list(OmegaConf.load(run_dir / "overrides.yaml")), [f"run_dir={run_dir}"])
+    merged = merge_overrides(begun_with, overrides)
     return hydra.compose(algorithm, merged), merged
 
 

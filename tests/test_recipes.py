@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -94,6 +95,13 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
     done = recipe("dreamer_v3", f"resume='{run_dir}'", "track=kidney", cwd=run_dir.parent)
     assert done.returncode == 2 and "trained with track=circle" in done.stderr and "Traceback" not in done.stderr
     assert (run_dir / "config.yaml").read_text() == before
+    training = recipe_module("training")
+    with pytest.raises(ValueError, match="trained with decoys=None"):
+        training.resumed_config("dreamer_v3", str(run_dir), ["+decoys=paper"])
+    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+        _, overrides = training.resumed_config("dreamer_v3", str(run_dir), ["track=circle", "seed=1"])
+    names = [override.partition("=")[0] for override in overrides]
+    assert len(names) == len(set(names)), "an override stands twice"
 
 
 def test_evaluations_stand_where_they_were_measured(run_dir: Path) -> None:

@@ -24,7 +24,7 @@ from dreamer_racing.baselines.networks import (
 from dreamer_racing.modules import Interface
 from dreamer_racing.timing import Timer, untimed
 
-NO_WEIGHT = 1e-30
+NO_WEIGHT = 1e-30  # beside a transition's 1: lost in float32, but a sum of it is not 0
 
 
 @dataclass
