@@ -235,6 +235,8 @@ def _track_title(track: str) -> str:
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
     """Draw a bar a variant, its standard deviation over seeds, and a dot a seed; the reference is a dashed line.
 
+    Where values may be negative there is a diamond instead of the bar.
+
     Args:
         comparison: what to draw.
         path: the file to write; missing folders are made.
@@ -269,7 +271,10 @@ def _draw_bar(axes: Axes, place: int, result: VariantResult, name: str) -> None:
         return
     error = values.std(ddof=1) if len(values) > 1 else None
     color = INK if result.key.is_reference else OTHER_COLOR
-    axes.barh(place, values.mean(), xerr=error, color=color, ecolor=MUTED, height=0.65)
+    if QUANTITIES[name].counted or QUANTITIES[name].comparable:
+        axes.barh(place, values.mean(), xerr=error, color=color, ecolor=MUTED, height=0.65)
+    else:  # a bar from zero would make the worst of what is negative look the largest
+        axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, ecolor=MUTED)
     axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4)
     if len(values) != result.seeds:
         right = max(values.max(), values.mean() + (error or 0.0))

@@ -110,9 +110,18 @@ def result(variant: str, gates: list[float] | None, seeds: int, algorithm: str =
     return VariantResult(CurveKey("circle", algorithm, variant), seeds, values, (800, 1000), None)
 
 
+RETURN = "evaluation_return"
 COMPARISON = Comparison(
     [result("default", [1.0, 2.0, 6.0], 3), result("no_replay", [4.0], 2), result("lost", [], 1)], ["late left out"]
 )
+
+
+def test_what_may_be_negative_has_no_bar_from_zero(tmp_path, figures):
+    returns = VariantResult(CurveKey("circle", "ppo", "default"), 2, {RETURN: np.array([-4.0, -2.0])}, (0, 1), None)
+    plot_comparison(Comparison([returns], []), tmp_path / "comparison.png")
+    (axes,) = figures[0].axes
+    assert not axes.patches
+    assert [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "D"] == [[[-3.0, 0.0]]]
 
 
 def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, figures):
