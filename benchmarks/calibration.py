@@ -29,6 +29,7 @@ from schema import DreamerConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.diagnostics import correlation
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.losses import imagine
 from dreamer_racing.modules.decoder import VectorDecoder
@@ -55,13 +56,11 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
     """Return one record.
 
     Raises:
-        ValueError: the checkpoint is of another algorithm, or the flight would reach the time limit, which is no crash.
+        ValueError: the checkpoint is of another algorithm.
     """
     config = trained_config(checkpoint.parent.parent)
     if not isinstance(config, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which imagines nothing.")
-    if steps >= config.env.episode_steps:
-        raise ValueError(f"--steps {steps}: at most {config.env.episode_steps - 1}, so that no time runs out.")
     torch.manual_seed(0)
     restored, counters = restore_learner(config, checkpoint, torch.device("cpu"))
     learner = cast(DreamerLearner, restored)
@@ -73,8 +72,15 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
 
 
 def fly(learner: DreamerLearner, config: DreamerConfig, num_envs: int, steps: int) -> TensorDict:
-    """Fly the stochastic policy; return latents, actions, rewards, ends and, if there, race vectors ``[K, N]``."""
+    """Fly the stochastic policy; return latents, actions, rewards, ends and, if there, race vectors ``[K, N]``.
+
+    Raises:
+        ValueError: the flight would reach the time limit, which is no crash.
+    """
     env, policy, size = make_env(config, num_envs), learner.policy(), learner.size
+    longest = cast(DroneRacingEnv, env).worlds.race.episode_steps - 1
+    if steps > longest:
+        raise ValueError(f"--steps {steps}: at most {longest}, so that no time runs out.")
     observation = env.reset()
     memory = {
         "belief": torch.zeros(num_envs, size.belief),

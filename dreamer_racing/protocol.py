@@ -14,7 +14,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
 
 from dreamer_racing.envs.looks import LooksRandomisation
-from dreamer_racing.envs.race import EVALUATION_STEPS
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
 from dreamer_racing.evaluation import Evaluation, evaluate
@@ -198,7 +197,7 @@ def fly(
         return policy(tensordict.to(weight.device)).to(base.device)
 
     try:
-        return evaluate(env, act, episodes, **{"max_recorded_steps": EVALUATION_STEPS, **recording})
+        return evaluate(env, act, episodes, **{"max_recorded_steps": base.worlds.race.episode_steps, **recording})
     finally:
         env.close(raise_if_closed=False)
 

@@ -1,5 +1,6 @@
 """Where a run acts: the environment that its configuration names, and what comes with it."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -65,6 +66,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "preset": env.preset,
         "renderer": env.renderer,
         "camera": camera_of(config),
+        "control_rate": env.control_rate,
     }
 
 
@@ -81,6 +83,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             from_pixels=env.from_pixels,
             privileged=reads_privileged,
             start_beyond_gate=env.start_beyond_gate,
+            start_on_line=env.start_on_line,
             device=env.device,
             looks=env.looks,
             seed=config.seed,
@@ -167,7 +170,8 @@ def restore_learner(config: RunConfig, checkpoint: Path, device: torch.device) -
     config.env.device = "cpu"  # wherever it was trained
     if isinstance(config, DreamerConfig):
         config.model.compile = config.model.cuda_graph = False
-    env = make_env(config, num_envs=1)
+    no_line = replace(config, env=replace(config.env, start_on_line=0.0))  # whose planning takes seconds
+    env = make_env(no_line, num_envs=1)
     interface = Interface.of(env)
     env.close()
     learner = make_learner(config, interface, device)

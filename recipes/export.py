@@ -83,6 +83,7 @@ def prepare(
         1,
         from_pixels=trained.env.from_pixels,
         preset=trained.env.preset,
+        control_rate=trained.env.control_rate,
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         camera=camera_of(trained),

@@ -17,8 +17,10 @@ class EnvConfig:
     suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful
     num_envs: int = MISSING  # worlds flown side by side; missing: the recipe's own number
-    episode_steps: int = 1000  # control steps of 20 ms
+    control_rate: float = 50.0  # actions a second, Hz
+    episode_steps: int | None = None  # control steps of a training episode; null: those of 20 s
     start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
+    start_on_line: float = 0.0  # share of training episodes that begin in flight on a planned racing line
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)

@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
-from dreamer_racing.envs.race import EVALUATION_STEPS, RaceStep
+from dreamer_racing.envs.race import RaceStep
 from dreamer_racing.envs.racing_line import Dynamics, LineLimits, Reference, plan_racing_line
 from dreamer_racing.envs.rotation import rotate, rotate_inverse, turn
 from dreamer_racing.envs.tracks import Track, load_track
@@ -313,7 +313,7 @@ def fly_laps(
     randomise: bool = True,
     random_starts: bool = False,
     seed: int = 0,
-    episode_steps: int = EVALUATION_STEPS,
+    episode_steps: int = 1500,
 ) -> FlownLaps:
     """Fly N episodes to their ends.
 

@@ -111,6 +111,25 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     return PRESETS[preset]
 
 
+def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
+    """The same drone with so many actions a second.
+
+    Args:
+        parameters: of the drone.
+        rate: Hz; a control step must be a whole number of physics steps.
+
+    Raises:
+        ValueError: it is not.
+    """
+    steps = round(1.0 / (rate * parameters.physics_dt)) if rate > 0 else 0
+    if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:
+        raise ValueError(
+            f"control_rate={rate} Hz: a control step must be a whole number of physics steps of "
+            f"{parameters.physics_dt * 1e3:g} ms, for example 50 or 25 Hz."
+        )
+    return replace(parameters, control_dt=steps * parameters.physics_dt)
+
+
 def without_randomisation(parameters: QuadrotorParameters) -> QuadrotorParameters:
     """The same drone with nominal parameters in every episode (drag and delay stay)."""
     return replace(parameters, randomisation=None)

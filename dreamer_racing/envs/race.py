@@ -1,4 +1,4 @@
-"""Episodes of N drones on one track: target gates, laps, time, rewards, and where an episode starts.
+"""Episodes of N drones on one track: target gates, laps, time and rewards.
 
 Shape legend: N drones, P physics steps per control step, G race gates. SI units, world z up, quaternions wxyz.
 """
@@ -6,22 +6,19 @@ Shape legend: N drones, P physics steps per control step, G race gates. SI units
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 
 import torch
 
 from dreamer_racing.envs.gates import CrashCause, GateSweeper
 from dreamer_racing.envs.rewards import RewardWeights, race_reward
-from dreamer_racing.envs.rotation import from_roll_pitch_yaw, rotate
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.tracks.validation import START_CLEARANCE, flyable_box
 
-EPISODE_STEPS = 1000
-"""Control steps after which a training episode is truncated: 20 s [choice]."""
+EPISODE_TIME = 20.0
+"""Time after which a training episode is truncated, s [choice]."""
 
-EVALUATION_STEPS = 1500
-"""The same in evaluation: 30 s, because three laps of split_s take a good pilot 22 s [choice]."""
+EVALUATION_TIME = 30.0
+"""The same in evaluation, s: three laps of split_s take a good pilot 22 s [choice]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +82,7 @@ class Race:
         track: Track,
         num_envs: int,
         weights: RewardWeights | None = None,
-        episode_steps: int = EPISODE_STEPS,
+        episode_steps: int = 1000,
         laps: int | None = None,
         control_dt: float = 0.02,
         device: torch.device | str = "cpu",
@@ -197,169 +194,3 @@ class Race:
         lap_time = torch.where(lap_complete, lap_steps * self.control_dt, 0.0).to(self._dtype)
         self.lap_start_step.copy_(torch.where(lap_complete, self.step_count, self.lap_start_step))
         return lap_complete, lap_time
-
-
-@dataclasses.dataclass(frozen=True)
-class StartPose:
-    """Where episodes begin."""
-
-    position: torch.Tensor
-    """(N, 3) m."""
-    attitude: torch.Tensor
-    """(N, 4) unit quaternion wxyz, body → world."""
-    linear_velocity: torch.Tensor
-    """(N, 3) in the world, m/s."""
-    target_gate: torch.Tensor
-    """(N,) int64: the first gate to pass."""
-
-
-class StartSampler:
-    """Draws the poses in which episodes begin [choice].
-
-    Evaluation starts at the track's start pose, at rest; ``start_noise`` adds that many times the noise of training. In
-    training half of the drones start there too and half
-    1–3 m before a random race gate, facing it and flying towards its centre at 1.5–2.5 m/s; all of them with uniform
-    noise of ±0.5/0.5/0.3 m (forward/left/up of the pose), ±5° roll and pitch, ±10° yaw. Positions are then moved into
-    the free box, 0.3 m from its sides. ``load_track`` accepts only tracks on which neither the noise nor this move can
-    carry a drone across the plane of its first gate.
-
-    A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random one, facing and flying along its
-    direction at 1.5–5 m/s, to the next gate. They practise the turn from one gate to the next before the policy flies
-    through the first well enough to get there.
-
-    Args:
-        track: the track.
-        generator: source of randomness, on the sampler's device; None for torch's own.
-        device: where the poses are wanted.
-        dtype: floating-point type of the poses.
-        beyond_gate: share of training episodes that begin beyond a gate; the others are as above.
-        start_noise: of evaluation starts, as a multiple of the noise of training.
-
-    Raises:
-        ValueError: ``beyond_gate`` is not a share, or ``start_noise`` is negative or could carry a drone across the
-            plane of its first gate.
-
-    Example:
-        >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
-        >>> pose.position[0]
-        tensor([ 4.0000, -2.5000,  1.3500])
-    """
-
-    POSITION_NOISE = (0.5, 0.5, 0.3)  # m
-    ATTITUDE_NOISE_DEGREES = (5.0, 5.0, 10.0)  # roll, pitch, yaw
-    GATE_DISTANCE = (1.0, 3.0)  # m before a random gate
-    SPEED = (1.5, 2.5)  # m/s towards a random gate
-    BEYOND_DISTANCE = (0.6, 2.0)  # m behind a random gate: more than the noise
-    BEYOND_SPEED = (1.5, 5.0)  # m/s along its direction
-
-    def __init__(
-        self,
-        track: Track,
-        generator: torch.Generator | None = None,
-        device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
-        beyond_gate: float = 0.0,
-        start_noise: float = 0.0,
-    ):
-        if not 0.0 <= beyond_gate <= 1.0:
-            raise ValueError(f"beyond_gate={beyond_gate}: a share of episodes lies between 0 and 1.")
-        _check_start_noise(start_noise, track)
-        self._beyond_gate = beyond_gate
-        self._start_noise = start_noise
-        self._generator = generator
-        self._device, self._dtype = device, dtype
-        self._gate_positions = track.gate_positions(device, dtype)
-        self._gate_normals = track.gate_normals(device, dtype)
-        self._gate_yaws = track.gate_yaws(device, dtype)
-        self._start_position = torch.tensor(track.start_position, device=device, dtype=dtype)
-        self._start_yaw = torch.tensor(math.radians(track.start_yaw_degrees), device=device, dtype=dtype)
-        low, high = flyable_box(track, START_CLEARANCE)
-        self._low = torch.tensor(low, device=device, dtype=dtype)
-        self._high = torch.tensor(high, device=device, dtype=dtype)
-        self._position_noise = torch.tensor(self.POSITION_NOISE, device=device, dtype=dtype)
-        self._attitude_noise = torch.tensor(self.ATTITUDE_NOISE_DEGREES, device=device, dtype=dtype).deg2rad()
-
-    def sample(self, num: int, evaluation: bool = False) -> StartPose:
-        """Draw start poses.
-
-        Args:
-            num: number of poses N.
-            evaluation: the track's start pose; without noise it draws nothing from the generator.
-        """
-        return self._start(num) if evaluation else self._training_start(num)
-
-    def _start(self, num: int) -> StartPose:
-        """Return the track's start pose, at rest, with the noise of evaluation."""
-        origin, yaw = self._start_position.expand(num, 3), self._start_yaw.expand(num)
-        noise = torch.zeros(num, 6, device=self._device, dtype=self._dtype)
-        if self._start_noise:
-            noise = noise.uniform_(-self._start_noise, self._start_noise, generator=self._generator)
-        position, attitude = self._disturb(origin, yaw, noise)
-        return StartPose(
-            position=position,
-            attitude=attitude,
-            linear_velocity=torch.zeros(num, 3, device=self._device, dtype=self._dtype),
-            target_gate=torch.zeros(num, dtype=torch.int64, device=self._device),
-        )
-
-    def _training_start(self, num: int) -> StartPose:
-        """Draw noisy poses at the start, before random gates and beyond them."""
-        draw = torch.rand(num, 9, generator=self._generator, device=self._device, dtype=self._dtype)
-        gate = torch.randint(len(self._gate_yaws), (num,), generator=self._generator, device=self._device)
-        beyond = draw[:, 0] < self._beyond_gate  # (N,)
-        at_gate = draw[:, 0] < 0.5 * (1.0 + self._beyond_gate)
-        before = _spread(draw[:, 1], self.GATE_DISTANCE)
-        distance = torch.where(beyond, -_spread(draw[:, 1], self.BEYOND_DISTANCE), before)
-        speed = torch.where(beyond, _spread(draw[:, 2], self.BEYOND_SPEED), _spread(draw[:, 2], self.SPEED))
-        noise = 2 * draw[:, 3:] - 1  # (N, 6)
-
-        before_gate = self._gate_positions[gate] - distance.unsqueeze(-1) * self._gate_normals[gate]
-        origin = torch.where(at_gate.unsqueeze(-1), before_gate, self._start_position)  # (N, 3)
-        yaw = torch.where(at_gate, self._gate_yaws[gate], self._start_yaw)  # (N,)
-        position, attitude = self._disturb(origin, yaw, noise)
-        towards = torch.nn.functional.normalize(self._gate_positions[gate] - position, dim=-1)
-        direction = torch.where(beyond.unsqueeze(-1), self._gate_normals[gate], towards)
-        target = (gate + beyond) % len(self._gate_yaws)
-        return StartPose(
-            position=position,
-            attitude=attitude,
-            linear_velocity=torch.where(at_gate, speed, 0.0).unsqueeze(-1) * direction,
-            target_gate=torch.where(at_gate, target, 0),
-        )
-
-    def _disturb(
-        self, origin: torch.Tensor, yaw: torch.Tensor, noise: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Move level poses by noise (N, 6) in units of training's, and into the free box.
-
-        Args:
-            origin: (N, 3) m.
-            yaw: (N,) rad.
-            noise: forward, left, up, roll, pitch, yaw.
-
-        Returns:
-            Positions (N, 3) and attitudes (N, 4).
-        """
-        level = torch.zeros_like(yaw)
-        position = origin + rotate(from_roll_pitch_yaw(level, level, yaw), noise[:, :3] * self._position_noise)
-        position = torch.minimum(torch.maximum(position, self._low), self._high)
-        roll, pitch, yaw_noise = (noise[:, 3:] * self._attitude_noise).unbind(-1)
-        return position, from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise)
-
-
-def _check_start_noise(start_noise: float, track: Track) -> None:
-    """Refuse noise that could carry a drone from the start across the plane of the first gate."""
-    gate, start = track.gates[0], track.start_position
-    ahead = sum((a - b) * c for a, b, c in zip(gate.position, start, gate.forward, strict=True))
-    most = ahead / math.hypot(*StartSampler.POSITION_NOISE[:2])
-    if not 0.0 <= start_noise < most:
-        raise ValueError(
-            f"start_noise={start_noise}: on track {track.name!r}, whose start is {ahead:.2f} m before the plane of the "
-            f"first gate, at least 0 and below {most:.2f} times the noise of training."
-        )
-
-
-def _spread(draw: torch.Tensor, interval: tuple[float, float]) -> torch.Tensor:
-    """Spread draws from [0, 1) over an interval."""
-    low, high = interval
-    return low + (high - low) * draw

@@ -30,11 +30,12 @@ from dm_env import specs
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
-from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
+from dreamer_racing.envs.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.rendering import GL_LIBRARIES, RendererUnavailableError
+from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
 
@@ -108,7 +109,7 @@ def load(
     """
     track, parameters = load_track(track), load_preset(preset)
     if time_limit is None:
-        time_limit = (EVALUATION_STEPS if evaluation else EPISODE_STEPS) * parameters.control_dt
+        time_limit = EVALUATION_TIME if evaluation else EPISODE_TIME
     episode_steps = round(time_limit / parameters.control_dt)
     if episode_steps < 1:
         raise ValueError(
@@ -285,7 +286,7 @@ class DroneRace(base.Task):
         generator: torch.Generator | None = None,
         *,
         random: int | np.random.RandomState | None = None,
-        episode_steps: int = EPISODE_STEPS,
+        episode_steps: int = 1000,
         evaluation: bool = False,
         camera: Camera | None = None,
         weights: RewardWeights | None = None,

@@ -12,15 +12,19 @@ from torch import Tensor
 
 from dreamer_racing.envs.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.privileged import RaceVector
-from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
-from dreamer_racing.envs.race import EPISODE_STEPS, EVALUATION_STEPS, Race, RaceStep, StartSampler
+from dreamer_racing.envs.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
+from dreamer_racing.envs.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
+from dreamer_racing.envs.racing_line import LineLimits, plan_racing_line
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator import Simulator, check_device, make_simulator
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
+from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import Track, load_track
 
 ACTION_SIZE = 4
+START_LINE = LineLimits(speed=0.7)
+"""Of the line on which training episodes begin: tame enough to fly on from with noise [choice]."""
 
 
 class RaceWorlds:
@@ -31,7 +35,7 @@ class RaceWorlds:
         num_envs: N.
         preset: physics preset (`easy`, `faithful`) or parameters.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
-        episode_steps: control steps until an episode is truncated; if None 1000 (20 s), in evaluation 1500 (30 s).
+        episode_steps: control steps until an episode is truncated; if None those of 20 s, in evaluation of 30 s.
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
         renderer: `auto`, or on CPU `egl`, `osmesa`, `warp`, or `warp_cuda`: drawn on a CUDA device.
@@ -43,7 +47,9 @@ class RaceWorlds:
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
+        start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
+        control_rate: actions a second, Hz; if None the preset's, 50.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -74,7 +80,9 @@ class RaceWorlds:
         backend: str = "auto",
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
+        start_on_line: float = 0.0,
         start_noise: float = 0.0,
+        control_rate: float | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
@@ -84,6 +92,8 @@ class RaceWorlds:
         self.evaluation = evaluation
         self.camera = camera or Camera()
         self.parameters = load_preset(preset)
+        if control_rate is not None:
+            self.parameters = at_control_rate(self.parameters, control_rate)
         self._generator = torch.Generator(device)
         self.seed(seed)
         self.simulator: Simulator = make_simulator(
@@ -99,18 +109,28 @@ class RaceWorlds:
             load_looks(looks),
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
+        episode_time = EVALUATION_TIME if evaluation else EPISODE_TIME
         self.race = Race(
             self.track,
             num_envs,
             weights=weights or RewardWeights(),
-            episode_steps=episode_steps or (EVALUATION_STEPS if evaluation else EPISODE_STEPS),
+            episode_steps=episode_steps or round(episode_time / self.parameters.control_dt),
             laps=self.track.laps if evaluation else None,
             control_dt=self.parameters.control_dt,
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
+        on_line = 0.0 if evaluation else start_on_line
+        nominal = without_randomisation(self.parameters)
         self._starts = StartSampler(
-            self.track, self._generator, self.device, self.dtype, start_beyond_gate, start_noise
+            self.track,
+            self._generator,
+            self.device,
+            self.dtype,
+            start_beyond_gate,
+            start_noise,
+            on_line,
+            plan_racing_line(self.track, nominal, START_LINE) if on_line else None,
         )
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None

@@ -9,11 +9,11 @@ from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.quadrotor import PRESETS
-from dreamer_racing.envs.race import StartSampler
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator import MujocoSimulator, WarpSimulator, mujoco_warp
 from dreamer_racing.envs.simulator.mujoco_warp import memory_of_worlds
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 

@@ -11,10 +11,14 @@ from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.race import Race, RaceStep, StartSampler
+from dreamer_racing.envs.pilot import ScriptedPilot
+from dreamer_racing.envs.quadrotor import GRAVITY, load_preset
+from dreamer_racing.envs.race import Race, RaceStep
+from dreamer_racing.envs.racing_line import plan_racing_line
 from dreamer_racing.envs.rotation import rotate
+from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
-from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.envs.worlds import START_LINE, RaceWorlds
 
 CIRCLE = load_track("circle")
 CENTRES = CIRCLE.gate_positions(dtype=torch.float64)
@@ -428,3 +432,86 @@ def test_the_share_of_starts_beyond_a_gate_leaves_the_rest_as_it_was():
     assert fast.float().mean() == pytest.approx(0.4 * 2.5 / 3.5, abs=0.02)
     with pytest.raises(ValueError, match="beyond_gate=2"):
         StartSampler(load_track("circle"), beyond_gate=2)
+
+
+N_ON_LINE = 400
+
+
+def on_line(name: str, num: int = N_ON_LINE) -> tuple[RaceWorlds, torch.Tensor]:
+    """Begin episodes on the line of a track; return the worlds and how far each is before its gate's plane, m."""
+    worlds = RaceWorlds(name, num, from_pixels=False, start_on_line=1.0, seed=0)
+    worlds.reset()
+    gate = worlds.race.target_gate
+    ahead = worlds.track.gate_positions(dtype=torch.float64)[gate] - worlds.simulator.state.position
+    return worlds, (ahead * worlds.track.gate_normals(dtype=torch.float64)[gate]).sum(-1)
+
+
+@pytest.mark.parametrize("name", ["circle", "kidney"])
+def test_starts_on_the_line_can_be_flown_on_from_anywhere_of_a_lap(name):
+    worlds, ahead = on_line(name)
+    state, gates = worlds.simulator.state, worlds.track.num_gates
+    assert worlds.race.target_gate.unique().tolist() == list(range(gates))
+    near = (state.position - worlds.track.gate_positions(dtype=torch.float64)[worlds.race.target_gate]).norm(dim=-1) < 1
+    assert (ahead[near] > 0).all(), "a drone begins beyond the plane of the gate it has to pass"
+    pilot = ScriptedPilot(worlds.track, dtype=worlds.dtype)
+    crashed, passed = torch.zeros(N_ON_LINE, dtype=torch.bool), torch.zeros(N_ON_LINE, dtype=torch.int64)
+    for _ in range(100):
+        state = worlds.simulator.state
+        action = pilot.act(
+            state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate
+        )
+        outcome = worlds.step(action)
+        passed = torch.where(crashed, passed, outcome.gates_passed)
+        crashed |= outcome.terminated
+    worlds.close()
+    assert crashed.float().mean() < 0.1
+    assert (passed > 0).float().mean() > 0.9
+
+
+def test_starts_on_the_line_look_where_it_leads_and_push_along_its_acceleration():
+    line = plan_racing_line(CIRCLE, load_preset("easy"), START_LINE).to("cpu", torch.float64)
+    starts = StartSampler(CIRCLE, torch.Generator().manual_seed(0), dtype=torch.float64, on_line=1.0, line=line)
+    starts.LINE_NOISE, starts._attitude_noise = 0.0, torch.zeros(3, dtype=torch.float64)
+    pose = starts.sample(500)
+    nearest = torch.cdist(pose.position, line.samples[:, :3]).argmin(-1)
+    reference = line.samples[nearest]
+    pace = pose.linear_velocity.norm(dim=-1) / reference[:, 3:6].norm(dim=-1)
+    assert 0.19 < pace.min() < 0.25 and 0.95 < pace.max() < 1.02
+    force = pace.square().unsqueeze(-1) * reference[:, 6:9] + torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
+    axis = rotate(pose.attitude, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(500, 3))
+    assert (axis * force).sum(-1).div(force.norm(dim=-1)).min() > 0.999
+    left = rotate(pose.attitude, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand(500, 3))
+    nose = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(500, 3))
+    later = line.at(nearest.double() * line.dt + starts.LOOK_AHEAD).position - pose.position
+    assert (left * later).sum(-1).abs().max() < 0.1 and (nose * later).sum(-1).min() > 0
+
+
+def test_the_share_of_starts_on_the_line_leaves_the_rest_as_it_was():
+    line = plan_racing_line(CIRCLE, load_preset("easy"), START_LINE)
+    mixed = StartSampler(CIRCLE, torch.Generator().manual_seed(0), on_line=0.5, line=line).sample(2000)
+    plain = StartSampler(CIRCLE, torch.Generator().manual_seed(0)).sample(2000)
+    same = (mixed.position == plain.position).all(-1)
+    assert same.float().mean() == pytest.approx(0.5, abs=0.04)
+    assert torch.equal(mixed.target_gate[same], plain.target_gate[same])
+    with pytest.raises(ValueError, match=r"on_line=-0.1"):
+        StartSampler(CIRCLE, on_line=-0.1, line=line)
+    with pytest.raises(ValueError, match="give a line"):
+        StartSampler(CIRCLE, on_line=0.5)
+
+
+def test_evaluation_never_begins_on_the_line():
+    worlds = RaceWorlds("circle", 3, evaluation=True, from_pixels=False, start_on_line=1.0)
+    worlds.reset()
+    assert worlds.simulator.state.linear_velocity.eq(0).all()
+
+
+def test_half_the_control_rate_flies_twice_as_far_a_step_and_ends_after_the_same_time():
+    fast, slow = (RaceWorlds("circle", 1, from_pixels=False, seed=0, control_rate=rate) for rate in (None, 25.0))
+    for worlds, steps in ((fast, 4), (slow, 2)):
+        worlds.reset()
+        for _ in range(steps):
+            worlds.step(torch.full((1, 4), 0.1))
+    torch.testing.assert_close(fast.simulator.state.position, slow.simulator.state.position)
+    assert (fast.race.episode_steps, slow.race.episode_steps) == (1000, 500)
+    with pytest.raises(ValueError, match=r"control_rate=60.* whole number of physics steps of 2 ms"):
+        RaceWorlds("circle", 1, from_pixels=False, control_rate=60)
