@@ -97,6 +97,11 @@ class GymWorlds:
         )
         self._onboard: Renderer | None = None
 
+    @property
+    def frames_per_second(self) -> int:
+        """Of a video in real time: control steps a second."""
+        return round(1.0 / self.worlds.parameters.control_dt)
+
     def action_space(self) -> Box:
         """The action space of one environment."""
         return Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
@@ -218,6 +223,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     ) -> None:
         worlds["preset"] = preset
         self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.render_mode = render_mode
         self.action_space = self.race.action_space()
         self.observation_space = self.race.observation_space()
@@ -233,7 +239,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         return row_of(self.race.observe(), 0), row_of(self.race.info(None), 0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Fly one control step of 20 ms.
+        """Fly one control step.
 
         Args:
             action: (4,); values beyond [-1, 1] are clipped, and one that is not finite is a crash.
@@ -315,6 +321,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         if max_episode_steps is not None:
             worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps", max_episode_steps))
         self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_action_space = self.race.action_space()
@@ -341,7 +348,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return self.race.observe(), self._masked(self.race.info(None))
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one control step of 20 ms, or begin an episode where the last one has ended.
+        """Fly one control step, or begin an episode where the last one has ended.
 
         Args:
             actions: (N, 4); values beyond [-1, 1] are clipped, and one that is not finite is a crash of its drone.

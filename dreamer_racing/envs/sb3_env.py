@@ -82,7 +82,7 @@ class DroneRaceVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Fly one control step of 20 ms; return observations, rewards (N,), ends (N,) and N `info`.
+        """Fly one control step; return observations, rewards (N,), ends (N,) and N `info`.
 
         Raises:
             ValueError: actions of the wrong shape.

@@ -267,3 +267,10 @@ def test_gymnasiums_own_vectorisation_works_too() -> None:
     _, _, _, _, info = envs.step(envs.action_space.sample())
     assert list(info["crash"]) == ["none", "none"]
     envs.close()
+
+
+def test_videos_play_at_the_control_rate():
+    single = gymnasium.make(IDS[0], observation="state", control_rate=25)
+    several = gymnasium.make_vec(IDS[0], num_envs=2, observation="state", control_rate=25)
+    assert single.unwrapped.metadata["render_fps"] == several.unwrapped.metadata["render_fps"] == 25
+    assert gymnasium.make(IDS[0], observation="state").unwrapped.metadata["render_fps"] == 50
