@@ -100,11 +100,17 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
 
 
 def make_report(
-    config: RunConfig, directory: Path, learner: Learner, episodes: int, video_steps: int, **options: Any
+    config: RunConfig,
+    directory: Path,
+    learner: Learner,
+    episodes: int,
+    video_steps: int,
+    start_noise: float = 0.0,
+    **options: Any,
 ) -> Report:
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
-        worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels}
+        worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels, "start_noise": start_noise}
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
     env = ControlSuiteEnv(config.task, min(8, episodes), from_pixels=config.env.from_pixels, seed=config.seed + 1)
     return ReturnReport(directory, learner, env, episodes, video_steps)

@@ -92,6 +92,7 @@ RANGES = {
     "evaluation.every": NOT_NEGATIVE,
     "evaluation.episodes": Range(1),
     "evaluation.video_steps": Range(1),
+    "evaluation.start_noise": NOT_NEGATIVE,
     "checkpoint.every": NOT_NEGATIVE,
     "checkpoint.keep": Range(1),
     "logger.every": NOT_NEGATIVE,

@@ -50,6 +50,8 @@ def main(config: DictConfig) -> None:
         results = evaluate_fully(settings, restored, directory)
         written = describe(results, restored.trained.env.preset)
     written["provenance"] = restored.provenance(settings, time.monotonic() - started)
+    if settings.start_noise:
+        written["provenance"]["start_noise"] = settings.start_noise
     if not report:
         write_markdown(directory, results, written["provenance"])
     (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
@@ -57,7 +59,7 @@ def main(config: DictConfig) -> None:
 
 
 def check(config: EvaluateConfig) -> None:
-    """Refuse what is no protocol, and episodes of which there are none.
+    """Refuse what is no protocol or would be ignored, and episodes of which there are none.
 
     Raises:
         ValueError: the message names the field and what is allowed.
@@ -66,12 +68,24 @@ def check(config: EvaluateConfig) -> None:
         raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
     if config.episodes < 1 or config.num_envs < 1:
         raise ValueError(f"episodes={config.episodes}, num_envs={config.num_envs}: both must be at least 1.")
+    if config.protocol == "full" and config.start_noise:
+        raise ValueError(
+            f"start_noise={config.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."
+        )
 
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
     """Make the races that the policy is to fly as it was trained to."""
     options = {"num_envs": config.num_envs, "seed": config.seed}
-    report = make_report(restored.trained, directory, restored.learner, config.episodes, config.video_steps, **options)
+    report = make_report(
+        restored.trained,
+        directory,
+        restored.learner,
+        config.episodes,
+        config.video_steps,
+        config.start_noise,
+        **options,
+    )
     return cast(EvaluationReport, report)
 
 

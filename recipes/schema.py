@@ -120,6 +120,7 @@ class EvaluationConfig:
     every: int = 25_000  # env_steps; 0 never
     episodes: int = 8
     stochastic: bool = False  # also fly the sampling policy
+    start_noise: float = 0.0  # of starts, as a multiple of the noise of training; 0: all begin at the start pose
     video_steps: int = 500  # control steps in the video
 
 
@@ -231,6 +232,7 @@ class EvaluateConfig:
 
     checkpoint: str = MISSING  # run directory or checkpoint
     protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    start_noise: float = 0.0  # with protocol=nominal: of starts, as a multiple of the noise of training
     episodes: int = 100  # of each condition
     num_envs: int = 20
     track: str | None = None  # null: the track it was trained on

@@ -115,9 +115,13 @@ def test_evaluations_stand_where_they_were_measured(run_dir: Path) -> None:
 
 
 def test_evaluate_reports_both_policies(run_dir: Path) -> None:
-    done = recipe("evaluate", f"checkpoint='{run_dir}'", "episodes=3", "num_envs=2", cwd=run_dir.parent)
+    options = ("episodes=3", "num_envs=2", "start_noise=1")
+    done = recipe("evaluate", f"checkpoint='{run_dir}'", *options, cwd=run_dir.parent)
     assert done.returncode == 0, done.stderr
     report = json.loads((run_dir / "evaluation" / "evaluation.json").read_text())
+    assert report["provenance"]["start_noise"] == 1.0
+    returns = {episode["reward_sum"] for episode in report["deterministic"]["episodes"]}
+    assert len(returns) == 3, "every episode begins elsewhere"
     for policy in ("deterministic", "stochastic"):
         assert policy in done.stdout
         assert len(report[policy]["episodes"]) == 3
@@ -190,6 +194,9 @@ def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
 def test_an_unknown_protocol_is_refused() -> None:
     config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=quick"))
     with pytest.raises(ValueError, match="protocol=quick: there are nominal, full"):
+        recipe_module("evaluate").check(config)
+    config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=full", "start_noise=1"))
+    with pytest.raises(ValueError, match="start_noise=1.0 is for protocol=nominal"):
         recipe_module("evaluate").check(config)
 
 
