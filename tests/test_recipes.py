@@ -438,3 +438,21 @@ def test_a_loss_that_is_not_finite_ends_the_run(every: int, tmp_path: Path) -> N
         weights = torch.load(path, weights_only=True)["agent"]
         assert all(value.isfinite().all() for value in weights.values()), "what was saved is not the last good state"
     assert int(kept.name.rpartition("-")[2]) >= 100
+
+
+def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
+    tuned = compose("dreamer_v3", "+tuned=cpu")
+    assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
+    assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
+    changed = compose("dreamer_v3", "+tuned=cpu", "loss=informed", "env.control_rate=50")
+    assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
+
+
+def test_another_control_rate_reaches_training_and_evaluation(tmp_path: Path) -> None:
+    config = OmegaConf.to_object(compose("dreamer_v3", *TINY, "env.control_rate=25", "env.episode_steps=null"))
+    arena = recipe_module("arena")
+    config.env.device = "cpu"
+    env = arena.make_env(config)
+    assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
+    env.close()
+    assert arena.worlds_of(config)["control_rate"] == 25
