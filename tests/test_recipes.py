@@ -51,10 +51,10 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
 def test_every_group_composes(path: Path) -> None:
-    append = "+" if path.parent.name == "decoys" else ""  # not among the defaults
-    recipe_with_group = {"network": "ppo"}.get(path.parent.name, "dreamer_v3")
-    config = compose(recipe_with_group, f"{append}{path.parent.name}={path.stem}")
-    assert OmegaConf.select(config, path.parent.name) is not None
+    group = path.parent.name
+    append = "+" if group in ("decoys", "tuned") else ""  # not among the defaults
+    config = compose({"network": "ppo"}.get(group, "dreamer_v3"), f"{append}{group}={path.stem}")
+    assert group == "tuned" or OmegaConf.select(config, group) is not None
 
 
 def test_every_model_config_names_a_known_size() -> None:
