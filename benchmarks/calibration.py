@@ -7,10 +7,10 @@ eighth step, over the learner's horizon H: `reward` is the sum until a crash, in
 from the same latents; `crash` the share that crashed; `value_end` the critic's value of where that led, 0 after one.
 For losses that decode privileged state, `open_loop_error` is the squared error of the decoded race vector (symlogs,
 summed over its 21 entries) predicted H steps ahead from the real actions, beside that of the latents themselves
-(`filter_error`) and the vector's variance; `gate_error` is how far the target gate's decoded centre is from the true
-one, m (root mean square), and `gate_error_in_view` the same where it is less than 3 m away, ahead, and within 40° to
-the sides; `in_view` is how often that is. `value` is the critic's mean on the first half of the flights, `monte_carlo`
-the mean discounted sum of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of the
+(`filter_error`) and the vector's variance; `in_view` is how often the target gate is less than 3 m away, ahead, and
+within 40° to the sides; `wrong_gate` the share of that where its decoded centre is more than 2 m off, which is another
+gate's, and `gate_error` how far it is off in the rest, m (root mean square). `value` is the critic's mean on the first
+half of the flights, `monte_carlo` the mean discounted sum of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of the
 value is cut off.
 """
 
@@ -40,6 +40,7 @@ from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.world_model import join_features
 
+WRONG_GATE = 2.0  # m
 TO_GATE = slice(9, 12)  # of a race vector: from the drone to the centre of the target gate, see `RACE_VECTOR_ENTRIES`
 
 
@@ -135,7 +136,8 @@ def compare(learner: DreamerLearner, flight: TensorDict) -> dict[str, Any]:
         rows.append({name: numbers.mean() for name, numbers in row.items()})
     # Where no drone is left after H steps there is no error to take.
     means = {name: torch.stack([row[name] for row in rows]).nanmean().item() for name in rows[0]}
-    means |= {name: math.sqrt(means[name]) for name in ("gate_error", "gate_error_in_view") if name in means}
+    if "gate_error" in means:
+        means["gate_error"] = math.sqrt(means["gate_error"])
     paid, half = monte_carlo(flight, learner.config.discount), len(flight) // 2
     return means | {
         "value": value[:half].mean().item(),
@@ -157,13 +159,14 @@ def decoded_errors(
     then, real = decoder(join_features(belief, state)), symlog(flight["vector"][[k, k + horizon]])
     gate = DISTANCE * flight["vector"][k][:, TO_GATE]  # (N, 3) m, in the body frame
     gate_error = (DISTANCE * now[:, TO_GATE] - gate).square().sum(-1)  # (N,) m²
+    is_wrong = gate_error > WRONG_GATE**2
     forward, left, _ = gate.unbind(-1)
     in_view = (gate.norm(dim=-1) < 3.0) & (forward > 0.0) & (left.abs() < math.tan(math.radians(40.0)) * forward)
     return {
         "filter_error": (symlog(now) - real[0]).square().sum(-1),
-        "gate_error": gate_error,
-        "gate_error_in_view": gate_error[in_view],
         "in_view": in_view.float(),
+        "wrong_gate": is_wrong[in_view].float(),
+        "gate_error": gate_error[in_view & ~is_wrong],
         "open_loop_error": (symlog(then) - real[1])[alive].square().sum(-1),
         "variance": real[1][alive].var(0).sum(),
     }
