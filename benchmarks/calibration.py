@@ -10,8 +10,8 @@ summed over its 21 entries) predicted H steps ahead from the real actions, besid
 (`filter_error`) and the vector's variance; `in_view` is how often the target gate is less than 3 m away, ahead, and
 within 40° to the sides; `wrong_gate` the share of that where its decoded centre is more than 2 m off, which is another
 gate's, and `gate_error` how far it is off in the rest, m (root mean square). `value` is the critic's mean on the first
-half of the flights, `monte_carlo` the mean discounted sum of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of the
-value is cut off.
+half of the flights, `monte_carlo` the mean discounted sum of what was paid until the episode's or the flight's end: γ
+to the power of K / 2 or less of the value is cut off.
 """
 
 import argparse

@@ -79,7 +79,7 @@ class EvaluationReport:
         """Fly the episodes."""
         self._policy.deterministic = deterministic
         self._base.worlds.seed(self._seed)
-        return evaluate(self._env, self._act, self.episodes, max_recorded_steps=1000)
+        return evaluate(self._env, self._act, self.episodes, max_recorded_steps=self._base.worlds.race.episode_steps)
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act on the learner's device, with the environment on the CPU."""

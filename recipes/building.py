@@ -26,6 +26,7 @@ from dreamer_racing.checkpoint import (
 )
 from dreamer_racing.envs.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.partial_reset import TransformedPixelEnv
+from dreamer_racing.envs.race import EPISODE_TIME
 from dreamer_racing.learner import Learner
 from dreamer_racing.memory import (
     available_memory,
@@ -48,6 +49,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     config.device = str(device)
     if OmegaConf.is_missing(config.env, "num_envs"):
         config.env.num_envs = num_envs
+    if config.env.episode_steps is None:
+        config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
         config.env.device = worlds_device(config)
         print(f"worlds: {config.env.device} (env.device=auto)")

@@ -15,6 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
+from dreamer_racing.envs.quadrotor import MIN_CONTROL_RATE, at_control_rate, load_preset
+from dreamer_racing.envs.starts import StartSampler
+from dreamer_racing.envs.tracks import TrackError, load_track
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 
@@ -45,7 +48,7 @@ RANGES = {
     "seed": Range(0, 2**32 - 1),
     "env.num_envs": Range(1),
     "env.episode_steps": Range(1),
-    "env.control_rate": POSITIVE,
+    "env.control_rate": Range(MIN_CONTROL_RATE),
     "env.start_beyond_gate": SHARE,
     "env.start_on_line": SHARE,
     "model.batch_size": Range(1),
@@ -98,6 +101,14 @@ RANGES = {
     "logger.every": NOT_NEGATIVE,
 }
 """Allowed values by setting, of those that a recipe has; null is allowed where the schema allows it."""
+
+RACE_ONLY = {
+    "env.control_rate": 50.0,
+    "env.start_beyond_gate": 0.0,
+    "env.start_on_line": 0.0,
+    "evaluation.start_noise": 0.0,
+}
+"""Settings that other suites have no use for, with the defaults at which they must be left."""
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -181,6 +192,30 @@ def check(config: RunConfig) -> None:
         raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
     if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
         raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
+    if is_race(config):
+        check_race(config)
+        return
+    for name, default in RACE_ONLY.items():
+        if (value := OmegaConf.select(values, name)) != default:
+            raise ValueError(f"{name}={value} is for races, and env.suite={config.env.suite}: leave it at {default}.")
+
+
+def check_race(config: RunConfig) -> None:
+    """Refuse a control rate that the physics cannot step, and starts that cannot be.
+
+    Raises:
+        ValueError: the message names the setting.
+    """
+    for group, check_it in (
+        ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
+        ("evaluation", lambda: StartSampler(load_track(config.track), start_noise=config.evaluation.start_noise)),
+    ):
+        try:
+            check_it()
+        except TrackError:
+            raise
+        except ValueError as error:
+            raise ValueError(f"{group}.{error}") from error
 
 
 def check_replay(config: DreamerConfig | SACRunConfig) -> None:

@@ -50,8 +50,7 @@ def main(config: DictConfig) -> None:
         results = evaluate_fully(settings, restored, directory)
         written = describe(results, restored.trained.env.preset)
     written["provenance"] = restored.provenance(settings, time.monotonic() - started)
-    if settings.start_noise:
-        written["provenance"]["start_noise"] = settings.start_noise
+    written["provenance"]["start_noise"] = settings.start_noise
     if not report:
         write_markdown(directory, results, written["provenance"])
     (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")

@@ -42,6 +42,7 @@ class Restored:
             "track": self.trained.track,
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
+            "control_rate": self.trained.env.control_rate,
             "episodes": config.episodes,
             "seed": config.seed,
             "wall_clock_seconds": round(seconds, 1),

@@ -14,6 +14,7 @@ from checks import ReplayRatio, check_overrides
 from command_line import merge_overrides, override_key, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from schema import RECIPES
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from tqdm import tqdm
@@ -38,7 +39,7 @@ from dreamer_racing.replay import StreamReplay
 from dreamer_racing.run_lock import RunLock
 from dreamer_racing.timing import RunClock
 
-TRAINED_ON = ("track", "task", "decoys")  # what a run that is resumed cannot change
+TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
 
 
 @dataclass
@@ -195,11 +196,13 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
+    known = OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved)  # older runs do not say all
     for override in overrides:
         name, value = override_key(override), override.partition("=")[2]
-        if name in TRAINED_ON and value != str(saved.get(name)):
+        trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
+        if name in TRAINED_ON and OmegaConf.from_dotlist([f"value={value}"]).value != trained:
             raise ValueError(
-                f"{run_dir} was trained with {name}={saved.get(name)}, and goes on with it: {override} would be "
+                f"{run_dir} was trained with {name}={trained}, and goes on with it: {override} would be "
                 "another run. Leave it out, or begin anew."
             )
     begun_with = merge_overrides(list(OmegaConf.load(run_dir / "overrides.yaml")), [f"run_dir={run_dir}"])

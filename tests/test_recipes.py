@@ -20,6 +20,7 @@ from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.lesions import LESIONS
+from dreamer_racing.modules import Interface
 from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
 SMALL = [
@@ -279,6 +280,12 @@ REFUSED = [
     (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
     (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
     (["device=quantum"], ["device=quantum", "cpu"]),
+    (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
+    (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
+    (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
+    (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
+    (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
+    (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
 ]
 
 
@@ -448,11 +455,28 @@ def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
-def test_another_control_rate_reaches_training_and_evaluation(tmp_path: Path) -> None:
-    config = OmegaConf.to_object(compose("dreamer_v3", *TINY, "env.control_rate=25", "env.episode_steps=null"))
-    arena = recipe_module("arena")
-    config.env.device = "cpu"
+def test_another_control_rate_reaches_training_evaluation_and_export(tmp_path: Path) -> None:
+    options = ["env.control_rate=25", "env.start_on_line=0.5", "evaluation.start_noise=1", "evaluation.episodes=3"]
+    resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *TINY, *options, "env.episode_steps=null"))
+    assert resolved.env.episode_steps == 500
+    config, arena = OmegaConf.to_object(resolved), recipe_module("arena")
     env = arena.make_env(config)
     assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
+    assert env.worlds._starts._on_line == 0.5
+    learner = arena.make_learner(config, Interface.of(env), "cpu")
     env.close()
-    assert arena.worlds_of(config)["control_rate"] == 25
+    report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
+    assert report._base.worlds.parameters.control_dt == 0.04
+    assert report._base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
+    assert len({episode.reward_sum for episode in report.evaluate(deterministic=True).episodes}) == 3
+    report.close()
+
+
+def test_a_run_goes_on_at_its_control_rate(run_dir: Path) -> None:
+    resumed = recipe_module("training").resumed_config
+    with pytest.raises(ValueError, match=r"trained with env.control_rate=50.0, and goes on with it"):
+        resumed("dreamer_v3", str(run_dir), ["env.control_rate=25"])
+    recipe_module("schema").register()
+    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+        config, _ = resumed("dreamer_v3", str(run_dir), ["env.control_rate=50"])
+    assert config.env.control_rate == 50

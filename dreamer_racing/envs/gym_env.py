@@ -195,7 +195,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`) or parameters.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `num_threads`.
+            `num_threads`, `control_rate`, `start_on_line`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.

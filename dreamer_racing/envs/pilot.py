@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from dreamer_racing.envs.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
-from dreamer_racing.envs.race import RaceStep
+from dreamer_racing.envs.race import EVALUATION_TIME, RaceStep
 from dreamer_racing.envs.racing_line import Dynamics, LineLimits, Reference, plan_racing_line
 from dreamer_racing.envs.rotation import rotate, rotate_inverse, turn
 from dreamer_racing.envs.tracks import Track, load_track
@@ -313,7 +313,7 @@ def fly_laps(
     randomise: bool = True,
     random_starts: bool = False,
     seed: int = 0,
-    episode_steps: int = 1500,
+    episode_steps: int | None = None,
 ) -> FlownLaps:
     """Fly N episodes to their ends.
 
@@ -326,7 +326,7 @@ def fly_laps(
         randomise: whether a preset's randomisation is on.
         random_starts: start as training does, instead of at the start pose.
         seed: of randomisation and starts.
-        episode_steps: control steps until an episode is given up.
+        episode_steps: control steps until an episode is given up; None for those of 30 s.
     """
     parameters = load_preset(preset)
     worlds = RaceWorlds(
@@ -335,7 +335,7 @@ def fly_laps(
         parameters if randomise else without_randomisation(parameters),
         evaluation=not random_starts,
         from_pixels=False,
-        episode_steps=episode_steps,
+        episode_steps=episode_steps or round(EVALUATION_TIME / parameters.control_dt),
         seed=seed,
     )
     worlds.race.laps = laps

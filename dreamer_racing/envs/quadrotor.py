@@ -111,17 +111,25 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     return PRESETS[preset]
 
 
+MIN_CONTROL_RATE = 10.0
+"""Hz: the lowest rate of actions; a fast drone flies 2 m in a step then."""
+
+
 def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
     """The same drone with so many actions a second.
 
     Args:
         parameters: of the drone.
-        rate: Hz; a control step must be a whole number of physics steps.
+        rate: Hz, at least ``MIN_CONTROL_RATE``; a control step must be a whole number of physics steps.
 
     Raises:
-        ValueError: it is not.
+        ValueError: it is not, or the rate is lower.
     """
-    steps = round(1.0 / (rate * parameters.physics_dt)) if rate > 0 else 0
+    if not rate >= MIN_CONTROL_RATE:
+        raise ValueError(
+            f"control_rate={rate} Hz: at least {MIN_CONTROL_RATE:g}, because a control step can pass one gate only."
+        )
+    steps = round(1.0 / (rate * parameters.physics_dt))
     if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:
         raise ValueError(
             f"control_rate={rate} Hz: a control step must be a whole number of physics steps of "

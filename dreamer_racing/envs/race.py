@@ -60,7 +60,7 @@ class Race:
         track: the track.
         num_envs: number of drones N.
         weights: the weights of Eq. 1.
-        episode_steps: control steps after which an episode is truncated.
+        episode_steps: control steps after which an episode is truncated; None for those of 20 s.
         laps: laps after which an episode is truncated as finished (evaluation); None to fly until time is up.
         control_dt: duration of a control step, s.
         device: where all tensors live.
@@ -82,7 +82,7 @@ class Race:
         track: Track,
         num_envs: int,
         weights: RewardWeights | None = None,
-        episode_steps: int = 1000,
+        episode_steps: int | None = None,
         laps: int | None = None,
         control_dt: float = 0.02,
         device: torch.device | str = "cpu",
@@ -90,7 +90,7 @@ class Race:
     ):
         self.track = track
         self.weights = weights or RewardWeights()
-        self.episode_steps = episode_steps
+        self.episode_steps = episode_steps or round(EPISODE_TIME / control_dt)
         self.laps = laps
         self.control_dt = control_dt
         self._sweep = GateSweeper(track, device, dtype)

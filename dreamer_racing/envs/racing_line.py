@@ -70,15 +70,17 @@ class RacingLine:
         samples: (K, 18) the columns of `Reference`, `LINE_DT`-spaced over one lap.
         gate_times: (G,) s, when the line passes each gate.
         lap_time: s.
+        dynamics: of the drone that it was planned for.
     """
 
-    def __init__(self, samples: Tensor, gate_times: Tensor, lap_time: float) -> None:
-        self.samples, self.gate_times, self.lap_time = samples, gate_times, lap_time
+    def __init__(self, samples: Tensor, gate_times: Tensor, lap_time: float, dynamics: "Dynamics") -> None:
+        self.samples, self.gate_times, self.lap_time, self.dynamics = samples, gate_times, lap_time, dynamics
         self.dt = lap_time / len(samples)  # s
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "RacingLine":
         """The same line elsewhere."""
-        return RacingLine(self.samples.to(device, dtype), self.gate_times.to(device, dtype), self.lap_time)
+        samples, gate_times = (values.to(device, dtype) for values in (self.samples, self.gate_times))
+        return RacingLine(samples, gate_times, self.lap_time, self.dynamics)
 
     def at(self, time: Tensor) -> Reference:
         """Interpolate the line at times (N,) in s; it repeats every lap."""
@@ -177,7 +179,7 @@ class Dynamics:
         thrust alone. Reference: Faessler et al., Differential Flatness of Quadrotor Dynamics Subject to Rotor Drag.
         """
         force = acceleration + self.drag_sideways * velocity
-        return force + force.new_tensor((0.0, 0.0, GRAVITY))
+        return torch.cat((force[..., :2], force[..., 2:] + GRAVITY), dim=-1)
 
     def collective_thrust(self, force: Tensor, axis: Tensor, velocity: Tensor) -> Tensor:
         """Collective thrust (...) in m/s² that gives the force (..., 3) along the thrust axis (..., 3)."""
@@ -292,4 +294,4 @@ def _finish_line(nodes: _LineNodes, dynamics: Dynamics) -> RacingLine:
     _, body_rate = _axis_rate(dynamics.force(velocity, acceleration), force_rate)
     angular_acceleration = (body_rate.roll(-1, 0) - body_rate.roll(1, 0)) / (2 * lap_time / count)
     columns = (position, velocity, acceleration, force_rate, body_rate, angular_acceleration)
-    return RacingLine(torch.cat(columns, dim=-1), start_times[nodes.gate_nodes], lap_time)
+    return RacingLine(torch.cat(columns, dim=-1), start_times[nodes.gate_nodes], lap_time, dynamics)

@@ -5,7 +5,7 @@ package's own dependencies: `pip install -e '.[sb3]'`. Shapes: N environments.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -66,6 +66,7 @@ class DroneRaceVecEnv(VecEnv):
         self.render_mode = render_mode
         self._actions = np.zeros((num_envs, *self.race.action_space().shape), np.float32)
         super().__init__(num_envs, self.race.observation_space(), self.race.action_space())
+        cast(dict[str, Any], self.metadata)["render_fps"] = self.race.frames_per_second
 
     def reset(self) -> Observation:
         """Begin an episode everywhere."""

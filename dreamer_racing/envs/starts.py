@@ -10,7 +10,6 @@ import math
 
 import torch
 
-from dreamer_racing.envs.quadrotor import GRAVITY
 from dreamer_racing.envs.racing_line import RacingLine
 from dreamer_racing.envs.rotation import from_roll_pitch_yaw, rotate, rotate_inverse, turn
 from dreamer_racing.envs.tracks import Track
@@ -46,15 +45,16 @@ class StartSampler:
 
     A share of the drones may begin on a racing line instead: at a random time of a lap, at a random fraction of the
     line's speed, with the attitude that flies it and the nose to where the line leads, and noise: six tenths of the
-    above in position, as much in attitude. Every part of a lap is practised from the first episode on, also turns whose
-    gate is out of view. Reference: Peng et al. 2018, "DeepMimic", Section 6.2 (reference state initialisation).
+    above in position, along the world's axes, and as much in attitude. Every part of a lap is practised from the first
+    episode on, also turns whose gate is out of view. Reference: Peng et al. 2018, "DeepMimic", Section 6.2 (reference
+    state initialisation).
 
     Args:
         track: the track.
         generator: source of randomness, on the sampler's device; None for torch's own.
         device: where the poses are wanted.
         dtype: floating-point type of the poses.
-        beyond_gate: share of training episodes that begin beyond a gate.
+        beyond_gate: share of training episodes that begin beyond a gate, of those that do not begin on the line.
         on_line: share of training episodes that begin on ``line``; all others are as if there was none.
         line: the racing line; needed if ``on_line`` is above zero.
         start_noise: of evaluation starts, as a multiple of the noise of training.
@@ -76,9 +76,9 @@ class StartSampler:
     BEYOND_DISTANCE = (0.6, 2.0)  # m behind a random gate: more than the noise
     BEYOND_SPEED = (1.5, 5.0)  # m/s along its direction
     PACE = (0.2, 1.0)  # fraction of the line's speed
-    LINE_NOISE = 0.6  # position noise beside the line: it must not carry a drone past a gate's opening
+    LINE_NOISE = 0.6  # times the position noise: less, to stay inside the gates that the line goes through
     LOOK_AHEAD = 0.5  # s: the nose points to where the line is this much later
-    PAST_GATE = 1.0  # m around a gate's centre in which a drone beyond its plane has passed it
+    PAST_GATE = 1.0  # m around a gate's centre in which the side of its plane says whether it has been passed
 
     def __init__(
         self,
@@ -174,15 +174,16 @@ class StartSampler:
         reference = line.at(time)
         position = reference.position + self.LINE_NOISE * self._position_noise * noise[:, :3]
         position = torch.minimum(torch.maximum(position, self._low), self._high)
+        velocity = pace * reference.velocity
         # At a fraction of the speed the same curve asks for the square of that fraction of the acceleration.
-        force = pace.square() * reference.acceleration + position.new_tensor((0.0, 0.0, GRAVITY))
+        force = line.dynamics.force(velocity, pace.square() * reference.acceleration)
         ahead = line.at(time + self.LOOK_AHEAD).position - reference.position
         attitude = turn(_pointing(force, ahead), self._attitude_noise * noise[:, 3:])
         on_line = (draw[:, 0] < self._on_line).unsqueeze(-1)
         return StartPose(
             position=torch.where(on_line, position, pose.position),
             attitude=torch.where(on_line, attitude, pose.attitude),
-            linear_velocity=torch.where(on_line, pace * reference.velocity, pose.linear_velocity),
+            linear_velocity=torch.where(on_line, velocity, pose.linear_velocity),
             target_gate=torch.where(on_line[:, 0], self._next_gate(line, time, position), pose.target_gate),
         )
 
@@ -190,9 +191,16 @@ class StartSampler:
         """Return the gate (N,) that a drone near the line at a time has to pass next, whatever side noise put it on."""
         num_gates = len(self._gate_yaws)
         gate = (time.unsqueeze(-1) >= line.gate_times).sum(-1) % num_gates
-        beyond = position - self._gate_positions[gate]
-        passed = ((beyond * self._gate_normals[gate]).sum(-1) >= 0.0) & (beyond.norm(dim=-1) < self.PAST_GATE)
-        return (gate + passed) % num_gates
+        last = (gate - 1) % num_gates
+        near, beyond = self._beside_gate(position, gate)
+        near_last, beyond_last = self._beside_gate(position, last)
+        gate = torch.where(near & beyond, (gate + 1) % num_gates, gate)
+        return torch.where(near_last & ~beyond_last, last, gate)
+
+    def _beside_gate(self, position: torch.Tensor, gate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return which drones (N,) are near a gate's centre, and which are beyond its plane."""
+        offset = position - self._gate_positions[gate]
+        return offset.norm(dim=-1) < self.PAST_GATE, (offset * self._gate_normals[gate]).sum(-1) >= 0.0
 
     def _disturb(
         self, origin: torch.Tensor, yaw: torch.Tensor, noise: torch.Tensor

@@ -29,7 +29,7 @@ import torch
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, load_preset
+from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters, at_control_rate, load_preset
 from dreamer_racing.envs.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
@@ -82,6 +82,7 @@ def load(
     from_pixels: bool = False,
     camera: Camera | None = None,
     weights: RewardWeights | None = None,
+    control_rate: float | None = None,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
     """Make the race of one drone as a dm_control environment.
@@ -95,6 +96,7 @@ def load(
         from_pixels: whether there is an observation `pixels`; needs OpenGL (EGL, OSMesa or a display).
         camera: the nose camera.
         weights: of the reward, paper Eq. 1.
+        control_rate: actions a second, Hz; if None the preset's, 50.
         environment_kwargs: further arguments of `control.Environment`, e.g. `flat_observation`.
 
     Raises:
@@ -108,6 +110,8 @@ def load(
         1.0
     """
     track, parameters = load_track(track), load_preset(preset)
+    if control_rate is not None:
+        parameters = at_control_rate(parameters, control_rate)
     if time_limit is None:
         time_limit = EVALUATION_TIME if evaluation else EPISODE_TIME
     episode_steps = round(time_limit / parameters.control_dt)
@@ -269,7 +273,7 @@ class DroneRace(base.Task):
         parameters: the drone.
         generator: the source of physics randomisation that `Physics` draws from; its own if None.
         random: seed or `numpy.random.RandomState`.
-        episode_steps: control steps after which an episode is truncated.
+        episode_steps: control steps after which an episode is truncated; None for those of 20 s.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
         camera: the nose camera; None for no `pixels`.
         weights: of the reward, paper Eq. 1.
@@ -286,7 +290,7 @@ class DroneRace(base.Task):
         generator: torch.Generator | None = None,
         *,
         random: int | np.random.RandomState | None = None,
-        episode_steps: int = 1000,
+        episode_steps: int | None = None,
         evaluation: bool = False,
         camera: Camera | None = None,
         weights: RewardWeights | None = None,

@@ -120,6 +120,8 @@ class RaceWorlds:
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
+        if not 0.0 <= start_on_line <= 1.0:
+            raise ValueError(f"start_on_line={start_on_line}: a share of episodes lies between 0 and 1.")
         on_line = 0.0 if evaluation else start_on_line
         nominal = without_randomisation(self.parameters)
         self._starts = StartSampler(

@@ -94,3 +94,9 @@ def test_line_is_the_integral_of_its_velocity_and_repeats_every_lap(circle_line:
     travelled = torch.cumulative_trapezoid(reference.velocity, time, dim=0)
     torch.testing.assert_close(reference.position[1:] - reference.position[0], travelled, atol=1e-3, rtol=0.0)
     torch.testing.assert_close(circle_line.at(time - circle_line.lap_time).position, reference.position)
+
+
+def test_planning_again_gives_the_same_line_so_that_a_resumed_run_starts_alike():
+    arguments = (load_track("circle"), PRESETS["easy"], LineLimits(speed=0.7))
+    first, second = (plan_racing_line.__wrapped__(*arguments) for _ in range(2))
+    assert torch.equal(first.samples, second.samples) and torch.equal(first.gate_times, second.gate_times)

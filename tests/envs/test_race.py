@@ -12,7 +12,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.pilot import ScriptedPilot
-from dreamer_racing.envs.quadrotor import GRAVITY, load_preset
+from dreamer_racing.envs.quadrotor import GRAVITY, load_preset, without_randomisation
 from dreamer_racing.envs.race import Race, RaceStep
 from dreamer_racing.envs.racing_line import plan_racing_line
 from dreamer_racing.envs.rotation import rotate
@@ -437,22 +437,24 @@ def test_the_share_of_starts_beyond_a_gate_leaves_the_rest_as_it_was():
 N_ON_LINE = 400
 
 
-def on_line(name: str, num: int = N_ON_LINE) -> tuple[RaceWorlds, torch.Tensor]:
-    """Begin episodes on the line of a track; return the worlds and how far each is before its gate's plane, m."""
-    worlds = RaceWorlds(name, num, from_pixels=False, start_on_line=1.0, seed=0)
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_starts_on_the_line_are_between_the_last_gate_and_the_next(name):
+    worlds = RaceWorlds(name, 2000, from_pixels=False, start_on_line=1.0, seed=0)
     worlds.reset()
-    gate = worlds.race.target_gate
-    ahead = worlds.track.gate_positions(dtype=torch.float64)[gate] - worlds.simulator.state.position
-    return worlds, (ahead * worlds.track.gate_normals(dtype=torch.float64)[gate]).sum(-1)
+    gate, centres = worlds.race.target_gate, worlds.track.gate_positions(dtype=torch.float64)
+    assert gate.unique().tolist() == list(range(worlds.track.num_gates))
+    for of, side in ((gate, 1.0), ((gate - 1) % worlds.track.num_gates, -1.0)):
+        ahead = centres[of] - worlds.simulator.state.position
+        near = ahead.norm(dim=-1) < StartSampler.PAST_GATE
+        before = (ahead * worlds.track.gate_normals(dtype=torch.float64)[of]).sum(-1) * side
+        assert near.any() and (before[near] >= 0).all(), "a drone begins on the wrong side of a gate's plane"
+    worlds.close()
 
 
 @pytest.mark.parametrize("name", ["circle", "kidney"])
 def test_starts_on_the_line_can_be_flown_on_from_anywhere_of_a_lap(name):
-    worlds, ahead = on_line(name)
-    state, gates = worlds.simulator.state, worlds.track.num_gates
-    assert worlds.race.target_gate.unique().tolist() == list(range(gates))
-    near = (state.position - worlds.track.gate_positions(dtype=torch.float64)[worlds.race.target_gate]).norm(dim=-1) < 1
-    assert (ahead[near] > 0).all(), "a drone begins beyond the plane of the gate it has to pass"
+    worlds = RaceWorlds(name, N_ON_LINE, from_pixels=False, start_on_line=1.0, seed=0)
+    worlds.reset()
     pilot = ScriptedPilot(worlds.track, dtype=worlds.dtype)
     crashed, passed = torch.zeros(N_ON_LINE, dtype=torch.bool), torch.zeros(N_ON_LINE, dtype=torch.int64)
     for _ in range(100):
@@ -468,8 +470,10 @@ def test_starts_on_the_line_can_be_flown_on_from_anywhere_of_a_lap(name):
     assert (passed > 0).float().mean() > 0.9
 
 
-def test_starts_on_the_line_look_where_it_leads_and_push_along_its_acceleration():
-    line = plan_racing_line(CIRCLE, load_preset("easy"), START_LINE).to("cpu", torch.float64)
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_starts_on_the_line_look_where_it_leads_and_push_along_what_it_asks_for(preset):
+    parameters = without_randomisation(load_preset(preset))
+    line = plan_racing_line(CIRCLE, parameters, START_LINE).to("cpu", torch.float64)
     starts = StartSampler(CIRCLE, torch.Generator().manual_seed(0), dtype=torch.float64, on_line=1.0, line=line)
     starts.LINE_NOISE, starts._attitude_noise = 0.0, torch.zeros(3, dtype=torch.float64)
     pose = starts.sample(500)
@@ -477,8 +481,10 @@ def test_starts_on_the_line_look_where_it_leads_and_push_along_its_acceleration(
     reference = line.samples[nearest]
     pace = pose.linear_velocity.norm(dim=-1) / reference[:, 3:6].norm(dim=-1)
     assert 0.19 < pace.min() < 0.25 and 0.95 < pace.max() < 1.02
-    force = pace.square().unsqueeze(-1) * reference[:, 6:9] + torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
-    axis = rotate(pose.attitude, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(500, 3))
+    drag = sum(parameters.drag[:2]) / 2 / parameters.mass
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    force = pace.square().unsqueeze(-1) * reference[:, 6:9] + drag * pose.linear_velocity + GRAVITY * up
+    axis = rotate(pose.attitude, up.expand(500, 3))
     assert (axis * force).sum(-1).div(force.norm(dim=-1)).min() > 0.999
     left = rotate(pose.attitude, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand(500, 3))
     nose = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(500, 3))
@@ -513,5 +519,9 @@ def test_half_the_control_rate_flies_twice_as_far_a_step_and_ends_after_the_same
             worlds.step(torch.full((1, 4), 0.1))
     torch.testing.assert_close(fast.simulator.state.position, slow.simulator.state.position)
     assert (fast.race.episode_steps, slow.race.episode_steps) == (1000, 500)
+    with pytest.raises(ValueError, match=r"control_rate=5 Hz: at least 10"):
+        RaceWorlds("circle", 1, from_pixels=False, control_rate=5)
+    with pytest.raises(ValueError, match=r"start_on_line=1.5: a share"):
+        RaceWorlds("circle", 1, from_pixels=False, start_on_line=1.5)
     with pytest.raises(ValueError, match=r"control_rate=60.* whole number of physics steps of 2 ms"):
         RaceWorlds("circle", 1, from_pixels=False, control_rate=60)

@@ -135,3 +135,7 @@ def test_gymnasium_environments_live_in_other_processes() -> None:
     _, rewards, *_ = env.step(HOVER[None])
     assert np.isfinite(rewards).all()
     env.close()
+
+
+def test_videos_play_at_the_control_rate() -> None:
+    assert vec_env(1, "state", control_rate=25).metadata["render_fps"] == 25

@@ -404,3 +404,9 @@ def test_viewer_gets_the_environment_and_a_hovering_policy(monkeypatch: pytest.M
     for _ in range(3):
         time_step = env.step(policy(time_step))
     assert not time_step.last()
+
+
+def test_another_control_rate() -> None:
+    env = load("circle", random=0, control_rate=25)
+    assert env.control_timestep() == pytest.approx(0.04)
+    assert env.task.race.episode_steps == 500
