@@ -11,10 +11,13 @@ Every row is a process of its own. `images` is `none` (state only, `vector`), a 
 * `worlds`: `RaceWorlds` stepped, drawn and reset where an episode ended: the environment without TorchRL;
 * `rollout`: `DroneRacingEnv.rollout`;
 * `collector`: a TorchRL `Collector` with a random policy;
+* `still`: the same around worlds that stand still, whose step returns stored tensors and never ends an episode: what
+  TorchRL takes however fast the worlds are;
 * `actor`: the same with a DreamerV3 policy of `--actor` size and its recurrent state.
 
-The first three are measured in turns, five times, and the best reported, because other load on the machine only ever
-slows; `lost` is the share of the worlds' speed that the collector loses. On CPU the milliseconds of a collected step
+All but the last are measured in turns, five times, and the best reported, because other load on the machine only ever
+slows; `lost` is the share of the worlds' speed that the collector loses, `least` what it would lose if TorchRL took no
+longer than around worlds that stand still. On CPU the milliseconds of a collected step
 are split into physics, race rules, rendering and TorchRL (specs, TensorDicts, resets, storing). `memory` is the
 process's peak resident memory, or what is in use on the GPU, GiB.
 """
@@ -33,6 +36,7 @@ from typing import Any
 
 import torch
 from measuring import print_table, write_json
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
@@ -43,8 +47,8 @@ from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 
 PARTS = ("physics", "race", "render")
-MODES = ("worlds", "rollout", "collector", "actor")
-COLUMNS = ("images", "num_envs", *MODES, "lost", *(f"{part}_ms" for part in PARTS), "torchrl_ms", "memory_gib")
+MODES = ("worlds", "rollout", "collector", "still", "actor")
+COLUMNS = ("images", "num_envs", *MODES, "lost", "least", *(f"{part}_ms" for part in PARTS), "torchrl_ms", "memory_gib")
 ROLLOUT = 16  # control steps in a batch
 TURNS = 5
 README = Path(__file__).parent.parent / "README.md"
@@ -127,6 +131,7 @@ def measure(
         "worlds": lambda: fly_worlds(env, ROLLOUT),
         "rollout": lambda: env.rollout(ROLLOUT, break_when_any_done=False),
         "collector": lambda: next(rollouts),
+        "still": around_still_worlds(env, rollouts),
     }
     speeds: defaultdict[str, list[float]] = defaultdict(list)
     for _ in range(TURNS):
@@ -139,7 +144,8 @@ def measure(
     return {
         "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
         "image_size": image_size, "actor_size": actor, **rates,
-        "lost": 1 - rates["collector"] / rates["worlds"], **split, "memory_gib": peak_gib(env.device),
+        "lost": 1 - rates["collector"] / rates["worlds"],
+        "least": rates["worlds"] / (rates["worlds"] + rates["still"]), **split, "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
 
@@ -155,6 +161,23 @@ def fly_worlds(env: DroneRacingEnv, steps: int) -> None:
             worlds.reset(ended)
             if env.from_pixels:
                 worlds.render(ended)
+
+
+def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callable[[], None]:
+    """Collect rollouts while the worlds stand still: every step returns the same tensors, and nothing ends."""
+    after = env._step(TensorDict({"action": env.action_spec.zero()}, env.batch_size))
+    for key in ("done", "terminated", "truncated"):
+        after[key].zero_()
+    moving = env._step
+
+    def collect() -> None:
+        env._step = lambda tensordict: after.copy()  # type: ignore[method-assign]
+        try:
+            next(rollouts)
+        finally:
+            env._step = moving  # type: ignore[method-assign]
+
+    return collect
 
 
 def acting(env: DroneRacingEnv, size: str, options: dict[str, Any]) -> Callable[[], Any]:
