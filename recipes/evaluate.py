@@ -20,6 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from restoring import Restored, fresh_directory, heading, restore
 from schema import EvaluateConfig, register
 
+from dreamer_racing.envs.starts import StartSampler
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.plotting import plot_top_down
 from dreamer_racing.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
 from dreamer_racing.recording import onboard_beside_map, write_video
@@ -41,6 +43,7 @@ def main(config: DictConfig) -> None:
         settings = cast(EvaluateConfig, OmegaConf.to_object(config))
         check(settings)
         restored = restore(settings)
+        StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
         directory = fresh_directory(settings.run_dir or restored.run_dir / "evaluation", RESULT)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
@@ -75,7 +78,11 @@ def check(config: EvaluateConfig) -> None:
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
     """Make the races that the policy is to fly as it was trained to."""
-    options = {"num_envs": config.num_envs, "seed": config.seed}
+    num_envs = config.num_envs
+    if config.start_noise and num_envs < config.episodes:
+        num_envs = config.episodes
+        print(f"worlds: {num_envs}, one for each episode, so that every agent meets the same starts")
+    options = {"num_envs": num_envs, "seed": config.seed}
     report = make_report(
         restored.trained,
         directory,

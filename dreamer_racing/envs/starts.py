@@ -230,7 +230,7 @@ def _check_start_noise(start_noise: float, track: Track) -> None:
     if not 0.0 <= start_noise < most:
         raise ValueError(
             f"start_noise={start_noise}: on track {track.name!r}, whose start is {ahead:.2f} m before the plane of the "
-            f"first gate, at least 0 and below {most:.2f} times the noise of training."
+            f"first gate, must be at least 0 and below {most:.2f} times the noise of training."
         )
 
 
