@@ -33,6 +33,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from measuring import print_table, write_json
@@ -168,14 +169,10 @@ def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callabl
     after = env._step(TensorDict({"action": env.action_spec.zero()}, env.batch_size))
     for key in ("done", "terminated", "truncated"):
         after[key].zero_()
-    moving = env._step
 
     def collect() -> None:
-        env._step = lambda tensordict: after.copy()  # type: ignore[method-assign]
-        try:
+        with patch.object(env, "_step", lambda tensordict: after.copy()):
             next(rollouts)
-        finally:
-            env._step = moving  # type: ignore[method-assign]
 
     return collect
 
