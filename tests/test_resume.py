@@ -17,7 +17,8 @@ from dreamer_racing.checkpoint import latest_checkpoint
 ROOT = Path(__file__).parents[1]
 SETTINGS = [
     "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4", "env.num_envs=4",
-    "env.episode_steps=40", "prefill=64", "replay.capacity=1200", "replay.recent_share=0.5",
+    "env.episode_steps=40", "env.start_on_line=0.5", "env.control_rate=25", "prefill=64", "replay.capacity=1200",
+    "replay.recent_share=0.5",
     "evaluation.every=500", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=0",
     "logger.every=400", "logger=csv", "device=cpu", "curriculum.threshold=-100", "curriculum.cooldown=3",
 ]  # fmt: skip
