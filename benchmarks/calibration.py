@@ -40,7 +40,8 @@ from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.world_model import join_features
 
-WRONG_GATE = 2.0  # m
+NEAR, HALF_VIEW = 3.0, math.radians(40.0)  # m and rad to either side: where a gate counts as seen
+WRONG_GATE = 2.0  # m: an error that means another gate
 TO_GATE = slice(9, 12)  # of a race vector: from the drone to the centre of the target gate, see `RACE_VECTOR_ENTRIES`
 
 
@@ -161,7 +162,7 @@ def decoded_errors(
     gate_error = (DISTANCE * now[:, TO_GATE] - gate).square().sum(-1)  # (N,) m²
     is_wrong = gate_error > WRONG_GATE**2
     forward, left, _ = gate.unbind(-1)
-    in_view = (gate.norm(dim=-1) < 3.0) & (forward > 0.0) & (left.abs() < math.tan(math.radians(40.0)) * forward)
+    in_view = (gate.norm(dim=-1) < NEAR) & (forward > 0.0) & (left.abs() < math.tan(HALF_VIEW) * forward)
     return {
         "filter_error": (symlog(now) - real[0]).square().sum(-1),
         "in_view": in_view.float(),

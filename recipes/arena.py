@@ -111,8 +111,9 @@ def make_report(
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
         worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels, "start_noise": start_noise}
-        if start_noise:
-            options = {"num_envs": episodes} | options  # a world's second start would depend on how its first went
+        if start_noise:  # a world's second start would depend on how its first went
+            options["num_envs"] = episodes
+            print(f"evaluation: {episodes} worlds, one for each episode, so that every agent meets the same starts")
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
     env = ControlSuiteEnv(config.task, min(8, episodes), from_pixels=config.env.from_pixels, seed=config.seed + 1)
     return ReturnReport(directory, learner, env, episodes, video_steps)

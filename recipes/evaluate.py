@@ -78,11 +78,7 @@ def check(config: EvaluateConfig) -> None:
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
     """Make the races that the policy is to fly as it was trained to."""
-    num_envs = config.num_envs
-    if config.start_noise and num_envs < config.episodes:
-        num_envs = config.episodes
-        print(f"worlds: {num_envs}, one for each episode, so that every agent meets the same starts")
-    options = {"num_envs": num_envs, "seed": config.seed}
+    options = {"num_envs": config.num_envs, "seed": config.seed}
     report = make_report(
         restored.trained,
         directory,

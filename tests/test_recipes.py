@@ -455,7 +455,7 @@ def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
-def test_another_control_rate_reaches_training_evaluation_and_export(tmp_path: Path) -> None:
+def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_path: Path) -> None:
     options = ["env.control_rate=25", "env.start_on_line=0.5", "evaluation.start_noise=1", "evaluation.episodes=3"]
     resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *TINY, *options, "env.episode_steps=null"))
     assert resolved.env.episode_steps == 500

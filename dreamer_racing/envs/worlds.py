@@ -122,21 +122,19 @@ class RaceWorlds:
         self._vector = RaceVector(self.track, self.device, self.dtype)
         if not 0.0 <= start_on_line <= 1.0:
             raise ValueError(f"start_on_line={start_on_line}: a share of episodes lies between 0 and 1.")
-        on_line = 0.0 if evaluation else start_on_line
-        nominal = without_randomisation(self.parameters)
-        self._starts = StartSampler(
-            self.track,
-            self._generator,
-            self.device,
-            self.dtype,
-            start_beyond_gate,
-            start_noise,
-            on_line,
-            plan_racing_line(self.track, nominal, START_LINE) if on_line else None,
-        )
+        self._starts = self._make_starts(start_beyond_gate, start_noise, 0.0 if evaluation else start_on_line)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
+
+    def _make_starts(self, beyond_gate: float, noise: float, on_line: float) -> StartSampler:
+        """Make the sampler of start poses, and plan the line for it if episodes begin there."""
+        line = None
+        if on_line:
+            line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE)
+        return StartSampler(
+            self.track, self._generator, self.device, self.dtype, beyond_gate, noise, on_line=on_line, line=line
+        )
 
     def seed(self, seed: int | None) -> None:
         """Seed start poses and physics randomisation; None draws a seed from the operating system."""
