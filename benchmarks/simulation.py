@@ -8,18 +8,19 @@
 Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
 (physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
 
-* `worlds`: `RaceWorlds` stepped, drawn and reset where an episode ended: the environment without TorchRL;
+* `worlds`: `RaceWorlds` stepped, observed and reset where an episode ended, with random actions, in plain tensors;
 * `rollout`: `DroneRacingEnv.rollout`;
 * `collector`: a TorchRL `Collector` with a random policy;
 * `still`: the same around worlds that stand still, whose step returns stored tensors and never ends an episode: what
   TorchRL takes however fast the worlds are;
-* `actor`: the same with a DreamerV3 policy of `--actor` size and its recurrent state.
+* `agent`: as `worlds`, with the networks and the recurrent state of a DreamerV3 policy of `--actor` size;
+* `actor`: a `Collector` with that policy.
 
-All but the last are measured in turns, five times, and the best reported, because other load on the machine only ever
-slows; `lost` is the share of the worlds' speed that the collector loses, `least` what it would lose if TorchRL took no
-longer than around worlds that stand still. On CPU the milliseconds of a collected step
-are split into physics, race rules, rendering and TorchRL (specs, TensorDicts, resets, storing). `memory` is the
-process's peak resident memory, or what is in use on the GPU, GiB.
+They are measured in turns, five times, and the best reported, because other load on the machine only ever slows.
+`lost` is the share of the worlds' speed that the collector loses, `actor_lost` the same of `agent` and `actor`, `least`
+what the collector would lose if TorchRL took no longer than around worlds that stand still. On CPU the milliseconds of
+a collected step are split into physics, race rules, rendering and TorchRL (specs, TensorDicts, resets, storing).
+`memory` is the process's peak resident memory, or what is in use on the GPU, GiB.
 """
 
 import argparse
@@ -37,7 +38,8 @@ from unittest.mock import patch
 
 import torch
 from measuring import print_table, write_json
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
@@ -46,10 +48,13 @@ from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.modules import DreamerPolicy, Interface
 
 PARTS = ("physics", "race", "render")
-MODES = ("worlds", "rollout", "collector", "still", "actor")
-COLUMNS = ("images", "num_envs", *MODES, "lost", "least", *(f"{part}_ms" for part in PARTS), "torchrl_ms", "memory_gib")
+MODES = ("worlds", "rollout", "collector", "still", "agent", "actor")
+MILLISECONDS = tuple(f"{part}_ms" for part in (*PARTS, "torchrl"))
+COLUMNS = ("images", "num_envs", *MODES, "lost", "least", "actor_lost", *MILLISECONDS, "memory_gib")
 ROLLOUT = 16  # control steps in a batch
 TURNS = 5
 README = Path(__file__).parent.parent / "README.md"
@@ -125,14 +130,21 @@ def measure(
         **settings,
     )
     batch = ROLLOUT * num_envs
+    # the device said once: without it the collector takes its tensors off the device and puts them back, every step
     options = {"frames_per_batch": batch, "total_frames": -1, "track_traj_ids": False, "no_cuda_sync": True}
+    options["device"] = env.device
     collector = Collector(env, RandomPolicy(env.action_spec), **options)
     rollouts = iter(collector)
+    policy = make_policy(env, actor)
+    remembering = TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer()))
+    actor_rollouts = iter(Collector(remembering, policy, **options))
     modes: dict[str, Callable[[], Any]] = {
-        "worlds": lambda: fly_worlds(env, ROLLOUT),
+        "worlds": flying(env, lambda _: env.action_spec.rand()),
         "rollout": lambda: env.rollout(ROLLOUT, break_when_any_done=False),
         "collector": lambda: next(rollouts),
         "still": around_still_worlds(env, rollouts),
+        "agent": flying(env, acting(policy, remembering.reset())),
+        "actor": lambda: next(actor_rollouts),
     }
     speeds: defaultdict[str, list[float]] = defaultdict(list)
     for _ in range(TURNS):
@@ -140,28 +152,35 @@ def measure(
             speeds[mode].append(speed(job, batch, seconds, env.device))
     split = parts_of(env, lambda: next(rollouts), seconds) if env.device.type == "cpu" else {}
     rates = {mode: max(values) for mode, values in speeds.items()}
-    collector.shutdown(close_env=False)
-    rates["actor"] = speed(acting(env, actor, options), batch, seconds, env.device)
     return {
         "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
         "image_size": image_size, "actor_size": actor, **rates,
         "lost": 1 - rates["collector"] / rates["worlds"],
-        "least": rates["worlds"] / (rates["worlds"] + rates["still"]), **split, "memory_gib": peak_gib(env.device),
+        "least": rates["worlds"] / (rates["worlds"] + rates["still"]),
+        "actor_lost": 1 - rates["actor"] / rates["agent"], **split, "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
 
-def fly_worlds(env: DroneRacingEnv, steps: int) -> None:
-    """Step the worlds with random actions, observe, and reset where an episode ended."""
+def flying(env: DroneRacingEnv, act: Callable[[dict[str, Tensor]], Tensor]) -> Callable[[], None]:
+    """Fly the worlds in plain tensors: act on what is seen, step, reset where an episode ended, see."""
     worlds = env.worlds
-    observe = worlds.render if env.from_pixels else worlds.vector
-    for _ in range(steps):
-        outcome = worlds.step(env.action_spec.rand())
-        observe()
-        ended = outcome.terminated | outcome.truncated
-        if ended.any():
-            worlds.reset(ended)
-            if env.from_pixels:
-                worlds.render(ended)
+    key, observe = ("pixels", worlds.render) if env.from_pixels else ("vector", worlds.vector)
+    worlds.reset()
+    seen = {key: observe(), "is_init": torch.ones(worlds.num_envs, dtype=torch.bool, device=env.device)}
+
+    def fly() -> None:
+        for _ in range(ROLLOUT):
+            outcome = worlds.step(act(seen))
+            seen[key] = observe()
+            ended = seen["is_init"] = outcome.terminated | outcome.truncated
+            if ended.any():
+                worlds.reset(ended)
+                if env.from_pixels:
+                    seen[key][ended] = worlds.render(ended)
+                else:
+                    seen[key] = observe()
+
+    return fly
 
 
 def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callable[[], None]:
@@ -177,16 +196,21 @@ def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callabl
     return collect
 
 
-def acting(env: DroneRacingEnv, size: str, options: dict[str, Any]) -> Callable[[], Any]:
-    """Collect with a DreamerV3 policy that carries its recurrent state, as the recipe does."""
-    from dreamer_racing.learner import DreamerLearner, LearnerConfig
-    from dreamer_racing.modules import Interface
+def make_policy(env: DroneRacingEnv, size: str) -> DreamerPolicy:
+    """Make an untrained agent's policy."""
+    return DreamerLearner(size, Interface.of(env), LearnerConfig(), str(env.device)).policy()
 
-    learner = DreamerLearner(size, Interface.of(env), LearnerConfig(), str(env.device))
-    policy = learner.policy()
-    flying = TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer()))
-    rollouts = iter(Collector(flying, policy, **options))
-    return lambda: next(rollouts)
+
+def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[str, Tensor]], Tensor]:
+    """Act in plain tensors, with the policy's networks and the recurrent state that an environment begins with."""
+    memory = {key: beginning.get(key) for key in ("belief", "state", "previous_action")}
+
+    def act(seen: dict[str, Tensor]) -> Tensor:
+        action, memory["belief"], memory["state"] = policy.act({**seen, **memory})
+        memory["previous_action"] = action
+        return action
+
+    return act
 
 
 def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.device | None = None) -> float:

@@ -12,16 +12,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from dreamer_racing.envs.partial_reset import MergesImagesByRow
 from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
 from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.race import RaceStep
 from dreamer_racing.envs.simulator import check_device
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 
 
-class DroneRacingEnv(MergesImagesByRow, EnvBase):
+class DroneRacingEnv(EnvBase):
     """N drones racing at once, in one process, without ParallelEnv.
 
     Args:
@@ -111,52 +109,73 @@ class DroneRacingEnv(MergesImagesByRow, EnvBase):
         mask = tensordict.get("_reset", None) if tensordict is not None else None
         mask = None if mask is None else mask.view(self.batch_size)
         self.worlds.reset(mask)
-        return self._observe(None, mask)
+        data = self._before_the_race.clone().update(self._observe())
+        if self.from_pixels:
+            data.set("pixels", self._draw(mask))
+        return data
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         outcome = self.worlds.step(tensordict["action"])
-        data = self._observe(outcome, None)
-        reward = outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm
-        data.set("reward", self._column(reward))
-        data.set("terminated", self._column(outcome.terminated))
-        data.set("truncated", self._column(outcome.truncated))
-        data.set("done", data.get("terminated") | data.get("truncated"))
-        return data
+        names = ("gates_passed", "gate_offset", "lap_time", "crash", "finished")
+        data = {
+            "reward_base": self._column(outcome.reward_base),
+            "body_rate_norm": self._column(outcome.body_rate_norm),
+            "race": self._group({name: self._column(getattr(outcome, name)) for name in names}),
+            "reward": self._column(outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm),
+            "done": self._column(outcome.terminated | outcome.truncated),
+            "terminated": self._column(outcome.terminated),
+            "truncated": self._column(outcome.truncated),
+            **self._observe(),
+        }
+        if self.from_pixels:
+            data["pixels"] = self.worlds.render()
+        return self._group(data)
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step, and begin an episode where one ended: as ``EnvBase`` does, but without merging two observations."""
+        tensordict = self.step(tensordict)
+        begin = self._step_mdp(tensordict)
+        ended = begin.get("done").squeeze(-1)
+        if ended.any():
+            self._begin(begin, ended)
+        return tensordict, begin
+
+    def _begin(self, data: TensorDictBase, ended: Tensor) -> None:
+        """Begin episodes where one ended (N,), and write what is seen then into the data of all worlds.
+
+        Those that fly on have not moved, so all are observed again, and only images are drawn and merged row by row.
+        All else, of the race or of a policy, is zero where an episode begins.
+        """
+        self.worlds.reset(ended)
+        for key, value in list(data.items(include_nested=True, leaves_only=True)):
+            if (key if isinstance(key, str) else key[0]) not in ("pixels", "vector", "privileged"):
+                data.set(key, value.masked_fill(ended.view(-1, *[1] * (value.ndim - 1)), 0))
+        data.update(self._observe())
+        if self.from_pixels:
+            images = data.get("pixels").clone()  # the step before keeps them as its outcome
+            images[ended] = self.worlds.render(ended)
+            data.set("pixels", images)
 
     def _column(self, values: Tensor) -> Tensor:
         """(N,) → (N, 1), floats as float32."""
         values = values.unsqueeze(-1)
         return values.float() if values.is_floating_point() else values
 
-    def _observe(self, outcome: RaceStep | None, mask: Tensor | None) -> TensorDict:
-        """Everything but reward and done; after a reset (no outcome) the race's entries are zero."""
-        if outcome is None:
-            data = self._before_the_race.clone()
-        else:
-            race = {
-                name: self._column(getattr(outcome, name))
-                for name in ("gates_passed", "gate_offset", "lap_time", "crash", "finished")
-            }
-            data = TensorDict(
-                {
-                    "reward_base": self._column(outcome.reward_base),
-                    "body_rate_norm": self._column(outcome.body_rate_norm),
-                    "race": TensorDict(race, self.batch_size, device=self.device),
-                },
-                self.batch_size,
-                device=self.device,
-            )
-        vector = self.worlds.vector()
+    def _group(self, data: dict[str, Any]) -> TensorDict:
+        return TensorDict(data, self.batch_size, device=self.device)
+
+    def _observe(self) -> dict[str, Any]:
+        """What the worlds' states show now, without images."""
+        data: dict[str, Any] = {}
+        if not self.from_pixels or self.privileged:
+            vector = self.worlds.vector()
         if not self.from_pixels:
-            data.set("vector", vector)
+            data["vector"] = vector
         if self.privileged:
-            privileged = {**self.worlds.privileged(), "vector": vector}
-            data.set("privileged", TensorDict(privileged, self.batch_size, device=self.device))
-        if self.from_pixels:
-            data.set("pixels", self._pixels(mask))
+            data["privileged"] = self._group({**self.worlds.privileged(), "vector": vector})
         return data
 
-    def _pixels(self, mask: Tensor | None) -> Tensor:
+    def _draw(self, mask: Tensor | None) -> Tensor:
         """Images of all worlds (N, H, W, 3); after a partial reset only those rows are drawn, the rest is blank."""
         images = self.worlds.render(mask)
         if mask is None:

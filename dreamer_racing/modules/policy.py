@@ -5,9 +5,12 @@ Shape legend: N environments, A action, D belief, S state.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
@@ -57,19 +60,29 @@ class DreamerPolicy(TensorDictModuleBase):
         """
         batch = tensordict.batch_size
         flat = {key: tensordict.get(key).reshape(-1, *tensordict.get(key).shape[len(batch) :]) for key in self.in_keys}
-        belief, state = self.rssm.observe_step(
-            self.encoder(flat),
-            flat["previous_action"],
-            flat["is_init"].flatten(),
-            flat["belief"],
-            flat["state"],
-            deterministic=self.deterministic,
-        )
-        policy = self.actor(join_features(belief, state))
-        action = (policy.mode() if self.deterministic else policy.sample()).clamp(-1.0, 1.0)
+        action, belief, state = self.act(flat)
         for key, value in zip(self.out_keys, (action, belief, state, action), strict=True):
             tensordict.set(key, value.reshape(*batch, -1))
         return tensordict
+
+    @torch.no_grad()
+    def act(self, seen: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return action (N, A), belief (N, D) and state (N, S), in plain tensors.
+
+        Args:
+            seen: What is read, by key, with one batch dimension.
+        """
+        belief, state = self.rssm.observe_step(
+            self.encoder(seen),
+            seen["previous_action"],
+            seen["is_init"].flatten(),
+            seen["belief"],
+            seen["state"],
+            deterministic=self.deterministic,
+        )
+        policy = self.actor(join_features(belief, state))
+        action = policy.mode() if self.deterministic else policy.sample()
+        return action.clamp(-1.0, 1.0), belief, state
 
     def make_primer(self, device: torch.device | str = "cpu") -> TensorDictPrimer:
         """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size.

@@ -1,6 +1,8 @@
-"""Images merged by row are those that TorchRL's own merge gives."""
+"""Partial resets: what is seen after them is what TorchRL's own merge gives."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
@@ -8,13 +10,17 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.envs.partial_reset import MergesImagesByRow, TransformedPixelEnv
+from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 
 
-class StockMerge(DroneRacingEnv):
-    """The environment with TorchRL's merge."""
+class StockSteps(DroneRacingEnv):
+    """The environment with TorchRL's steps and resets."""
 
-    _reset_proc_data = EnvBase._reset_proc_data
+    step_and_maybe_reset = EnvBase.step_and_maybe_reset
+
+
+def make(kind: type[DroneRacingEnv] = DroneRacingEnv, **settings: Any) -> DroneRacingEnv:
+    return kind("kidney", 4, seed=3, **{"privileged": False, "renderer": "warp", "num_threads": 1, **settings})
 
 
 def flight(env: EnvBase, steps: int = 12) -> list[TensorDict]:
@@ -28,15 +34,10 @@ def flight(env: EnvBase, steps: int = 12) -> list[TensorDict]:
     return flown
 
 
-@pytest.mark.parametrize("transformed", [False, True])
-def test_images_are_those_of_torchrls_merge(transformed: bool) -> None:
-    def make(kind: type[DroneRacingEnv], wrapper: type[TransformedEnv]) -> EnvBase:
-        env = kind("kidney", 4, seed=3, privileged=False, renderer="warp", num_threads=1)
-        return wrapper(env, InitTracker()) if transformed else env
-
-    ours, stock = make(DroneRacingEnv, TransformedPixelEnv), make(StockMerge, TransformedEnv)
+def assert_same_flights(ours: EnvBase, stock: EnvBase) -> None:
     partial = 0
     for one, other in zip(flight(ours, 60), flight(stock, 60), strict=True):
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
         assert (one == other).all()
         done = one.get(("next", "done"), torch.zeros(4, 1, dtype=torch.bool))
         partial += bool(done.any() and not done.all())
@@ -45,8 +46,18 @@ def test_images_are_those_of_torchrls_merge(transformed: bool) -> None:
     stock.close()
 
 
-def test_the_step_before_keeps_its_images() -> None:
-    env = DroneRacingEnv("kidney", 4, seed=3, privileged=False, renderer="warp", num_threads=1)
+@pytest.mark.parametrize("settings", [{"from_pixels": False}, {"from_pixels": False, "privileged": True}, {}], ids=str)
+def test_steps_are_those_of_torchrl(settings: dict[str, Any]) -> None:
+    assert_same_flights(make(**settings), make(StockSteps, **settings))
+
+
+def test_images_are_those_of_torchrls_merge() -> None:
+    assert_same_flights(TransformedPixelEnv(make(), InitTracker()), TransformedEnv(make(), InitTracker()))
+
+
+@pytest.mark.parametrize("transformed", [False, True])
+def test_the_step_before_keeps_its_images(transformed: bool) -> None:
+    env = TransformedPixelEnv(make(), InitTracker()) if transformed else make()
     step = env.rand_step(env.reset())
     kept = step["next", "pixels"].clone()
     root = step["next"].clone(False).set("_reset", torch.tensor([[True], [False], [True], [False]]))
@@ -54,5 +65,4 @@ def test_the_step_before_keeps_its_images() -> None:
     assert torch.equal(step["next", "pixels"], kept)
     assert torch.equal(merged[1::2], kept[1::2])
     assert (merged[::2] != kept[::2]).flatten(1).any(1).all()
-    assert issubclass(type(env), MergesImagesByRow)
     env.close()
