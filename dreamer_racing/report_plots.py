@@ -19,7 +19,9 @@ from dreamer_racing.plotting import FAINT, INK, MUTED, SPEED_COLORS, draw_flight
 from dreamer_racing.protocol import MODES, Result
 
 MODE_COLORS = {"deterministic": "#2f5fb3", "stochastic": "#f2b705"}
-CAUSE_COLORS = dict(zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd"), strict=True))
+CAUSE_COLORS = dict(
+    zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd", "#f2b705"), strict=True)
+)
 SIGHT_COLORS = ("#2f5fb3", "#7bc043", "#c2255c")
 
 

@@ -84,6 +84,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             privileged=reads_privileged,
             start_beyond_gate=env.start_beyond_gate,
             start_on_line=env.start_on_line,
+            miss_radius=env.miss_radius,
             device=env.device,
             looks=env.looks,
             seed=config.seed,

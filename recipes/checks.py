@@ -51,6 +51,7 @@ RANGES = {
     "env.control_rate": Range(MIN_CONTROL_RATE),
     "env.start_beyond_gate": SHARE,
     "env.start_on_line": SHARE,
+    "env.miss_radius": NOT_NEGATIVE,
     "model.batch_size": Range(1),
     "model.batch_length": Range(2),
     "model.replay_ratio": POSITIVE,
@@ -106,6 +107,7 @@ RACE_ONLY = {
     "env.control_rate": 50.0,
     "env.start_beyond_gate": 0.0,
     "env.start_on_line": 0.0,
+    "env.miss_radius": 0.0,
     "evaluation.start_noise": 0.0,
 }
 """Settings that other suites have no use for, with the defaults at which they must be left."""

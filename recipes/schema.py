@@ -21,6 +21,7 @@ class EnvConfig:
     episode_steps: int | None = None  # control steps of a training episode; null: those of 20 s
     start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
     start_on_line: float = 0.0  # share of training episodes that begin in flight on a planned racing line
+    miss_radius: float = 0.0  # m; training episodes end where a gate is missed by less than this; 0: they go on
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)

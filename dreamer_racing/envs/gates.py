@@ -7,6 +7,7 @@ counted in segments (1.5 is the middle of the second segment):
 
 * a race gate's plane is crossed inside the frame's outer square: through the margin-reduced opening in the direction
   of flight (a pass if it is the target gate, else nothing), through it backwards (crash), or anywhere else (crash);
+* if misses end episodes: the target gate's plane is crossed in the direction of flight beside its frame (crash);
 * the free box is left: the ground at 0.05 m, or the track's bounding box (crash);
 * the position is not finite (crash).
 
@@ -40,6 +41,7 @@ class CrashCause(enum.IntEnum):
     OUT_OF_BOUNDS = 4
     NON_FINITE_STATE = 5
     INVALID_ACTION = 6
+    GATE_MISSED = 7
 
 
 class GateSweep(NamedTuple):
@@ -74,6 +76,8 @@ class GateSweeper:
         track: the track; only its race gates, shape and bounding box matter.
         device: where paths will be.
         dtype: floating-point type of the paths.
+        miss_radius: the target gate's plane may not be crossed beside its frame less than this from its centre (to any
+            side), m; 0 allows it.
 
     Example:
         >>> sweeper = GateSweeper(load_track("circle"))
@@ -82,7 +86,13 @@ class GateSweeper:
         tensor([True])
     """
 
-    def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32):
+    def __init__(
+        self,
+        track: Track,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+        miss_radius: float = 0.0,
+    ):
         x, y, z = track.gate_positions(device, torch.float64).unbind(1)
         yaw = track.gate_yaws(device, torch.float64)
         cos, sin = yaw.cos(), yaw.sin()
@@ -99,6 +109,8 @@ class GateSweeper:
         )
         self._half_opening = track.shape.pass_half_width
         self._half_outer = track.shape.outer / 2
+        self._miss_radius = miss_radius
+        self._gates = torch.arange(len(x), device=device).view(-1, 1, 1)
 
         low_x, low_y, low_z = track.bounds_low
         floor = max(low_z, GROUND_HEIGHT)
@@ -114,6 +126,7 @@ class GateSweeper:
                 CrashCause.NON_FINITE_STATE,
                 *(wall, wall, floor_cause),
                 *(wall, wall, wall),
+                CrashCause.GATE_MISSED,
             ],
             device=device,
         )
@@ -143,12 +156,17 @@ class GateSweeper:
         through = crossings.crossed & (offset < self._half_opening)
         into_frame = crossings.crossed & (offset < self._half_outer) & ~through
         pass_time, pass_offset = self._first_pass(crossings, through, target_gate)
-        crash_time, crash = self._first_crash(
-            _first(into_frame, crossings.time),
-            _first(through & ~crossings.forward, crossings.time),
-            _first(~(finite[:-1] & finite[1:]), segment),
+        crash_times = [
+            _first(into_frame, crossings.time).unsqueeze(0),
+            _first(through & ~crossings.forward, crossings.time).unsqueeze(0),
+            _first(~(finite[:-1] & finite[1:]), segment).unsqueeze(0),
             self._leave_box(position, segment),
-        )
+        ]
+        if self._miss_radius:
+            beside = crossings.crossed & (offset >= self._half_outer) & (offset < self._miss_radius)
+            missed = beside & crossings.forward & (self._gates == target_gate)
+            crash_times.append(_first(missed, crossings.time).unsqueeze(0))
+        crash_time, crash = self._first_crash(torch.cat(crash_times))
         passed = pass_time < crash_time
         return GateSweep(passed, torch.where(passed, pass_offset, 0.0), crash)
 
@@ -197,14 +215,12 @@ class GateSweeper:
         time = torch.where(leaving, segment + before / (before - after), math.inf)
         return time.amin(1)
 
-    def _first_crash(
-        self, frame: torch.Tensor, backwards: torch.Tensor, non_finite: torch.Tensor, box: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the earliest of the times (N,), (N,), (N,) and (6, N), and its cause, both (N,).
+    def _first_crash(self, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the earliest of the times (rows, N) of the causes, and its cause, both (N,).
 
         Of causes at the same time the first row wins.
         """
-        time, row = torch.cat((torch.stack((frame, backwards, non_finite)), box)).min(0)
+        time, row = times.min(0)
         return time, torch.where(time.isfinite(), self._causes[row], int(CrashCause.NONE))
 
 

@@ -65,6 +65,7 @@ class Race:
         control_dt: duration of a control step, s.
         device: where all tensors live.
         dtype: floating-point type of positions and rewards.
+        miss_radius: see `GateSweeper`.
 
     Example:
         >>> race = Race(load_track("circle"), num_envs=1)
@@ -87,13 +88,14 @@ class Race:
         control_dt: float = 0.02,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
+        miss_radius: float = 0.0,
     ):
         self.track = track
         self.weights = weights or RewardWeights()
         self.episode_steps = episode_steps or round(EPISODE_TIME / control_dt)
         self.laps = laps
         self.control_dt = control_dt
-        self._sweep = GateSweeper(track, device, dtype)
+        self._sweep = GateSweeper(track, device, dtype, miss_radius)
         self._gate_positions = track.gate_positions(device, dtype)
         self._dtype = dtype
 

@@ -49,6 +49,8 @@ class RaceWorlds:
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
+        miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
+            and less than so far from its centre, m; if 0 the drone flies on.
         control_rate: actions a second, Hz; if None the preset's, 50.
 
     Raises:
@@ -82,12 +84,19 @@ class RaceWorlds:
         start_beyond_gate: float = 0.0,
         start_on_line: float = 0.0,
         start_noise: float = 0.0,
+        miss_radius: float = 0.0,
         control_rate: float | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
         check_device(device)
         self.track = load_track(track)
+        frame = self.track.shape.outer / 2
+        if miss_radius and not miss_radius > frame:
+            raise ValueError(
+                f"miss_radius={miss_radius}: a gate is missed beyond its frame, more than {frame:g} m from the centre; "
+                "0 lets drones that miss fly on."
+            )
         self.num_envs = num_envs
         self.evaluation = evaluation
         self.camera = camera or Camera()
@@ -118,6 +127,7 @@ class RaceWorlds:
             laps=self.track.laps if evaluation else None,
             control_dt=self.parameters.control_dt,
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
+            miss_radius=0.0 if evaluation else miss_radius,
         )
         self._vector = RaceVector(self.track, self.device, self.dtype)
         if not 0.0 <= start_on_line <= 1.0:

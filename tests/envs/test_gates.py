@@ -14,7 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from dreamer_racing.envs.gates import CrashCause, GateSweep, GateSweeper
 from dreamer_racing.envs.tracks import GROUND_HEIGHT, Gate, Track, load_track, make_track
 
-NONE, FRAME, BACKWARDS, GROUND, OUTSIDE, NON_FINITE, INVALID = (int(cause) for cause in CrashCause)
+NONE, FRAME, BACKWARDS, GROUND, OUTSIDE, NON_FINITE, INVALID, MISSED = (int(cause) for cause in CrashCause)
 HALF_OPENING, HALF_OUTER = 0.65, 1.025  # m: 1.5 / 2 less the margin of 0.1, and 2.05 / 2
 
 # Gate 0 faces +x, so that a point's x is its distance beyond the plane; gate 1 is far away.
@@ -27,10 +27,10 @@ PLAIN = make_track(
 )
 
 
-def sweep(track: Track, points, target: int = 0) -> GateSweep:
+def sweep(track: Track, points, target: int = 0, miss_radius: float = 0.0) -> GateSweep:
     """Sweep one drone, float64; the result is plain Python numbers."""
     path = torch.tensor(points, dtype=torch.float64).unsqueeze(1)
-    result = GateSweeper(track, dtype=torch.float64)(path, torch.tensor([target]))
+    result = GateSweeper(track, dtype=torch.float64, miss_radius=miss_radius)(path, torch.tensor([target]))
     return GateSweep(*(value.item() for value in result))
 
 
@@ -83,6 +83,30 @@ def test_zones_of_a_gate(axis, sign, distance, forward, backward):
 def test_corner_of_the_opening_is_square():
     assert sweep(PLAIN, [(-0.1, 0.64, 3.64), (0.1, 0.64, 3.64)]).passed
     assert sweep(PLAIN, [(-0.1, 1.02, 4.02), (0.1, 1.02, 4.02)]).crash == FRAME
+
+
+@pytest.mark.parametrize(
+    ("distance", "cause"),
+    [(0.0, NONE), (0.64, NONE), (0.66, FRAME), (1.02, FRAME), (1.03, MISSED), (2.9, MISSED), (3.1, NONE)],
+)
+@pytest.mark.parametrize("axis", [1, 2])
+def test_misses_that_end_episodes(axis, distance, cause):
+    before, after = [-0.1, 0.0, 5.0], [0.1, 0.0, 5.0]
+    before[axis] += distance
+    after[axis] += distance
+    high = dataclasses.replace(PLAIN, gates=(Gate((0.0, 0.0, 5.0), 0.0), PLAIN.gates[1]))
+    there = sweep(high, [before, after], miss_radius=3.0)
+    assert (there.passed, there.crash) == (distance < HALF_OPENING, cause)
+    if cause == MISSED:
+        assert sweep(high, [after, before], miss_radius=3.0).crash == NONE  # on the way back to try again
+        assert sweep(high, [before, after], target=1, miss_radius=3.0).crash == NONE
+
+
+def test_a_pass_is_no_miss_of_the_same_step():
+    # Through the opening, back beside the gate, and across its plane again: what comes after the pass was a miss.
+    around = [(-0.1, 0, 3), (0.1, 0, 3), (0.1, 2, 3), (-0.1, 2, 3), (0.1, 2, 3)]
+    assert sweep(PLAIN, around[:4], miss_radius=3.0) == (True, 0.0, NONE)
+    assert sweep(PLAIN, around[2:], miss_radius=3.0) == (False, 0.0, MISSED)
 
 
 @pytest.mark.parametrize("gate", range(7))
@@ -207,7 +231,7 @@ def test_wrong_shapes_are_refused():
 
 def test_nothing_waits_for_the_host():
     with FakeTensorMode(allow_non_fake_inputs=True):  # refuses whatever needs a value: item, bool, nonzero
-        sweeper = GateSweeper(load_track("split_s"))
+        sweeper = GateSweeper(load_track("split_s"), miss_radius=3.0)
         assert sweeper(torch.zeros(11, 8, 3), torch.zeros(8, dtype=torch.int64)).crash.shape == (8,)
 
 
@@ -218,8 +242,8 @@ def test_gpu_agrees_with_cpu_and_never_synchronises():
     target = torch.randint(track.num_gates, (4096,), generator=generator)
     steps = 0.3 * torch.randn(11, 4096, 3, generator=generator, dtype=torch.float64)
     path = track.gate_positions(dtype=torch.float64)[target] + steps
-    expected = GateSweeper(track, dtype=torch.float64)(path, target)
-    sweeper = GateSweeper(track, "cuda", torch.float64)
+    expected = GateSweeper(track, dtype=torch.float64, miss_radius=3.0)(path, target)
+    sweeper = GateSweeper(track, "cuda", torch.float64, miss_radius=3.0)
     path, target = path.cuda(), target.cuda()
     torch.cuda.set_sync_debug_mode("error")
     try:

@@ -15,6 +15,7 @@ from dreamer_racing.envs.pilot import ScriptedPilot
 from dreamer_racing.envs.quadrotor import GRAVITY, load_preset, without_randomisation
 from dreamer_racing.envs.race import Race, RaceStep
 from dreamer_racing.envs.racing_line import plan_racing_line
+from dreamer_racing.envs.rewards import RewardWeights
 from dreamer_racing.envs.rotation import rotate
 from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
@@ -509,6 +510,41 @@ def test_evaluation_never_begins_on_the_line():
     worlds = RaceWorlds("circle", 3, evaluation=True, from_pixels=False, start_on_line=1.0)
     worlds.reset()
     assert worlds.simulator.state.linear_velocity.eq(0).all()
+
+
+@pytest.mark.parametrize(("evaluation", "ends"), [(False, True), (True, False)])
+def test_a_missed_gate_ends_training_episodes_only(evaluation, ends):
+    worlds = RaceWorlds("circle", 1, from_pixels=False, evaluation=evaluation, miss_radius=3.0, seed=0)
+    worlds.reset()
+    beside = torch.tensor([4.0, 0.0, 3.35], dtype=worlds.dtype)  # 2 m above gate 0, which is flown along y
+    path = torch.stack([beside - torch.tensor([0, 0.1, 0]), beside + torch.tensor([0, 0.1, 0])]).unsqueeze(1)
+    worlds.race.target_gate.zero_()
+    outcome = worlds.race.step(path, torch.zeros(1, 3), torch.tensor([False]))
+    assert outcome.terminated.item() is ends
+    assert outcome.crash.item() == (CrashCause.GATE_MISSED if ends else CrashCause.NONE)
+    if ends:
+        assert outcome.reward_base.item() == RewardWeights().collision
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_a_good_lap_misses_no_gate(name):
+    worlds = RaceWorlds(name, 4, from_pixels=False, miss_radius=3.0, seed=0)
+    worlds.reset()
+    pilot = ScriptedPilot(worlds.track, dtype=worlds.dtype)
+    for _ in range(450):
+        state = worlds.simulator.state
+        action = pilot.act(
+            state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate
+        )
+        outcome = worlds.step(action)
+        assert not (outcome.crash == CrashCause.GATE_MISSED).any()
+    assert (outcome.gates_passed >= worlds.track.num_gates).all()
+    worlds.close()
+
+
+def test_a_miss_is_beyond_the_frame():
+    with pytest.raises(ValueError, match=r"miss_radius=0.5: .* more than 1.025 m"):
+        RaceWorlds("circle", 1, from_pixels=False, miss_radius=0.5)
 
 
 def test_half_the_control_rate_flies_twice_as_far_a_step_and_ends_after_the_same_time():
