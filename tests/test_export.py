@@ -528,7 +528,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "first run"
     done = recipe(
         "dreamer_v3", "track=circle", "model=debug", "loss=privileged", "env.preset=faithful", "env.camera_tilt=30",
-        "env.image_size=32",
+        "env.image_size=32", "env.control_rate=40",
         "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000", "evaluation.every=0",
         f"run_dir='{directory}'", cwd=directory.parent,
     )  # fmt: skip
@@ -549,6 +549,7 @@ def test_the_recipe_exports_a_run(run_dir: Path) -> None:
     ):
         assert words in done.stdout
     contract = json.loads((folder / "contract.json").read_text())
+    assert contract["control"] == {"rate_hz": 40.0, "period_s": 0.025}
     assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == 0.02
     assert contract["source"]["env_steps"] == 160 and contract["verification"]["episodes"] >= 4
     assert (contract["camera"]["width_px"], contract["camera"]["height_px"]) == (32, 32)
