@@ -54,6 +54,8 @@ class LearnerConfig:
         behavior_lr: Learning rate of actor and critic; None for the same. A lower one lets the world model get ahead of
             the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
         warmup_updates: Updates over which the learning rate rises from zero.
+        decay_updates: Updates, from the first, over which both rates fall linearly; None for never.
+        decay_to: What is left of the rates then.
         world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
 
     Reference: danijar/dreamerv3, ``configs.yaml``; horizon 16 from the paper, Section III.
@@ -85,6 +87,8 @@ class LearnerConfig:
     lr: float = 4e-5
     behavior_lr: float | None = None
     warmup_updates: int = 1000
+    decay_updates: int | None = None
+    decay_to: float = 0.25
     world_model_loss: str = "reconstruction"
     actor_loss: str = "reinforce"
     critic_loss: str = "two_hot"
@@ -225,6 +229,7 @@ class DreamerLearner:
             ).to(self.device)
         self._networks = self._trained_parameters()
         self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
+        self._rates = [group["lr"] for group in self._groups]
         self.updates = 0
         self._timed: Timer = untimed
         self._compute = self.compute_losses
@@ -255,12 +260,21 @@ class DreamerLearner:
         metrics = self._step(batch)
         self._guard.check(metrics, batch)
         with timed("optimise"):
+            self._decay_rates()
             self.optimizer.step()
             self.agent.critic.update_slow(self.config.slow_critic_rate)
             if not self.config.cuda_graph:
                 self.optimizer.zero_grad(set_to_none=True)
         self.updates += 1
         return metrics
+
+    def _decay_rates(self) -> None:
+        config = self.config
+        if config.decay_updates is None:
+            return
+        left = 1.0 - (1.0 - config.decay_to) * min(1.0, self.updates / config.decay_updates)
+        for group, rate in zip(self._groups, self._rates, strict=True):
+            group["lr"] = rate * left
 
     def check_finite(self) -> None:
         """Wait for the latest updates, so that nothing bad is saved.

@@ -143,6 +143,8 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         lr=model.learning_rate,
         behavior_lr=model.behavior_learning_rate,
         warmup_updates=model.warmup_updates,
+        decay_updates=model.decay_updates,
+        decay_to=model.decay_to,
         compile=model.compile,
         cuda_graph=model.cuda_graph,
         mixed_precision=bool(model.mixed_precision),

@@ -58,6 +58,8 @@ RANGES = {
     "model.learning_rate": POSITIVE,
     "model.behavior_learning_rate": POSITIVE,
     "model.warmup_updates": NOT_NEGATIVE,
+    "model.decay_updates": Range(1),
+    "model.decay_to": SHARE,
     "model.imagination_horizon": Range(1),
     "model.imagination_starts": Range(1),
     "loss.discount": SHARE,

@@ -44,6 +44,8 @@ class ModelConfig:
     compile: bool = False  # torch.compile of the losses
     cuda_graph: bool = False  # forward and backward as one CUDA graph
     warmup_updates: int = MISSING  # over which the learning rate rises from zero
+    decay_updates: int | None = None  # over which both rates fall linearly, from the first update; null: they stay
+    decay_to: float = 0.25  # what is left of them then
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
 

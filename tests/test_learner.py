@@ -349,3 +349,17 @@ def test_rates_are_the_settings_of_the_learner_that_goes_on():
     assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6]
     assert {group["warmup_steps"] for group in other.optimizer.param_groups} == {7}
     assert other.updates == 1
+
+
+def test_rates_fall_from_the_first_update_on_also_after_a_restart():
+    config = replace(CONFIG, lr=1e-3, behavior_lr=4e-4, decay_updates=4, decay_to=0.5)
+    learner = DreamerLearner("debug", config=config, seed=0)
+    rates = []
+    for _ in range(6):
+        learner.update(make_batch())
+        rates.append([group["lr"] for group in learner.optimizer.param_groups])
+        restarted = DreamerLearner("debug", config=config, seed=1)
+        restarted.load_state_dict(copy.deepcopy(learner.state_dict()))
+        learner = restarted
+    left = torch.tensor([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
+    torch.testing.assert_close(torch.tensor(rates), left[:, None] * torch.tensor([1e-3, 4e-4]))

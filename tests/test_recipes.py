@@ -451,6 +451,7 @@ def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
     tuned = compose("dreamer_v3", "+tuned=cpu")
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
+    assert (tuned.env.miss_radius, tuned.model.decay_updates) == (3, 8000)
     changed = compose("dreamer_v3", "+tuned=cpu", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
