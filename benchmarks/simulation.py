@@ -130,9 +130,13 @@ def measure(
         **settings,
     )
     batch = ROLLOUT * num_envs
-    # the device said once: without it the collector takes its tensors off the device and puts them back, every step
-    options = {"frames_per_batch": batch, "total_frames": -1, "track_traj_ids": False, "no_cuda_sync": True}
-    options["device"] = env.device
+    options = {
+        "frames_per_batch": batch,
+        "total_frames": -1,
+        "track_traj_ids": False,
+        "no_cuda_sync": True,
+        "device": env.device,  # else the collector makes the data forget its device, and finds it again, every step
+    }
     collector = Collector(env, RandomPolicy(env.action_spec), **options)
     rollouts = iter(collector)
     policy = make_policy(env, actor)

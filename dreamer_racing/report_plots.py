@@ -20,7 +20,7 @@ from dreamer_racing.protocol import MODES, Result
 
 MODE_COLORS = {"deterministic": "#2f5fb3", "stochastic": "#f2b705"}
 CAUSE_COLORS = dict(
-    zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd", "#f2b705"), strict=True)
+    zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd", "#a0522d"), strict=True)
 )
 SIGHT_COLORS = ("#2f5fb3", "#7bc043", "#c2255c")
 

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
+from dreamer_racing.envs.gates import GateSweeper
 from dreamer_racing.envs.quadrotor import MIN_CONTROL_RATE, at_control_rate, load_preset
 from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
@@ -205,13 +206,14 @@ def check(config: RunConfig) -> None:
 
 
 def check_race(config: RunConfig) -> None:
-    """Refuse a control rate that the physics cannot step, and starts that cannot be.
+    """Refuse a control rate that the physics cannot step, and starts and misses that cannot be.
 
     Raises:
         ValueError: the message names the setting.
     """
     for group, check_it in (
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
+        ("env", lambda: GateSweeper(load_track(config.track), miss_radius=config.env.miss_radius)),
         ("evaluation", lambda: StartSampler(load_track(config.track), start_noise=config.evaluation.start_noise)),
     ):
         try:

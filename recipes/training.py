@@ -165,7 +165,10 @@ def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
         check_overrides(config, overrides)
-        run = build(OmegaConf.to_object(resolve(config)), overrides)
+        config = resolve(config)
+        if config.resume and (changed := changed_settings(config)):
+            print(f"resumed with other settings: {', '.join(changed)}")
+        run = build(OmegaConf.to_object(config), overrides)
     if run.learner.device.type == "cpu" and not keep_freed_memory():
         print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     try:
@@ -192,11 +195,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
         ValueError: it is another algorithm's run, or an override would make another run of it.
     """
     run_dir = latest_checkpoint(resume).parent.parent
-    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
-    trained_by = saved.get("algorithm", algorithm)
-    if trained_by != algorithm:
-        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    known = OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved)  # older runs do not say all
+    known = saved_config(algorithm, run_dir)
     for override in overrides:
         name, value = override_key(override), override.partition("=")[2]
         trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
@@ -208,6 +207,38 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     begun_with = merge_overrides(list(OmegaConf.load(run_dir / "overrides.yaml")), [f"run_dir={run_dir}"])
     merged = merge_overrides(begun_with, overrides)
     return hydra.compose(algorithm, merged), merged
+
+
+def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
+    """What a run was last trained with, resolved; what older runs do not say is at its default.
+
+    Raises:
+        ValueError: it is another algorithm's run.
+    """
+    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
+    trained_by = saved.get("algorithm", algorithm)
+    if trained_by != algorithm:
+        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
+    return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved))
+
+
+def changed_settings(config: DictConfig) -> list[str]:
+    """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
+    before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
+    return [
+        f"{name}={value} (was {before.get(name)})"
+        for name, value in flat_settings(config).items()
+        if value != before.get(name) and name not in ("resume", "run_dir")
+    ]
+
+
+def flat_settings(config: DictConfig) -> dict[str, Any]:
+    """Values by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        inner = flat_settings(value) if isinstance(value, DictConfig) else None
+        flat |= {str(name): value} if inner is None else {f"{name}.{key}": leaf for key, leaf in inner.items()}
+    return flat
 
 
 def train(run: Run) -> None:

@@ -283,6 +283,7 @@ REFUSED = [
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
+    (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
     (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
@@ -457,17 +458,19 @@ def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
 
 
 def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_path: Path) -> None:
-    options = ["env.control_rate=25", "env.start_on_line=0.5", "evaluation.start_noise=1", "evaluation.episodes=3"]
+    options = ["env.control_rate=25", "env.start_on_line=0.5", "env.miss_radius=2", "evaluation.start_noise=1"]
+    options.append("evaluation.episodes=3")
     resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *TINY, *options, "env.episode_steps=null"))
     assert resolved.env.episode_steps == 500
     config, arena = OmegaConf.to_object(resolved), recipe_module("arena")
     env = arena.make_env(config)
     assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
-    assert env.worlds._starts._on_line == 0.5
+    assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
     learner = arena.make_learner(config, Interface.of(env), "cpu")
     env.close()
     report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
     assert report._base.worlds.parameters.control_dt == 0.04
+    assert report._base.worlds.race._sweep._miss_radius == 0
     assert report._base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
     assert len({episode.reward_sum for episode in report.evaluate(deterministic=True).episodes}) == 3
     report.close()
@@ -481,3 +484,12 @@ def test_a_run_goes_on_at_its_control_rate(run_dir: Path) -> None:
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         config, _ = resumed("dreamer_v3", str(run_dir), ["env.control_rate=50"])
     assert config.env.control_rate == 50
+
+
+def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:
+    training = recipe_module("training")
+    config = training.saved_config("dreamer_v3", run_dir)
+    config.run_dir = str(run_dir)
+    assert training.changed_settings(config) == []
+    config.loss.discount, config.model.decay_updates = 0.9, 8  # by an override, or by another version's defaults
+    assert training.changed_settings(config) == ["model.decay_updates=8 (was None)", "loss.discount=0.9 (was 0.997)"]

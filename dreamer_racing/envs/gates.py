@@ -76,8 +76,11 @@ class GateSweeper:
         track: the track; only its race gates, shape and bounding box matter.
         device: where paths will be.
         dtype: floating-point type of the paths.
-        miss_radius: the target gate's plane may not be crossed beside its frame less than this from its centre (to any
-            side), m; 0 allows it.
+        miss_radius: the target gate's plane may not be crossed beside its frame and less than this from its centre, m;
+            0 allows it.
+
+    Raises:
+        ValueError: a miss radius within the frame.
 
     Example:
         >>> sweeper = GateSweeper(load_track("circle"))
@@ -109,6 +112,11 @@ class GateSweeper:
         )
         self._half_opening = track.shape.pass_half_width
         self._half_outer = track.shape.outer / 2
+        if miss_radius and not miss_radius > self._half_outer:
+            raise ValueError(
+                f"miss_radius={miss_radius}: a gate is missed beyond its frame, more than {self._half_outer:g} m from "
+                "the centre; 0 lets drones that miss fly on."
+            )
         self._miss_radius = miss_radius
         self._gates = torch.arange(len(x), device=device).view(-1, 1, 1)
 
@@ -163,8 +171,9 @@ class GateSweeper:
             self._leave_box(position, segment),
         ]
         if self._miss_radius:
-            beside = crossings.crossed & (offset >= self._half_outer) & (offset < self._miss_radius)
-            missed = beside & crossings.forward & (self._gates == target_gate)
+            near = torch.hypot(crossings.left, crossings.up) < self._miss_radius
+            beside = crossings.crossed & crossings.forward & (offset >= self._half_outer) & near
+            missed = beside & (self._gates == target_gate) & (crossings.time < pass_time)
             crash_times.append(_first(missed, crossings.time).unsqueeze(0))
         crash_time, crash = self._first_crash(torch.cat(crash_times))
         passed = pass_time < crash_time

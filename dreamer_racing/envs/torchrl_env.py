@@ -31,7 +31,7 @@ class DroneRacingEnv(EnvBase):
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and of the randomisation of physics and looks.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `looks`, `num_threads`, `backend`, `start_noise`, `start_on_line`, `miss_radius`,
+            `looks`, `num_threads`, `backend`, `start_beyond_gate`, `start_noise`, `start_on_line`, `miss_radius`,
             `control_rate`.
 
     Attributes:
@@ -132,30 +132,27 @@ class DroneRacingEnv(EnvBase):
             data["pixels"] = self.worlds.render()
         return self._group(data)
 
-    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Step, and begin an episode where one ended: as ``EnvBase`` does, but without merging two observations."""
-        tensordict = self.step(tensordict)
-        begin = self._step_mdp(tensordict)
-        ended = begin.get("done").squeeze(-1)
-        if ended.any():
-            self._begin(begin, ended)
-        return tensordict, begin
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Begin episodes where one ended, in place: what ``EnvBase`` does, without merging two observations.
 
-    def _begin(self, data: TensorDictBase, ended: Tensor) -> None:
-        """Begin episodes where one ended (N,), and write what is seen then into the data of all worlds.
-
-        Those that fly on have not moved, so all are observed again, and only images are drawn and merged row by row.
-        All else, of the race or of a policy, is zero where an episode begins.
+        The worlds that fly on have not moved, so all are observed again; only images are drawn and merged row by row.
+        All else, of the race or of a policy, is zero where an episode begins (``EnvBase``: unless all begin at once).
         """
+        done, images = tensordict.get("done", None), tensordict.get("pixels", None)
+        if done is None or (self.from_pixels and images is None):
+            return super().maybe_reset(tensordict)  # a caller's own data, not a step's
+        if not done.any():
+            return tensordict
+        ended = done.squeeze(-1)
         self.worlds.reset(ended)
-        for key, value in list(data.items(include_nested=True, leaves_only=True)):
-            if (key if isinstance(key, str) else key[0]) not in ("pixels", "vector", "privileged"):
-                data.set(key, value.masked_fill(ended.view(-1, *[1] * (value.ndim - 1)), 0))
-        data.update(self._observe())
+        seen = self._observe()
         if self.from_pixels:
-            images = data.get("pixels").clone()  # the step before keeps them as its outcome
-            images[ended] = self.worlds.render(ended)
-            data.set("pixels", images)
+            seen["pixels"] = images.clone()  # the step before keeps its own as its outcome
+            seen["pixels"][ended] = self.worlds.render(ended)
+        for key, value in list(tensordict.items(include_nested=True, leaves_only=True)):
+            if (key if isinstance(key, str) else key[0]) not in seen:
+                tensordict.set(key, value.masked_fill(ended.view(-1, *[1] * (value.ndim - 1)), 0))
+        return tensordict.update(seen)
 
     def _column(self, values: Tensor) -> Tensor:
         """(N,) → (N, 1), floats as float32."""
@@ -167,11 +164,10 @@ class DroneRacingEnv(EnvBase):
 
     def _observe(self) -> dict[str, Any]:
         """What the worlds' states show now, without images."""
-        data: dict[str, Any] = {}
-        if not self.from_pixels or self.privileged:
-            vector = self.worlds.vector()
-        if not self.from_pixels:
-            data["vector"] = vector
+        if self.from_pixels and not self.privileged:
+            return {}
+        vector = self.worlds.vector()
+        data: dict[str, Any] = {} if self.from_pixels else {"vector": vector}
         if self.privileged:
             data["privileged"] = self._group({**self.worlds.privileged(), "vector": vector})
         return data

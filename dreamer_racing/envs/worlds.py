@@ -50,7 +50,8 @@ class RaceWorlds:
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
         miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
-            and less than so far from its centre, m; if 0 the drone flies on.
+            and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
+            lead past it.
         control_rate: actions a second, Hz; if None the preset's, 50.
 
     Raises:
@@ -91,12 +92,6 @@ class RaceWorlds:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
         check_device(device)
         self.track = load_track(track)
-        frame = self.track.shape.outer / 2
-        if miss_radius and not miss_radius > frame:
-            raise ValueError(
-                f"miss_radius={miss_radius}: a gate is missed beyond its frame, more than {frame:g} m from the centre; "
-                "0 lets drones that miss fly on."
-            )
         self.num_envs = num_envs
         self.evaluation = evaluation
         self.camera = camera or Camera()

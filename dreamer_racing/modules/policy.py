@@ -48,7 +48,6 @@ class DreamerPolicy(TensorDictModuleBase):
         self.actor = actor
         self.deterministic = deterministic
 
-    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and the next recurrent keys.
 
@@ -70,7 +69,7 @@ class DreamerPolicy(TensorDictModuleBase):
         """Return action (N, A), belief (N, D) and state (N, S), in plain tensors.
 
         Args:
-            seen: What is read, by key, with one batch dimension.
+            seen: What is read, by the keys and shapes of the table, with one batch dimension; ``is_init`` may be (N,).
         """
         belief, state = self.rssm.observe_step(
             self.encoder(seen),

@@ -103,10 +103,17 @@ def test_misses_that_end_episodes(axis, distance, cause):
 
 
 def test_a_pass_is_no_miss_of_the_same_step():
-    # Through the opening, back beside the gate, and across its plane again: what comes after the pass was a miss.
+    # Through the opening, back beside the gate, and across its plane again, when it is no longer the target.
     around = [(-0.1, 0, 3), (0.1, 0, 3), (0.1, 2, 3), (-0.1, 2, 3), (0.1, 2, 3)]
-    assert sweep(PLAIN, around[:4], miss_radius=3.0) == (True, 0.0, NONE)
+    assert sweep(PLAIN, around, miss_radius=3.0) == (True, 0.0, NONE)
     assert sweep(PLAIN, around[2:], miss_radius=3.0) == (False, 0.0, MISSED)
+
+
+def test_the_radius_of_a_miss_is_round():
+    def beside(left: float, up: float) -> int:
+        return sweep(PLAIN, [(-0.1, left, 3 + up), (0.1, left, 3 + up)], miss_radius=3.0).crash
+
+    assert (beside(2.9, 0.0), beside(2.0, 2.0), beside(2.5, 2.5)) == (MISSED, MISSED, NONE)
 
 
 @pytest.mark.parametrize("gate", range(7))

@@ -14,9 +14,9 @@ from dreamer_racing.envs.partial_reset import TransformedPixelEnv
 
 
 class StockSteps(DroneRacingEnv):
-    """The environment with TorchRL's steps and resets."""
+    """The environment with TorchRL's resets between steps."""
 
-    step_and_maybe_reset = EnvBase.step_and_maybe_reset
+    maybe_reset = EnvBase.maybe_reset
 
 
 def make(kind: type[DroneRacingEnv] = DroneRacingEnv, **settings: Any) -> DroneRacingEnv:
@@ -24,11 +24,14 @@ def make(kind: type[DroneRacingEnv] = DroneRacingEnv, **settings: Any) -> DroneR
 
 
 def flight(env: EnvBase, steps: int = 12) -> list[TensorDict]:
-    """Step with partial resets, from the same seed."""
+    """Step with partial resets, from the same seed, with a policy that remembers."""
     torch.manual_seed(0)
     data, flown = env.reset(), []
     for _ in range(steps):
         data.set("action", torch.rand(4, 4) * 2 - 1)
+        data.set("noise", torch.rand(4))
+        data.set(("next", "memory"), torch.rand(4, 2, 3))
+        data.set(("next", "agent", "age"), torch.rand(4, 1))
         step, data = env.step_and_maybe_reset(data)
         flown += [step.clone(), data.clone()]
     return flown
@@ -46,18 +49,47 @@ def assert_same_flights(ours: EnvBase, stock: EnvBase) -> None:
     stock.close()
 
 
-@pytest.mark.parametrize("settings", [{"from_pixels": False}, {"from_pixels": False, "privileged": True}, {}], ids=str)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"from_pixels": False},
+        {"from_pixels": False, "privileged": True},
+        {"from_pixels": False, "backend": "mujoco_warp"},
+        {},
+        {"privileged": True},
+        {"looks": "randomised"},
+    ],
+    ids=str,
+)
 def test_steps_are_those_of_torchrl(settings: dict[str, Any]) -> None:
     assert_same_flights(make(**settings), make(StockSteps, **settings))
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_where_all_episodes_end_at_once_a_policys_keys_are_zero_too(num_envs: int) -> None:
+    env = DroneRacingEnv("kidney", num_envs, from_pixels=False, privileged=False, seed=3, episode_steps=2)
+    data = env.reset().set("memory", torch.ones(num_envs, 2))
+    for _ in range(2):
+        data.set("action", torch.zeros(num_envs, 4))
+        step, data = env.step_and_maybe_reset(data)
+    assert step["next", "truncated"].all() and step["memory"].all()
+    assert not data["memory"].any() and not data["done"].any()
+    assert torch.equal(data["vector"], env.worlds.vector())
+
+
+def test_a_callers_own_data_is_reset_by_torchrl() -> None:
+    env = make()
+    data = env.reset().exclude("pixels").set("done", torch.tensor([[True], [False], [True], [False]]))
+    assert not env.maybe_reset(data)["done"].any()
+    env.close()
 
 
 def test_images_are_those_of_torchrls_merge() -> None:
     assert_same_flights(TransformedPixelEnv(make(), InitTracker()), TransformedEnv(make(), InitTracker()))
 
 
-@pytest.mark.parametrize("transformed", [False, True])
-def test_the_step_before_keeps_its_images(transformed: bool) -> None:
-    env = TransformedPixelEnv(make(), InitTracker()) if transformed else make()
+def test_the_step_before_keeps_its_images() -> None:
+    env = TransformedPixelEnv(make(), InitTracker())
     step = env.rand_step(env.reset())
     kept = step["next", "pixels"].clone()
     root = step["next"].clone(False).set("_reset", torch.tensor([[True], [False], [True], [False]]))
