@@ -235,9 +235,12 @@ def changed_settings(config: DictConfig) -> list[str]:
 def flat_settings(config: DictConfig) -> dict[str, Any]:
     """Values by dotted name."""
     flat: dict[str, Any] = {}
-    for name, value in config.items():
-        inner = flat_settings(value) if isinstance(value, DictConfig) else None
-        flat |= {str(name): value} if inner is None else {f"{name}.{key}": leaf for key, leaf in inner.items()}
+    for key, value in config.items():
+        name = str(key)
+        if isinstance(value, DictConfig):
+            flat |= {f"{name}.{inner}": leaf for inner, leaf in flat_settings(value).items()}
+        else:
+            flat[name] = value
     return flat
 
 
