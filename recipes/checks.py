@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from arena import is_race
 from omegaconf import DictConfig, OmegaConf
-from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
+from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, ModelConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.envs.gates import GateSweeper
@@ -60,7 +60,7 @@ RANGES = {
     "model.behavior_learning_rate": POSITIVE,
     "model.warmup_updates": NOT_NEGATIVE,
     "model.decay_updates": Range(1),
-    "model.decay_to": SHARE,
+    "model.decay_to": Range(0, 1, open_below=True),
     "model.imagination_horizon": Range(1),
     "model.imagination_starts": Range(1),
     "loss.discount": SHARE,
@@ -251,6 +251,11 @@ def check_dreamer(config: DreamerConfig) -> None:
         ValueError: the message gives the numbers and the setting to change.
     """
     check(config)
+    if config.model.decay_updates is None and config.model.decay_to != ModelConfig.decay_to:
+        raise ValueError(
+            f"model.decay_to={config.model.decay_to} has no effect without model.decay_updates, the number of updates "
+            "over which the rates fall to it."
+        )
     check_replay(config)
     check_image_size(config.env.image_size, config.model.size)
     model = config.model

@@ -43,8 +43,11 @@ class DreamerRun(ReplayRun):
     remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
 
     def measure(self) -> None:
-        """Measure the world model's errors on records that are never trained on, too."""
+        """Say the learning rates, and measure the world model's errors on records that are never trained on, too."""
         super().measure()
+        names = ("learning_rate/world_model", "learning_rate/behavior")
+        rates = (group["lr"] for group in self.learner.optimizer.param_groups)
+        self.metrics.push(dict(zip(names, rates, strict=True)))
         length = CONTEXT + self.config.model.imagination_horizon
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is not None and self.counters["updates"]:

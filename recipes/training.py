@@ -225,8 +225,12 @@ def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
 def changed_settings(config: DictConfig) -> list[str]:
     """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
     before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
+
+    def word(value: Any) -> str:
+        return "null" if value is None else str(value)
+
     return [
-        f"{name}={value} (was {before.get(name)})"
+        f"{name}={word(value)} (was {word(before.get(name))})"
         for name, value in flat_settings(config).items()
         if value != before.get(name) and name not in ("resume", "run_dir")
     ]

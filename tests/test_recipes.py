@@ -283,6 +283,7 @@ REFUSED = [
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
+    (["model.decay_to=0.1"], ["model.decay_to=0.1 has no effect without model.decay_updates"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
@@ -492,4 +493,4 @@ def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:
     config.run_dir = str(run_dir)
     assert training.changed_settings(config) == []
     config.loss.discount, config.model.decay_updates = 0.9, 8  # by an override, or by another version's defaults
-    assert training.changed_settings(config) == ["model.decay_updates=8 (was None)", "loss.discount=0.9 (was 0.997)"]
+    assert training.changed_settings(config) == ["model.decay_updates=8 (was null)", "loss.discount=0.9 (was 0.997)"]
