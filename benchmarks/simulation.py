@@ -49,6 +49,7 @@ from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.memory import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
 
 PARTS = ("physics", "race", "render")
@@ -119,6 +120,8 @@ def measure(
 ) -> dict[str, Any]:
     """Return one record."""
     torch.set_num_threads(1)
+    if settings.get("device", "cpu") == "cpu":
+        keep_freed_memory()  # as the recipes do
     env = DroneRacingEnv(
         track,
         num_envs,
