@@ -55,7 +55,7 @@ class LearnerConfig:
             the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
         warmup_updates: Updates over which the learning rate rises from zero.
         decay_updates: Updates, from the first, over which both rates fall linearly; None for never.
-        decay_to: What is left of the rates then.
+        decay_to: What share of the rates is left then [choice; docs/experiments.md, entry 13].
         world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
 
     Reference: danijar/dreamerv3, ``configs.yaml``; horizon 16 from the paper, Section III.
@@ -269,6 +269,7 @@ class DreamerLearner:
         return metrics
 
     def _decay_rates(self) -> None:
+        """Set both rates to what is left of them at this update."""
         config = self.config
         if config.decay_updates is None:
             return

@@ -43,7 +43,7 @@ class DreamerRun(ReplayRun):
     remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
 
     def measure(self) -> None:
-        """Say the learning rates, and measure the world model's errors on records that are never trained on, too."""
+        """Say the learning rates after warm-up, and measure the world model on records never trained on, too."""
         super().measure()
         names = ("learning_rate/world_model", "learning_rate/behavior")
         rates = (group["lr"] for group in self.learner.optimizer.param_groups)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +16,7 @@ from dreamer_racing.finite_guard import FiniteGuard
 from dreamer_racing.modules import Interface
 
 
-class BaselineLearner:
+class BaselineLearner(ABC):
     """Networks, one optimiser, and their state.
 
     Args:
@@ -69,9 +70,9 @@ class BaselineLearner:
         self.optimizer.param_groups[0]["lr"] = rate  # a setting of this learner, not state
         self.updates = state_dict["updates"]
 
+    @abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
         """Return what is saved."""
-        raise NotImplementedError(f"{type(self).__name__} must say what is saved.")
 
 
 @contextmanager

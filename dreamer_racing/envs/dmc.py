@@ -34,7 +34,7 @@ from torchrl.envs import EnvBase
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.task import _choose_gl_backend
 
-_choose_gl_backend()  # before dm_control is imported, which decides then
+_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
 
 import mujoco as mujoco_bindings  # noqa: E402
 from dm_control import _render, mujoco, suite  # noqa: E402

@@ -164,12 +164,11 @@ class GateSweeper:
         through = crossings.crossed & (offset < self._half_opening)
         into_frame = crossings.crossed & (offset < self._half_outer) & ~through
         pass_time, pass_offset = self._first_pass(crossings, through, target_gate)
-        crash_times = [
-            _first(into_frame, crossings.time).unsqueeze(0),
-            _first(through & ~crossings.forward, crossings.time).unsqueeze(0),
-            _first(~(finite[:-1] & finite[1:]), segment).unsqueeze(0),
-            self._leave_box(position, segment),
-        ]
+        frame = _first(into_frame, crossings.time)
+        backwards = _first(through & ~crossings.forward, crossings.time)
+        non_finite = _first(~(finite[:-1] & finite[1:]), segment)
+        # rows in the order of `_causes`
+        crash_times = [torch.stack((frame, backwards, non_finite)), self._leave_box(position, segment)]
         if self._miss_radius:
             near = torch.hypot(crossings.left, crossings.up) < self._miss_radius
             beside = crossings.crossed & crossings.forward & (offset >= self._half_outer) & near

@@ -62,7 +62,7 @@ def _loads(library: str) -> bool:
     return True
 
 
-_choose_gl_backend()  # before dm_control is imported, which decides then
+_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
 
 from dm_control import _render, mujoco  # noqa: E402
 from dm_control.mujoco import wrapper  # noqa: E402

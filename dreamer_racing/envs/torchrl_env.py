@@ -160,6 +160,7 @@ class DroneRacingEnv(EnvBase):
         return values.float() if values.is_floating_point() else values
 
     def _group(self, data: dict[str, Any]) -> TensorDict:
+        """Entries of all worlds as one TensorDict [N]."""
         return TensorDict(data, self.batch_size, device=self.device)
 
     def _observe(self) -> dict[str, Any]:
