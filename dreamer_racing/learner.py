@@ -5,8 +5,9 @@ Shape legend: B batch, T time, A action.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Protocol
 
 import torch
@@ -16,7 +17,14 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.acceleration import GraphedStep, Step
 from dreamer_racing.finite_guard import FiniteGuard
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossClass, find_loss
+from dreamer_racing.losses import (
+    ACTOR_LOSSES,
+    CRITIC_LOSSES,
+    WORLD_MODEL_LOSSES,
+    ImaginedPPOConfig,
+    LossClass,
+    find_loss,
+)
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.timing import Timer, untimed
@@ -56,6 +64,9 @@ class LearnerConfig:
         warmup_updates: Updates over which the learning rate rises from zero.
         decay_updates: Updates, from the first, over which both rates fall linearly; None for never.
         decay_to: What share of the rates is left then [choice; docs/experiments.md, entry 13].
+        average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
+            None keeps none.
+        ppo: Numbers of the actor loss of that name.
         world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
 
     Reference: danijar/dreamerv3, ``configs.yaml``; horizon 16 from the paper, Section III.
@@ -89,6 +100,8 @@ class LearnerConfig:
     warmup_updates: int = 1000
     decay_updates: int | None = None
     decay_to: float = 0.25
+    average_rate: float | None = None
+    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)
     world_model_loss: str = "reconstruction"
     actor_loss: str = "reinforce"
     critic_loss: str = "two_hot"
@@ -101,7 +114,11 @@ class Learner(Protocol):
     updates: int
 
     def policy(self, deterministic: bool = False) -> Any:
-        """Return the acting step, which shares the learner's parameters."""
+        """Return the acting step that is trained, which shares the learner's parameters."""
+        ...
+
+    def evaluation_policy(self, deterministic: bool = False) -> Any:
+        """Return the acting step to evaluate, which may be one of averaged weights."""
         ...
 
     def check_finite(self) -> None:
@@ -227,8 +244,11 @@ class DreamerLearner:
             self.losses = nn.ModuleDict(
                 {name: loss.from_config(self.agent, self.config) for name, loss in losses.items()}
             ).to(self.device)
+        self.averaged = None if self.config.average_rate is None else copy.deepcopy(self.agent).requires_grad_(False)
+        self.latents: TensorDictBase | None = None
         self._networks = self._trained_parameters()
         self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
+        self._actor_optimizer: torch.optim.Optimizer | None = getattr(self.losses["actor"], "optimizer", None)
         self._rates = [group["lr"] for group in self._groups]
         self.updates = 0
         self._timed: Timer = untimed
@@ -266,7 +286,17 @@ class DreamerLearner:
             if not self.config.cuda_graph:
                 self.optimizer.zero_grad(set_to_none=True)
         self.updates += 1
+        if self._actor_optimizer is not None:
+            with timed("improve"), self.autocast():
+                metrics |= self.losses["actor"].improve(self.updates)
+        self._average()
         return metrics
+
+    def _average(self) -> None:
+        """Move the averaged weights; while there are few updates they are the plain mean of all."""
+        if self.averaged is not None and self.config.average_rate is not None:
+            rate = max(self.config.average_rate, 1.0 / self.updates)
+            torch._foreach_lerp_(list(self.averaged.parameters()), list(self.agent.parameters()), rate)
 
     def _decay_rates(self) -> None:
         """Set both rates to what is left of them at this update."""
@@ -320,6 +350,7 @@ class DreamerLearner:
 
     def _behavior_losses(self, context: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
         """Imagine from the latents of a batch and judge; losses and metrics of actor and critic."""
+        self.latents = context.detach()
         imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
         imagination = imagined.pop("imagination")
         replay = batch.select("reward", "is_init", "terminated", "truncated")
@@ -331,8 +362,17 @@ class DreamerLearner:
         return {**imagined, **critic}
 
     def policy(self, deterministic: bool = False) -> DreamerPolicy:
-        """Return the acting step, which shares this learner's parameters."""
+        """Return the acting step of the networks that are trained, which shares their parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
+
+    def evaluation_policy(self, deterministic: bool = False) -> DreamerPolicy:
+        """Return the acting step of `flying_agent`, which shares its parameters."""
+        return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor, deterministic)
+
+    @property
+    def flying_agent(self) -> Agent:
+        """What is evaluated and exported: the averaged networks where they are kept, else those that are trained."""
+        return self.agent if self.averaged is None else self.averaged
 
     def open_loop(self, batch: TensorDictBase, context: int) -> Tensor:
         """Reconstruct the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
@@ -357,6 +397,8 @@ class DreamerLearner:
             "losses": {name: _own_state(loss) for name, loss in self.losses.items()},
             "optimizer": self.optimizer.state_dict(),
             "updates": self.updates,
+            **({} if self.averaged is None else {"averaged": self.averaged.state_dict()}),
+            **({} if self._actor_optimizer is None else {"actor_optimizer": self._actor_optimizer.state_dict()}),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -375,13 +417,18 @@ class DreamerLearner:
         names = {"lr", "warmup_steps"}
         own = [{name: value for name, value in group.items() if name in names} for group in self._groups]
         self.optimizer.load_state_dict(state_dict["optimizer"])
+        if self._actor_optimizer is not None:
+            self._actor_optimizer.load_state_dict(state_dict["actor_optimizer"])
+        if self.averaged is not None:
+            self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
         for group, settings in zip(self._groups, own, strict=True):
             group.update(settings)
         self.updates = state_dict["updates"]
 
     @property
     def _groups(self) -> ParameterGroups:
-        return self.optimizer.param_groups
+        own = [] if self._actor_optimizer is None else self._actor_optimizer.param_groups
+        return [*self.optimizer.param_groups, *own]
 
     def _check_parts(self, saved: dict[str, Any]) -> None:
         """Refuse networks or losses of other parameters than these."""
@@ -423,9 +470,11 @@ class DreamerLearner:
         """Return the world model's parameters, and actor's and critic's, with their learning rates."""
         networks, config = self._networks, self.config
         behavior_lr = config.lr if config.behavior_lr is None else config.behavior_lr
+        stepped_alone = getattr(self.losses["actor"], "optimizer", None) is not None
+        actor = [] if stepped_alone else networks["actor"]
         return [
             {"params": networks["world_model"], "lr": config.lr},
-            {"params": networks["actor"] + networks["critic"], "lr": behavior_lr},
+            {"params": actor + networks["critic"], "lr": behavior_lr},
         ]
 
     def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:

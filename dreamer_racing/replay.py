@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import Transform
 
+from dreamer_racing.modules.stored_latents import CONTEXT, pack_latents
 from dreamer_racing.streams import (
     RecordStorage,
     StreamMemmapStorage,
@@ -39,6 +40,7 @@ def records_from_rollout(
     rollout: TensorDictBase,
     observation_keys: Sequence[NestedKey] = ("pixels",),
     reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+    latents: int | None = None,
 ) -> TensorDictBase:
     """Converts what a TorchRL collector yields into replay records.
 
@@ -51,6 +53,9 @@ def records_from_rollout(
             observations, the rewards, ``terminated``, ``truncated``.
         observation_keys: what of an observation is kept.
         reward_keys: which rewards are kept.
+        latents: number of the categorical latents whose classes, with the belief, are kept as each record's
+            ``context``: what the policy had in mind before it saw the record's observation (`pack_latents`). None: none
+            are kept.
 
     Returns:
         Records, batch ``[M]`` with M = N·T + number of first observations, first all arrivals, then all first
@@ -61,7 +66,7 @@ def records_from_rollout(
         KeyError: if the rollout lacks a key.
         ValueError: if the rollout has no time dimension.
     """
-    _check_rollout(rollout, observation_keys, reward_keys)
+    _check_rollout(rollout, observation_keys, reward_keys, latents)
     steps = rollout.shape[-1]
     flat = rollout.reshape(-1)  # [N·T], environment by environment
     is_init = flat["is_init"].reshape(-1)
@@ -75,18 +80,22 @@ def records_from_rollout(
     arrival = flat["next"].select(*observation_keys, *reward_keys, *_END_KEYS)
     arrival.update({"previous_action": flat["action"], "is_init": torch.zeros_like(flat["is_init"])})
     arrival.update({"stream": stream, "order": order})
+    if latents is not None:
+        arrival.set(CONTEXT, pack_latents(flat["next", "belief"], flat["next", "state"], latents))
     initial = flat.select(*observation_keys)[first]
-    zeros = arrival.select("previous_action", *reward_keys, *_END_KEYS)[: len(first)]
+    zeros = arrival.select("previous_action", *reward_keys, *_END_KEYS, CONTEXT, strict=False)[: len(first)]
     initial.update(zeros.apply(torch.zeros_like))
     initial.update({"is_init": flat["is_init"][first], "stream": stream[first], "order": order[first] - 1})
     return torch.cat([arrival, initial])
 
 
-def _check_rollout(rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str]) -> None:
+def _check_rollout(
+    rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str], latents: int | None
+) -> None:
     if rollout.ndim < 2:
         raise ValueError(f"Expected a rollout of batch [environments, time], got batch {list(rollout.shape)}.")
     root = [*observation_keys, "action", "is_init"]
-    arrived = [*observation_keys, *reward_keys, *_END_KEYS]
+    arrived = [*observation_keys, *reward_keys, *_END_KEYS, *(("belief", "state") if latents is not None else ())]
     missing = [key for key in root if rollout.get(key, None) is None]
     missing += [("next", key) for key in arrived if rollout["next"].get(key, None) is None]
     if missing:
@@ -104,6 +113,7 @@ class StreamReplay(TensorDictReplayBuffer):
     Args:
         observation_keys: what of an observation is kept.
         reward_keys: which rewards are kept.
+        latents: number of the policy's categorical latents, to keep each record's ``context``; None keeps none.
         **kwargs: of `TensorDictReplayBuffer`.
     """
 
@@ -117,16 +127,32 @@ class StreamReplay(TensorDictReplayBuffer):
         *,
         observation_keys: Sequence[NestedKey] = ("pixels",),
         reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+        latents: int | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         self.observation_keys = tuple(observation_keys)
         self.reward_keys = tuple(reward_keys)
+        self.latents = latents
 
     def extend(self, rollout: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Appends a collector's rollout ``[N, T]``; see `records_from_rollout`. Returns the slots, int64 ``(M,)``."""
-        records = records_from_rollout(rollout, self.observation_keys, self.reward_keys)
+        records = records_from_rollout(rollout, self.observation_keys, self.reward_keys, self.latents)
         return super().extend(records, update_priority=update_priority)
+
+    def refresh(self, slots: Tensor, belief: Tensor, state: Tensor) -> None:
+        """Replaces the context of sampled records by what the world model makes of the records before them now.
+
+        Args:
+            slots: of windows just sampled (``"index"`` of the sample), int64 ``(B, T)``.
+            belief: after each of their records, ``(B, T, D)``.
+            state: likewise, ``(B, T, S)``.
+
+        Reference: danijar/dreamerv3, ``replay_context`` (latents written back to the replay after each update).
+        """
+        assert self.latents is not None, "made without latents: there is no context to refresh"
+        packed = pack_latents(belief[:, :-1], state[:, :-1], self.latents).flatten()
+        self._storage.overwrite(slots[:, 1:].flatten(), TensorDict({CONTEXT: packed}, packed.batch_size))
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
         """Returns windows ``[num_windows, length]`` of records that are never sampled, delivered as samples are.
@@ -197,7 +223,11 @@ class StreamReplay(TensorDictReplayBuffer):
 
 
 def replay_bytes(
-    capacity: int, image_shape: Sequence[int] = (64, 64, 3), action_size: int = 4, numbers: int = 0
+    capacity: int,
+    image_shape: Sequence[int] = (64, 64, 3),
+    action_size: int = 4,
+    numbers: int = 0,
+    context: tuple[int, int] = (0, 0),
 ) -> int:
     """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
 
@@ -206,9 +236,11 @@ def replay_bytes(
         image_shape: of ``pixels``.
         action_size: A.
         numbers: float32 observed beside the image: ``vector`` and the privileged one.
+        context: widths D and L of the belief and of the state's classes, where they are kept.
     """
-    flags = 1 + len(_END_KEYS)
-    return capacity * (math.prod(image_shape) + 4 * (action_size + len(RACE_REWARD_KEYS) + numbers) + flags)
+    flags, (belief, latents) = 1 + len(_END_KEYS), context
+    floats = action_size + len(RACE_REWARD_KEYS) + numbers
+    return capacity * (math.prod(image_shape) + 4 * floats + flags + 2 * belief + latents)
 
 
 def make_replay(
@@ -229,6 +261,7 @@ def make_replay(
     recent_records: int | None = None,
     held_out: int = 0,
     prefetch: int | None = None,
+    latents: int | None = None,
 ) -> StreamReplay:
     """Builds the replay of N streams.
 
@@ -251,6 +284,7 @@ def make_replay(
         held_out: the last streams are kept out of samples, for `StreamReplay.held_out`.
         prefetch: samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the newest
             records, and a restored replay then does not continue the same samples.
+        latents: number of the policy's categorical latents, to keep each record's ``context`` (`pack_latents`).
 
     Raises:
         ValueError: if a stream could not hold one window, ``recent_share`` is not a share, or all streams are held out.
@@ -291,6 +325,7 @@ def make_replay(
         batch_size=batch_size,
         observation_keys=observation_keys,
         reward_keys=reward_keys,
+        latents=latents,
         prefetch=prefetch,
     )
     if records.device != torch.empty((), device=device).device:

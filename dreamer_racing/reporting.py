@@ -54,7 +54,7 @@ class EvaluationReport:
         self._seed = seed
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
-        self._policy = learner.policy()
+        self._policy = learner.evaluation_policy()
         self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
         self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))
 
@@ -129,7 +129,7 @@ class ReturnReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
-        self._policy = learner.policy()
+        self._policy = learner.evaluation_policy()
         self._env = TransformedEnv(env, Compose(InitTracker(), self._policy.make_primer()))
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:

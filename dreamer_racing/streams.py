@@ -69,6 +69,16 @@ class RecordStorage(TensorStorage):
                 _rows(stored).index_copy_(0, cursor.to(self.device), _rows(new))
         self._bump_mutation_revision()
 
+    def overwrite(self, slots: Tensor, data: TensorDictBase) -> None:
+        """Replaces what records in slots ``(M,)`` have of the keys of data ``[M]``; where slots repeat, one of them."""
+        for key, stored in self.fields():
+            new = data.get(key, None)
+            if new is not None:
+                new = new.to(self.device, non_blocking=self.device.type == "cuda")
+                check_layout(key, new, stored)
+                _rows(stored).index_copy_(0, slots.to(self.device), _rows(new))
+        self._bump_mutation_revision()
+
     def get(self, index: Tensor | slice) -> TensorDictBase:
         """Returns copies of the records in slots of any shape, or those of a slice themselves."""
         if not isinstance(index, Tensor):

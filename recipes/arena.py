@@ -145,6 +145,7 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         warmup_updates=model.warmup_updates,
         decay_updates=model.decay_updates,
         decay_to=model.decay_to,
+        average_rate=model.average_rate,
         compile=model.compile,
         cuda_graph=model.cuda_graph,
         mixed_precision=bool(model.mixed_precision),

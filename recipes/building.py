@@ -122,6 +122,7 @@ def make_run_replay(
     curriculum: BodyRateCurriculum | None,
     batch_size: int,
     batch_length: int,
+    context: tuple[int, int] = (0, 0),
     **windows: Any,
 ) -> StreamReplay:
     """Make the replay, on the learner's device if it has room there; say where and how large.
@@ -132,12 +133,13 @@ def make_run_replay(
         curriculum: by which old rewards are relabelled, if they are.
         batch_size: windows in a batch.
         batch_length: records in a window.
+        context: widths of the belief and of the state's classes, where latents are kept with the records.
         windows: further arguments of `make_replay` on which windows are drawn.
     """
     settings, interface = config.replay, Interface.of(env)
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
-    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers)
+    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, context)
     storage_device = settings.device
     if storage_device == "auto":
         on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)

@@ -19,6 +19,7 @@ from checks import check_dreamer
 from command_line import CONFIG_DIR, computes_bfloat16
 from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, register
+from tensordict import TensorDictBase
 from training import ReplayRun, launch
 
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
@@ -52,6 +53,13 @@ class DreamerRun(ReplayRun):
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is not None and self.counters["updates"]:
             self.metrics.push(held_out_metrics(self.learner, windows))
+
+    def after_update(self, batch: TensorDictBase) -> None:
+        """Let later windows go on from what the world model makes of these records now."""
+        if self.config.replay.context:
+            latents = self.learner.latents
+            assert latents is not None, "the update left them"
+            self.replay.refresh(batch["index"], latents["belief"], latents["state"])
 
     def save(self) -> Path:
         """Take in the rollout that is under way, if there is one, and save."""
@@ -107,6 +115,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     acting = acting_copy(policy) if overlapped else policy
     collector = make_collector(config, env, acting)
     curriculum = make_curriculum(config)
+    size = learner.size
     return assemble(
         DreamerRun,
         config,
@@ -123,6 +132,8 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
             curriculum,
             config.model.batch_size,
             config.model.batch_length,
+            context=(size.belief, size.latents) if config.replay.context else (0, 0),
+            latents=size.latents if config.replay.context else None,
             recent_share=config.replay.recent_share,
             recent_records=config.replay.recent_records,
             held_out=config.replay.held_out,

@@ -8,6 +8,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from dreamer_racing.baselines import PPOConfig, SACConfig
+from dreamer_racing.losses import ImaginedPPOConfig
 
 
 @dataclass
@@ -46,6 +47,7 @@ class ModelConfig:
     warmup_updates: int = MISSING  # over which the learning rate rises from zero
     decay_updates: int | None = None  # over which both rates fall linearly, from the first update; null: they stay
     decay_to: float = 0.25  # what is left of them then
+    average_rate: float | None = None  # of the averaged weights, which fly evaluations and exports; null: none
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
 
@@ -55,7 +57,7 @@ class LossConfig:
     """Losses by the names of their registries in `dreamer_racing.losses`, and their weights."""
 
     world_model: str = "reconstruction"
-    actor: str = "reinforce"
+    actor: str = "reinforce"  # reinforce | dynamics | ppo
     critic: str = "two_hot"
     discount: float = 0.997
     lambda_: float = 0.95
@@ -69,6 +71,7 @@ class LossConfig:
     continuation: bool = True  # predicted ends of episodes cut imagined returns
     replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off
     replay_value_gradient: bool = True  # whether that loss also trains the world model
+    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)  # numbers of actor=ppo
 
 
 @dataclass
@@ -114,6 +117,7 @@ class SequenceReplayConfig(ReplayConfig):
     held_out: int = 1  # worlds whose records are never trained on, to measure the model; 0 of a single world
     recent_share: float = 0.0  # of a batch's windows, drawn from the newest records
     recent_records: int = 20_000  # how many those are
+    context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
 
 
 @dataclass

@@ -147,6 +147,10 @@ class ReplayRun(Run):
                 batch = self.replay.sample()
             self.metrics.push(self.learner.update(batch, self.clock.timed))
             self.counters["updates"] += 1
+            self.after_update(batch)
+
+    def after_update(self, batch: TensorDictBase) -> None:
+        """Do what a recipe does with a batch that was learned from."""
 
 
 def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:

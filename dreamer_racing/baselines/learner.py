@@ -47,6 +47,10 @@ class BaselineLearner(ABC):
         """Return the acting step, which shares this learner's parameters."""
         return BaselinePolicy(self.actor, deterministic)
 
+    def evaluation_policy(self, deterministic: bool = False) -> BaselinePolicy:
+        """Return the acting step to evaluate: the one that is trained."""
+        return self.policy(deterministic)
+
     def check_finite(self) -> None:
         """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
         self._guard.settle()

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
+from dreamer_racing.losses.ppo_actor import ImaginedPPOConfig, PPOActorLoss
 from dreamer_racing.losses.representation import (
     DecoderFreeLoss,
     InformedLoss,
@@ -46,7 +47,11 @@ WORLD_MODEL_LOSSES: dict[str, type[WorldModelLoss]] = {
     "decoder_free": DecoderFreeLoss,
     "reward_only": WorldModelLoss,
 }
-ACTOR_LOSSES: dict[str, LossClass] = {"reinforce": ReinforceLoss, "dynamics": DynamicsActorLoss}
+ACTOR_LOSSES: dict[str, LossClass] = {
+    "reinforce": ReinforceLoss,
+    "dynamics": DynamicsActorLoss,
+    "ppo": PPOActorLoss,
+}
 CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
 
 
@@ -83,8 +88,10 @@ __all__ = [
     "DecoderFreeLoss",
     "DynamicsActorLoss",
     "Imagination",
+    "ImaginedPPOConfig",
     "InformedLoss",
     "LossClass",
+    "PPOActorLoss",
     "PrivilegedLoss",
     "ReconstructionLoss",
     "ReinforceLoss",

@@ -80,6 +80,8 @@ class ActorLoss(LossModule):
         "continuation",
         "imagination",
     ]
+    optimizer: torch.optim.Optimizer | None = None
+    """Of the actor, where the loss steps it by itself in ``improve``; None: the learner's optimiser does."""
 
     def __init__(
         self,
@@ -129,6 +131,14 @@ class ActorLoss(LossModule):
             {key: judged.pop(key) for key in ("features", "lambda_return", "weight")}, [self.horizon, len(belief)]
         )
         return TensorDict({"loss_actor": loss, **judged, "imagination": imagination}, [])
+
+    def improve(self, updates: int) -> dict[str, Tensor]:
+        """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.
+
+        Returns:
+            Metrics, scalars.
+        """
+        return {}
 
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Imagine from starts ``(N, ...)``; return the loss and everything else that ``forward`` writes."""

@@ -17,6 +17,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules.rssm import Posterior, mix_uniform
+from dreamer_racing.modules.stored_latents import CONTEXT, unpack_latents
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
 if TYPE_CHECKING:
@@ -78,7 +79,8 @@ class WorldModelLoss(LossModule):
         kl_mode: Key of ``KL_MODES``.
 
     Reads a batch ``[B, T]`` of replay records: what the encoder sees, ``previous_action``, ``reward``, ``is_init``,
-    ``terminated``. Writes, as scalars, ``loss_reward``, ``loss_continue``, ``loss_dynamics``, ``loss_representation``,
+    ``terminated``; where the records have a ``context``, windows go on from the first one's latents, else from an
+    episode's start. Writes, as scalars, ``loss_reward``, ``loss_continue``, ``loss_dynamics``, ``loss_representation``,
     what ``represent`` adds, the metrics ``kl`` and ``reward_error`` (mean absolute); and ``replay_context``, batch
     ``[B, T]``, with ``belief`` and ``state``, which carry gradient.
 
@@ -137,8 +139,12 @@ class WorldModelLoss(LossModule):
         """Compute the losses of a batch ``[B, T]``; keys in the class's docstring."""
         require_keys(self, tensordict, self.in_keys)
         embedding = self.world_model.encoder(tensordict)
-        posterior = self.world_model.rssm.observe(
-            embedding, tensordict.get("previous_action"), tensordict.get("is_init").squeeze(-1)
+        rssm, context = self.world_model.rssm, tensordict.get(CONTEXT, None)
+        posterior = rssm.observe(
+            embedding,
+            tensordict.get("previous_action"),
+            tensordict.get("is_init").squeeze(-1),
+            initial=None if context is None else unpack_latents(context[:, 0], rssm.classes),
         )
         features = join_features(posterior.belief, posterior.state)
         losses = self.represent(posterior, features, embedding, tensordict)

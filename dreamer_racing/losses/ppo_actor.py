@@ -1,0 +1,230 @@
+"""PPO on imagined rollouts: an extension, not part of DreamerV3.
+
+REINFORCE takes one step along a gradient that is nearly all noise (docs/experiments.md, entry 14), and the optimiser
+makes it a full step. Here the rollouts of several updates are kept, the actor does not move meanwhile, and then a few
+epochs of minibatches use them up; the clipped ratio bounds how far it moves for so much of the model's data.
+
+Shape legend: K updates, H horizon, N starts, M records of a minibatch, F features, A action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from dreamer_racing.losses.actor import ActorLoss
+from dreamer_racing.losses.imagination import imagine
+from dreamer_racing.modules.actor import ActionDistribution
+
+if TYPE_CHECKING:
+    from dreamer_racing.learner import Agent, LearnerConfig
+
+
+@dataclass
+class ImaginedPPOConfig:
+    """Numbers of ``PPOActorLoss`` [choice, by docs/experiments.md, entry 14, unless a source is named].
+
+    Attributes:
+        updates: K, learner updates whose rollouts are kept before the actor learns from them.
+        epochs: Times that every imagined step is trained on.
+        minibatch: M, imagined steps of a gradient step.
+        clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
+        advantage_clip: Largest normalised advantage.
+        kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
+        learning_rate: Of Adam.
+        gradient_clip: Largest norm of the actor's gradient.
+    """
+
+    updates: int = 8
+    epochs: int = 3
+    minibatch: int = 4096
+    clip_epsilon: float = 0.2
+    advantage_clip: float = 5.0
+    kl_stop: float = 0.03
+    learning_rate: float = 3e-4
+    gradient_clip: float = 0.5
+
+
+class Minibatch(NamedTuple):
+    """Imagined steps to learn from; each ``(M, ...)``.
+
+    Attributes:
+        features: Seen by the policy, ``(M, F)``.
+        action: Sampled there, ``(M, A)``.
+        old: Mean and standard deviation of the policy that sampled, ``(M, 2·A)``.
+        advantage: Normalised, ``(M, 1)``.
+        weight: Discounted probability of getting there, ``(M, 1)``.
+    """
+
+    features: Tensor
+    action: Tensor
+    old: Tensor
+    advantage: Tensor
+    weight: Tensor
+
+
+class PPOActorLoss(ActorLoss):
+    """Keep imagined rollouts, and improve the actor on them every few updates, with an optimiser of its own.
+
+    ``forward`` imagines and judges as its siblings do, keeps the rollout, and writes a ``loss_actor`` of zero: nothing
+    for the learner's optimiser. ``improve``, which the learner calls after each update, does nothing until K rollouts
+    are there; then advantages are normalised over all of them, and the actor makes epochs of minibatches on
+    ``−weight · (min(r·advantage, clip(r, 1 ± ε)·advantage) + entropy_scale · H[π])``, r being the ratio of new to old
+    probability of an action.
+
+    The rollouts are buffers of the module, so a checkpoint holds them and a CUDA graph can fill them.
+
+    Args:
+        starts: N, starts that every call of ``forward`` brings.
+        ppo: Numbers of the improvement.
+        args, kwargs: Of ``ActorLoss``.
+
+    Reference: Schulman et al. 2017, "Proximal policy optimization algorithms", Eq. 7.
+    """
+
+    optimizer: torch.optim.Optimizer
+    features: Tensor
+    action: Tensor
+    old: Tensor
+    advantage: Tensor
+    weight: Tensor
+    cursor: Tensor
+
+    def __init__(self, *args: Any, starts: int, ppo: ImaginedPPOConfig | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.ppo = ppo or ImaginedPPOConfig()
+        self.starts = starts
+        features, actions = self.world_model.size.features, self.world_model.interface.action_dim
+        widths = {"features": features, "action": actions, "old": 2 * actions, "advantage": 1, "weight": 1}
+        for name, width in widths.items():
+            self.register_buffer(name, torch.zeros(self.ppo.updates, self.horizon, starts, width))
+        self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))
+        self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
+
+    @classmethod
+    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
+        """Make the loss of an agent with a learner's numbers."""
+        records = config.batch_size * config.batch_length
+        return cls(
+            agent.world_model,
+            agent.actor,
+            agent.critic,
+            starts=min(config.imagination_starts or records, records),
+            ppo=config.ppo,
+            horizon=config.imagination_horizon,
+            discount=config.discount,
+            lambda_=config.lambda_,
+            entropy_scale=config.entropy_scale,
+            return_decay=config.return_decay,
+            continuation=config.continuation,
+        )
+
+    @torch.no_grad()
+    def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        if len(belief) != self.starts:
+            raise ValueError(
+                f"{type(self).__name__} was made for {self.starts} starts an update, got {len(belief)}: batch_size, "
+                "batch_length and imagination_starts of the learner's configuration must be those of its batches."
+            )
+        features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+        judged = self._judge(features, terminated)
+        policy = self.actor(features[:-1])
+        if self.training:
+            self._keep(
+                features=features[:-1],
+                action=action,
+                old=torch.cat((policy.mean, policy.std), -1),
+                advantage=judged.lambda_return - judged.value,
+                weight=judged.weight,
+            )
+        return features.new_zeros(()), self._report(features, policy.entropy(), judged)
+
+    def _keep(self, **rollout: Tensor) -> None:
+        """Write a rollout of ``(H, N, ...)`` into the next of the K places."""
+        for name, value in rollout.items():
+            self.get_buffer(name).index_copy_(0, self.cursor, value.unsqueeze(0).float())
+        self.cursor.add_(1).remainder_(self.ppo.updates)
+
+    def improve(self, updates: int) -> dict[str, Tensor]:
+        """Train the actor if the rollouts of K updates are there.
+
+        Args:
+            updates: Updates of the learner so far.
+
+        Returns:
+            Nothing, or ``loss_actor``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
+            ``gradient_norm/actor`` of what was done; scalars.
+        """
+        if updates % self.ppo.updates:
+            return {}
+        records = self._normalised()
+        number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
+        done: list[dict[str, Tensor]] = []
+        for _ in range(self.ppo.epochs):
+            order = torch.randperm(number, device=records.features.device)
+            for chosen in order.split(size):
+                metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)))
+                done.append(metrics)
+                if metrics["ppo/kl"] > self.ppo.kl_stop:  # waits for the device, some times an improvement
+                    return self._summary(done, number / size)
+        return self._summary(done, number / size)
+
+    def _normalised(self) -> Minibatch:
+        """Return all imagined steps, with advantages of mean 0 and deviation 1 under their weights."""
+        records = Minibatch(*(self.get_buffer(name).flatten(0, 2) for name in Minibatch._fields))
+        share = records.weight / records.weight.sum().clamp_min(1e-8)
+        mean = (share * records.advantage).sum()
+        deviation = (share * (records.advantage - mean).square()).sum().sqrt()
+        advantage = (records.advantage - mean) / (deviation + 1e-8)
+        return records._replace(advantage=advantage.clamp(-self.ppo.advantage_clip, self.ppo.advantage_clip))
+
+    def _minibatch(self, batch: Minibatch) -> dict[str, Tensor]:
+        """Make one gradient step; the divergence is that from before it."""
+        loss, metrics = clipped_objective(
+            self.actor(batch.features), batch, self.ppo.clip_epsilon, self.entropy_scale
+        )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.ppo.gradient_clip)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        return {"loss_actor": loss.detach(), **metrics, "gradient_norm/actor": norm}
+
+    def _summary(self, done: list[dict[str, Tensor]], minibatches: float) -> dict[str, Tensor]:
+        """Average over the gradient steps; the divergence is the last."""
+        means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
+        epochs = torch.tensor(len(done) / minibatches)
+        return means | {"ppo/kl": done[-1]["ppo/kl"], "ppo/epochs": epochs}
+
+
+def clipped_objective(
+    policy: ActionDistribution, batch: Minibatch, clip_epsilon: float, entropy_scale: float
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Compute PPO's loss on a minibatch, a scalar, and what to watch: ``ppo/kl`` and ``ppo/clipped``.
+
+    Args:
+        policy: The present one at the minibatch's features.
+        batch: The minibatch.
+        clip_epsilon: ε.
+        entropy_scale: Weight of the entropy.
+
+    Reference: Schulman et al. 2017, Eq. 7.
+    """
+    old = ActionDistribution(*batch.old.chunk(2, -1))
+    ratio = (policy.log_prob(batch.action) - old.log_prob(batch.action)).exp()
+    bounded = ratio.clamp(1.0 - clip_epsilon, 1.0 + clip_epsilon)
+    gain = torch.minimum(ratio * batch.advantage, bounded * batch.advantage)
+    loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
+    with torch.no_grad():
+        kl = normal_divergence(old, policy).mean()
+        clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
+    return loss, {"ppo/kl": kl, "ppo/clipped": clipped}
+
+
+def normal_divergence(old: ActionDistribution, new: ActionDistribution) -> Tensor:
+    """Return KL(old ‖ new) of independent normals, nats, ``(..., 1)``."""
+    variances = (old.std.square() + (old.mean - new.mean).square()) / (2.0 * new.std.square())
+    return (new.std.log() - old.std.log() + variances - 0.5).sum(-1, keepdim=True)
