@@ -70,7 +70,7 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
         metrics["held_out/open_loop_reward_error"] = (predicted - paid).abs().mean()
         metrics["held_out/open_loop_correlation"] = correlation(predicted, paid)
 
-    discount = learner.config.discount ** torch.arange(horizon + 1, device=reward.device)
+    discount = learner.discount ** torch.arange(horizon + 1, device=reward.device)
     value = critic.value(join_features(belief[:, -1], state[:, -1])).squeeze(-1)
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
     real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value

@@ -62,8 +62,6 @@ class LearnerConfig:
         behavior_lr: Learning rate of actor and critic; None for the same. A lower one lets the world model get ahead of
             the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
         warmup_updates: Updates over which the learning rate rises from zero.
-        decay_updates: Updates, from the first, over which both rates fall linearly; None for never.
-        decay_to: What share of the rates is left then [choice; docs/experiments.md, entry 13].
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         ppo: Numbers of the actor loss of that name.
@@ -98,8 +96,6 @@ class LearnerConfig:
     lr: float = 4e-5
     behavior_lr: float | None = None
     warmup_updates: int = 1000
-    decay_updates: int | None = None
-    decay_to: float = 0.25
     average_rate: float | None = None
     ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)
     world_model_loss: str = "reconstruction"
@@ -213,6 +209,11 @@ class DreamerLearner:
         seed: Seed of the initial weights; None takes them from the global generator. Later sampling always uses the
             global generator of the device, which a checkpoint of yours should save.
 
+    Attributes:
+        latents: Belief and state of the last batch's records, ``[B, T]``, for the replay's context; on a CUDA device
+            with ``cuda_graph`` the next update writes over them.
+        discount: γ as it is now, see ``adjust``.
+
     Example:
         >>> learner = DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3), seed=0)
         >>> policy = learner.policy()
@@ -246,6 +247,7 @@ class DreamerLearner:
             ).to(self.device)
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(self.agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
+        self.discount = self.config.discount
         self._networks = self._trained_parameters()
         self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(self.losses["actor"], "optimizer", None)
@@ -280,7 +282,6 @@ class DreamerLearner:
         metrics = self._step(batch)
         self._guard.check(metrics, batch)
         with timed("optimise"):
-            self._decay_rates()
             self.optimizer.step()
             self.agent.critic.update_slow(self.config.slow_critic_rate)
             if not self.config.cuda_graph:
@@ -298,14 +299,30 @@ class DreamerLearner:
             rate = max(self.config.average_rate, 1.0 / self.updates)
             torch._foreach_lerp_(list(self.averaged.parameters()), list(self.agent.parameters()), rate)
 
-    def _decay_rates(self) -> None:
-        """Set both rates to what is left of them at this update."""
-        config = self.config
-        if config.decay_updates is None:
-            return
-        left = 1.0 - (1.0 - config.decay_to) * min(1.0, self.updates / config.decay_updates)
+    def adjust(
+        self, *, rates: float = 1.0, discount: float | None = None, entropy_scale: float | None = None
+    ) -> None:
+        """Change what a run may have on a schedule, from the next update on; what is not named is as configured.
+
+        Args:
+            rates: Share of the configured learning rates, of all optimisers.
+            discount: γ.
+            entropy_scale: Weight of the actor's entropy.
+        """
         for group, rate in zip(self._groups, self._rates, strict=True):
-            group["lr"] = rate * left
+            group["lr"] = rate * rates
+        self.discount = self.config.discount if discount is None else discount
+        self._set_in_losses("discount", self.discount)
+        self._set_in_losses("entropy_scale", self.config.entropy_scale if entropy_scale is None else entropy_scale)
+
+    def _set_in_losses(self, name: str, value: float) -> None:
+        """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""
+        for loss in self.losses.values():
+            setting = getattr(loss, name, None)
+            if isinstance(setting, Tensor):
+                setting.fill_(value)
+            elif setting is not None:
+                setattr(loss, name, value)
 
     def check_finite(self) -> None:
         """Wait for the latest updates, so that nothing bad is saved.

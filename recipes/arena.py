@@ -143,8 +143,6 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         lr=model.learning_rate,
         behavior_lr=model.behavior_learning_rate,
         warmup_updates=model.warmup_updates,
-        decay_updates=model.decay_updates,
-        decay_to=model.decay_to,
         average_rate=model.average_rate,
         compile=model.compile,
         cuda_graph=model.cuda_graph,

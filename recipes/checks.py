@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from arena import is_race
 from omegaconf import DictConfig, OmegaConf
-from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, ModelConfig, RunConfig, SACRunConfig
+from schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.envs.gates import GateSweeper
@@ -59,8 +59,6 @@ RANGES = {
     "model.learning_rate": POSITIVE,
     "model.behavior_learning_rate": POSITIVE,
     "model.warmup_updates": NOT_NEGATIVE,
-    "model.decay_updates": Range(1),
-    "model.decay_to": Range(0, 1, open_below=True),
     "model.imagination_horizon": Range(1),
     "model.imagination_starts": Range(1),
     "loss.discount": SHARE,
@@ -251,12 +249,8 @@ def check_dreamer(config: DreamerConfig) -> None:
         ValueError: the message gives the numbers and the setting to change.
     """
     check(config)
-    if config.model.decay_updates is None and config.model.decay_to != ModelConfig.decay_to:
-        raise ValueError(
-            f"model.decay_to={config.model.decay_to} has no effect without model.decay_updates, the number of updates "
-            "over which the rates fall to it."
-        )
     check_replay(config)
+    check_schedule(config)
     check_image_size(config.env.image_size, config.model.size)
     model = config.model
     prefilled = config.prefill // config.env.num_envs
@@ -281,6 +275,31 @@ def check_dreamer(config: DreamerConfig) -> None:
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
         )
+
+
+def check_schedule(config: DreamerConfig) -> None:
+    """Refuse ramps that end before they begin, or lead where the setting itself could not be.
+
+    Raises:
+        ValueError: the message names the ramp.
+    """
+    targets = {
+        "learning_rates": POSITIVE,
+        "discount": RANGES["loss.discount"],
+        "entropy_scale": RANGES["loss.entropy_scale"],
+        "start_on_line": RANGES["env.start_on_line"],
+    }
+    for name, allowed in targets.items():
+        ramp = getattr(config.schedule, name)
+        if ramp is None:
+            continue
+        ramp.check(f"schedule.{name}")
+        if ramp.to not in allowed:
+            raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
+    if config.schedule.start_on_line and not is_race(config):
+        raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
+    if config.schedule.start_on_line and not config.env.start_on_line:
+        raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
 
 
 def check_image_size(image_size: int, size: str) -> None:

@@ -10,7 +10,7 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import hydra
 from arena import make_env, make_learner
@@ -22,8 +22,10 @@ from schema import Collection, DreamerConfig, register
 from tensordict import TensorDictBase
 from training import ReplayRun, launch
 
+from dreamer_racing.checkpoint import GracefulExit
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
 from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
+from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.modules import Interface
 
@@ -53,6 +55,25 @@ class DreamerRun(ReplayRun):
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is not None and self.counters["updates"]:
             self.metrics.push(held_out_metrics(self.learner, windows))
+
+    def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
+        """Put what is scheduled where it belongs by now, and make the updates that are due."""
+        self.keep_to_schedule()
+        super().learn(rollout, stop)
+
+    def keep_to_schedule(self) -> None:
+        """Set everything that is scheduled to its value at this share of the run."""
+        schedule, loss = self.config.schedule, self.config.loss
+        progress = self.counters["env_steps"] / self.config.total_env_steps
+        now = {
+            "rates": (schedule.learning_rates, 1.0),
+            "discount": (schedule.discount, loss.discount),
+            "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
+        }
+        self.learner.adjust(**{name: ramp.at(value, progress) for name, (ramp, value) in now.items() if ramp})
+        if schedule.start_on_line:
+            share = schedule.start_on_line.at(self.config.env.start_on_line, progress)
+            cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 
     def after_update(self, batch: TensorDictBase) -> None:
         """Let later windows go on from what the world model makes of these records now."""

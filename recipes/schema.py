@@ -9,6 +9,7 @@ from omegaconf import MISSING
 
 from dreamer_racing.baselines import PPOConfig, SACConfig
 from dreamer_racing.losses import ImaginedPPOConfig
+from dreamer_racing.training.schedule import Ramp
 
 
 @dataclass
@@ -45,8 +46,6 @@ class ModelConfig:
     compile: bool = False  # torch.compile of the losses
     cuda_graph: bool = False  # forward and backward as one CUDA graph
     warmup_updates: int = MISSING  # over which the learning rate rises from zero
-    decay_updates: int | None = None  # over which both rates fall linearly, from the first update; null: they stay
-    decay_to: float = 0.25  # what is left of them then
     average_rate: float | None = None  # of the averaged weights, which fly evaluations and exports; null: none
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
@@ -139,6 +138,16 @@ class CheckpointConfig:
     keep: int = 2
 
 
+@dataclass
+class ScheduleConfig:
+    """Settings that move over a run, each from its own value `to` another between two shares of total_env_steps."""
+
+    learning_rates: Ramp | None = None  # `to`: share of all learning rates that is left
+    discount: Ramp | None = None  # loss.discount
+    entropy_scale: Ramp | None = None  # loss.entropy_scale
+    start_on_line: Ramp | None = None  # env.start_on_line
+
+
 class Collection(Enum):
     """How acting and learning share time."""
 
@@ -179,6 +188,7 @@ class DreamerConfig(RunConfig):
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
 
 
 @dataclass

@@ -91,15 +91,11 @@ class StartSampler:
         on_line: float = 0.0,
         line: RacingLine | None = None,
     ):
-        for name, share in (("beyond_gate", beyond_gate), ("on_line", on_line)):
-            if not 0.0 <= share <= 1.0:
-                raise ValueError(f"{name}={share}: a share of episodes lies between 0 and 1.")
-        if on_line and line is None:
-            raise ValueError(f"on_line={on_line}: give a line to begin on, `plan_racing_line(track, parameters)`.")
+        _check_share("beyond_gate", beyond_gate)
         _check_start_noise(start_noise, track)
         self._beyond_gate = beyond_gate
-        self._on_line = on_line
-        self._line = line.to(device, dtype) if line is not None and on_line else None
+        self._line = line.to(device, dtype) if line is not None else None
+        self.on_line = on_line
         self._start_noise = start_noise
         self._generator = generator
         self._device, self._dtype = device, dtype
@@ -124,7 +120,19 @@ class StartSampler:
         if evaluation:
             return self._start(num)
         pose = self._training_start(num)
-        return pose if self._line is None else self._put_on_line(self._line, pose)
+        return self._put_on_line(self._line, pose) if self._line is not None and self._on_line else pose
+
+    @property
+    def on_line(self) -> float:
+        """Share of training episodes that begin on the line; settable where there is one."""
+        return self._on_line
+
+    @on_line.setter
+    def on_line(self, share: float) -> None:
+        _check_share("on_line", share)
+        if share and self._line is None:
+            raise ValueError(f"on_line={share}: give a line to begin on, `plan_racing_line(track, parameters)`.")
+        self._on_line = share
 
     def _start(self, num: int) -> StartPose:
         """Return the track's start pose, at rest, with the noise of evaluation."""
@@ -220,6 +228,12 @@ class StartSampler:
         position = torch.minimum(torch.maximum(position, self._low), self._high)
         roll, pitch, yaw_noise = (noise[:, 3:] * self._attitude_noise).unbind(-1)
         return position, from_roll_pitch_yaw(roll, pitch, yaw + yaw_noise)
+
+
+def _check_share(name: str, share: float) -> None:
+    """Refuse what is no share of episodes."""
+    if not 0.0 <= share <= 1.0:
+        raise ValueError(f"{name}={share}: a share of episodes lies between 0 and 1.")
 
 
 def _check_start_noise(start_noise: float, track: Track) -> None:

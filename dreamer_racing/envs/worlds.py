@@ -141,6 +141,15 @@ class RaceWorlds:
             self.track, self._generator, self.device, self.dtype, beyond_gate, noise, on_line=on_line, line=line
         )
 
+    @property
+    def start_on_line(self) -> float:
+        """Share of training episodes that begin on the racing line; settable where there was one from the start."""
+        return self._starts.on_line
+
+    @start_on_line.setter
+    def start_on_line(self, share: float) -> None:
+        self._starts.on_line = share
+
     def seed(self, seed: int | None) -> None:
         """Seed start poses and physics randomisation; None draws a seed from the operating system."""
         if seed is None:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
-from dreamer_racing.losses.contract import require_keys
+from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import imagine, lambda_return
 from dreamer_racing.modules.actor import Actor
 from dreamer_racing.modules.critic import Critic
@@ -101,9 +101,9 @@ class ActorLoss(LossModule):
         self.actor = actor
         self.critic = critic
         self.horizon = horizon
-        self.discount = discount
+        self.discount = scheduled(discount)
         self.lambda_ = lambda_
-        self.entropy_scale = entropy_scale
+        self.entropy_scale = scheduled(entropy_scale)
         self.continuation = continuation
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 

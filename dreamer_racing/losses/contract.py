@@ -1,11 +1,13 @@
-"""What a loss asks of its input."""
+"""What a loss asks of its input, and what of it may change while it is used."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import nn
 
 
 def require_keys(loss: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
@@ -23,3 +25,8 @@ def require_keys(loss: object, tensordict: TensorDictBase, keys: Iterable[Nested
     if missing:
         found = sorted(map(str, tensordict.keys()))
         raise KeyError(f"{type(loss).__name__} needs {missing}, which the batch lacks. It has: {', '.join(found)}.")
+
+
+def scheduled(value: float) -> nn.Buffer:
+    """Return a number that may change between updates, as a scalar that a captured CUDA graph reads anew each time."""
+    return nn.Buffer(torch.tensor(float(value)), persistent=False)

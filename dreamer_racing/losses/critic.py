@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from dreamer_racing.losses.contract import require_keys
+from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import lambda_return
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import join_features
@@ -28,7 +28,7 @@ def replay_return(
     is_init: Tensor,
     terminated: Tensor,
     truncated: Tensor,
-    discount: float,
+    discount: float | Tensor,
     lambda_: float,
 ) -> tuple[Tensor, Tensor]:
     """Compute λ-returns along windows that may hold several episodes.
@@ -42,7 +42,7 @@ def replay_return(
         is_init: Whether each record is its episode's first, bool ``(B, T, 1)``.
         terminated: bool ``(B, T, 1)``.
         truncated: bool ``(B, T, 1)``.
-        discount: γ.
+        discount: γ, a number or a scalar.
         lambda_: λ.
 
     Returns:
@@ -57,7 +57,7 @@ def replay_return(
     steps = lambda_return(
         reward[:, 1:].transpose(0, 1),
         value[:, 1:].transpose(0, 1),
-        torch.full_like(kept, discount).transpose(0, 1),
+        (discount * torch.ones_like(kept)).transpose(0, 1),
         kept.transpose(0, 1),
     )
     returns = torch.cat((steps.transpose(0, 1), value[:, -1:]), 1)
@@ -97,7 +97,7 @@ class CriticLoss(LossModule):
     ) -> None:
         super().__init__()
         self.critic = critic
-        self.discount = discount
+        self.discount = scheduled(discount)
         self.lambda_ = lambda_
         self.slow_scale = slow_scale
         self.replay_scale = replay_scale
