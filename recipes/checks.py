@@ -291,14 +291,13 @@ def check_schedule(config: DreamerConfig) -> None:
     }
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
-        if ramp is None:
-            continue
         ramp.check(f"schedule.{name}")
-        if ramp.to not in allowed:
+        if ramp.to is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
-    if config.schedule.start_on_line and not is_race(config):
+    to = config.schedule.start_on_line.to
+    if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
-    if config.schedule.start_on_line and not config.env.start_on_line:
+    if to is not None and not config.env.start_on_line:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
 
 

@@ -70,8 +70,8 @@ class DreamerRun(ReplayRun):
             "discount": (schedule.discount, loss.discount),
             "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
         }
-        self.learner.adjust(**{name: ramp.at(value, progress) for name, (ramp, value) in now.items() if ramp})
-        if schedule.start_on_line:
+        self.learner.adjust(**{name: ramp.at(value, progress) for name, (ramp, value) in now.items()})
+        if schedule.start_on_line.to is not None:
             share = schedule.start_on_line.at(self.config.env.start_on_line, progress)
             cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 

@@ -142,10 +142,10 @@ class CheckpointConfig:
 class ScheduleConfig:
     """Settings that move over a run, each from its own value `to` another between two shares of total_env_steps."""
 
-    learning_rates: Ramp | None = None  # `to`: share of all learning rates that is left
-    discount: Ramp | None = None  # loss.discount
-    entropy_scale: Ramp | None = None  # loss.entropy_scale
-    start_on_line: Ramp | None = None  # env.start_on_line
+    learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
+    discount: Ramp = field(default_factory=Ramp)  # loss.discount
+    entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
+    start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
 
 
 class Collection(Enum):

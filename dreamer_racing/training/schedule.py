@@ -10,7 +10,7 @@ class Ramp:
     """A setting that moves linearly from its own value to another, between two shares of a run's env_steps.
 
     Attributes:
-        to: Where it ends.
+        to: Where it ends; None: it stays at its own value.
         begin: Share of the run at which it leaves its own value.
         end: Share of the run from which on it stays at ``to``.
 
@@ -19,7 +19,7 @@ class Ramp:
         0.985
     """
 
-    to: float
+    to: float | None = None
     begin: float = 0.0
     end: float = 1.0
 
@@ -45,6 +45,8 @@ class Ramp:
             value: Its own value, where it begins.
             progress: Share of the run's env_steps that are made; beyond 1 it counts as 1.
         """
+        if self.to is None:
+            return value
         if progress >= self.end:
             return self.to
         if progress <= self.begin:
