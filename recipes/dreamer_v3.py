@@ -16,7 +16,7 @@ import hydra
 from arena import make_env, make_learner
 from building import assemble, claim, make_collector, make_curriculum, make_run_replay, resolve_common, seed_generators
 from checks import check_dreamer
-from command_line import CONFIG_DIR, computes_bfloat16
+from command_line import CONFIG_DIR, choose_device, computes_bfloat16
 from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, register
 from tensordict import TensorDictBase
@@ -31,6 +31,11 @@ from dreamer_racing.modules import Interface
 
 NUM_ENVS = 32
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
+RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
+  the world model decodes the simulator's state in training; whoever flies sees images only
+  training episodes begin in flight on a planned racing line, fewer and fewer of them; a missed gate ends them
+  25 actions a second; the actor is trained by PPO on imagined rollouts; averaged weights fly evaluations and exports
+  recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -98,7 +103,17 @@ class DreamerRun(ReplayRun):
 @hydra.main(version_base="1.3", config_path="config", config_name="dreamer_v3")
 def main(config: DictConfig) -> None:
     """Compose the configuration, build the run, train."""
-    launch(config, resolve, build)
+    launch(config, resolve, build, tune)
+
+
+def tune(config: DictConfig) -> str:
+    """Choose the file of the group `tuned` for what is to be trained, and say what it means."""
+    on_cpu = choose_device(config.device).type == "cpu"
+    short = config.model.size == "debug" or config.budget in ("smoke", "paper")
+    if not on_cpu or short or config.env.suite != "race" or not config.env.from_pixels:
+        return "none"
+    print(RACE_SETTINGS)
+    return "race"
 
 
 def resolve(config: DictConfig) -> DictConfig:

@@ -121,6 +121,7 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
         ValueError: the message names the overrides that differ.
     """
     saved, wanted = settings_of(OmegaConf.load(run_dir / "overrides.yaml")), settings_of(overrides)
+    saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:
         values = ", ".join(

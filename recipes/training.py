@@ -153,13 +153,16 @@ class ReplayRun(Run):
         """Do what a recipe does with a batch that was learned from."""
 
 
-def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
+def launch(
+    config: DictConfig, resolve: Callable, build: Callable, tune: Callable[[DictConfig], str] | None = None
+) -> None:
     """Compose the configuration of a recipe, build its run, train it to its end.
 
     Args:
         config: as hydra composed it.
         resolve: replaces what the configuration leaves open.
         build: makes the ``Run`` of a configuration and its overrides.
+        tune: says which file of the group ``tuned`` is meant by ``tuned=auto``; None where there is no such group.
     """
     start_logging()
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
@@ -168,6 +171,9 @@ def launch(config: DictConfig, resolve: Callable, build: Callable) -> None:
         overrides = list(HydraConfig.get().overrides.task)
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
+        if tune and config.tuned == "auto":
+            overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
+            config = hydra.compose(config.algorithm, overrides)
         check_overrides(config, overrides)
         config = resolve(config)
         if config.resume and (changed := changed_settings(config)):
