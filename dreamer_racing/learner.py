@@ -48,6 +48,7 @@ class LearnerConfig:
         free_nats: KL below which there is no gradient, nats.
         kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
         privileged_scale: Weight of decoding the privileged state, where the loss does.
+        embedding_scale: Weight of decoding it from the encoder's embedding too, which is not in the reference; 0: not.
         barlow_scale: Weight of the redundancy reduction, where the loss has it.
         continuation: Whether predicted ends of episodes cut imagined returns.
         slow_critic_scale: Weight of the regularisation towards the slow critic.
@@ -83,6 +84,7 @@ class LearnerConfig:
     free_nats: float = 1.0
     kl_mode: str = "separate"
     privileged_scale: float = 1.0
+    embedding_scale: float = 0.0
     barlow_scale: float = 0.05
     continuation: bool = True
     slow_critic_scale: float = 1.0
@@ -180,6 +182,7 @@ def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
         ValueError: If they differ in anything but the name; the message says in what, and what to do.
     """
     wanted = asdict(size)
+    checkpoint = {"sampled": ModelSize.sampled, **checkpoint}  # older ones do not say
     differences = [
         f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
         for field in fields(size)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import Transform
 
-from dreamer_racing.modules.stored_latents import CONTEXT, pack_latents
+from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
 from dreamer_racing.streams import (
     RecordStorage,
     StreamMemmapStorage,
@@ -40,7 +40,7 @@ def records_from_rollout(
     rollout: TensorDictBase,
     observation_keys: Sequence[NestedKey] = ("pixels",),
     reward_keys: Sequence[str] = RACE_REWARD_KEYS,
-    latents: int | None = None,
+    latents: LatentFormat | None = None,
 ) -> TensorDictBase:
     """Converts what a TorchRL collector yields into replay records.
 
@@ -53,9 +53,8 @@ def records_from_rollout(
             observations, the rewards, ``terminated``, ``truncated``.
         observation_keys: what of an observation is kept.
         reward_keys: which rewards are kept.
-        latents: number of the categorical latents whose classes, with the belief, are kept as each record's
-            ``context``: what the policy had in mind before it saw the record's observation (`pack_latents`). None: none
-            are kept.
+        latents: how the policy's latents are kept as each record's ``context``: what it had in mind before it saw the
+            record's observation. None: they are not.
 
     Returns:
         Records, batch ``[M]`` with M = N·T + number of first observations, first all arrivals, then all first
@@ -81,7 +80,7 @@ def records_from_rollout(
     arrival.update({"previous_action": flat["action"], "is_init": torch.zeros_like(flat["is_init"])})
     arrival.update({"stream": stream, "order": order})
     if latents is not None:
-        arrival.set(CONTEXT, pack_latents(flat["next", "belief"], flat["next", "state"], latents))
+        arrival.set(CONTEXT, latents.pack(flat["next", "belief"], flat["next", "state"]))
     initial = flat.select(*observation_keys)[first]
     zeros = arrival.select("previous_action", *reward_keys, *_END_KEYS, CONTEXT, strict=False)[: len(first)]
     initial.update(zeros.apply(torch.zeros_like))
@@ -90,7 +89,7 @@ def records_from_rollout(
 
 
 def _check_rollout(
-    rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str], latents: int | None
+    rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str], latents: LatentFormat | None
 ) -> None:
     if rollout.ndim < 2:
         raise ValueError(f"Expected a rollout of batch [environments, time], got batch {list(rollout.shape)}.")
@@ -113,7 +112,7 @@ class StreamReplay(TensorDictReplayBuffer):
     Args:
         observation_keys: what of an observation is kept.
         reward_keys: which rewards are kept.
-        latents: number of the policy's categorical latents, to keep each record's ``context``; None keeps none.
+        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
         **kwargs: of `TensorDictReplayBuffer`.
     """
 
@@ -127,7 +126,7 @@ class StreamReplay(TensorDictReplayBuffer):
         *,
         observation_keys: Sequence[NestedKey] = ("pixels",),
         reward_keys: Sequence[str] = RACE_REWARD_KEYS,
-        latents: int | None = None,
+        latents: LatentFormat | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
@@ -151,7 +150,7 @@ class StreamReplay(TensorDictReplayBuffer):
         Reference: danijar/dreamerv3, ``replay_context`` (latents written back to the replay after each update).
         """
         assert self.latents is not None, "made without latents: there is no context to refresh"
-        packed = pack_latents(belief[:, :-1], state[:, :-1], self.latents).flatten()
+        packed = self.latents.pack(belief[:, :-1], state[:, :-1]).flatten()
         self._storage.overwrite(slots[:, 1:].flatten(), TensorDict({CONTEXT: packed}, packed.batch_size))
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
@@ -227,7 +226,7 @@ def replay_bytes(
     image_shape: Sequence[int] = (64, 64, 3),
     action_size: int = 4,
     numbers: int = 0,
-    context: tuple[int, int] = (0, 0),
+    latents: LatentFormat | None = None,
 ) -> int:
     """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
 
@@ -236,11 +235,11 @@ def replay_bytes(
         image_shape: of ``pixels``.
         action_size: A.
         numbers: float32 observed beside the image: ``vector`` and the privileged one.
-        context: widths D and L of the belief and of the state's classes, where they are kept.
+        latents: how latents are kept, if they are.
     """
-    flags, (belief, latents) = 1 + len(_END_KEYS), context
+    flags, context = 1 + len(_END_KEYS), latents.bytes if latents else 0
     floats = action_size + len(RACE_REWARD_KEYS) + numbers
-    return capacity * (math.prod(image_shape) + 4 * floats + flags + 2 * belief + latents)
+    return capacity * (math.prod(image_shape) + 4 * floats + flags + context)
 
 
 def make_replay(
@@ -261,7 +260,7 @@ def make_replay(
     recent_records: int | None = None,
     held_out: int = 0,
     prefetch: int | None = None,
-    latents: int | None = None,
+    latents: LatentFormat | None = None,
 ) -> StreamReplay:
     """Builds the replay of N streams.
 
@@ -284,7 +283,7 @@ def make_replay(
         held_out: the last streams are kept out of samples, for `StreamReplay.held_out`.
         prefetch: samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the newest
             records, and a restored replay then does not continue the same samples.
-        latents: number of the policy's categorical latents, to keep each record's ``context`` (`pack_latents`).
+        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
 
     Raises:
         ValueError: if a stream could not hold one window, ``recent_share`` is not a share, or all streams are held out.

@@ -17,7 +17,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.learner import DreamerLearner, Learner, LearnerConfig
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
-from dreamer_racing.modules import Interface
+from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.reporting import EvaluationReport, ReturnReport
 
 Environment = DroneRacingEnv | ControlSuiteEnv
@@ -155,7 +155,8 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
-        return DreamerLearner(config.model.size, interface, learner_config(config), device, config.seed)
+        size = replace(get_size(config.model.size), sampled=config.model.sampled)
+        return DreamerLearner(size, interface, learner_config(config), device, config.seed)
     assert isinstance(config, (PPORunConfig, SACRunConfig))
     size = NetworkSize(config.network.layers, config.network.units)
     if isinstance(config, SACRunConfig):

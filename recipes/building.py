@@ -34,6 +34,7 @@ from dreamer_racing.memory import (
 )
 from dreamer_racing.metrics import EpisodeTracker, MetricsLog
 from dreamer_racing.modules import Interface
+from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.run_lock import RunLock
 from dreamer_racing.timing import RunClock
@@ -122,7 +123,7 @@ def make_run_replay(
     curriculum: BodyRateCurriculum | None,
     batch_size: int,
     batch_length: int,
-    context: tuple[int, int] = (0, 0),
+    latents: LatentFormat | None = None,
     **windows: Any,
 ) -> StreamReplay:
     """Make the replay, on the learner's device if it has room there; say where and how large.
@@ -133,13 +134,13 @@ def make_run_replay(
         curriculum: by which old rewards are relabelled, if they are.
         batch_size: windows in a batch.
         batch_length: records in a window.
-        context: widths of the belief and of the state's classes, where latents are kept with the records.
+        latents: how they are kept with the records, if they are.
         windows: further arguments of `make_replay` on which windows are drawn.
     """
     settings, interface = config.replay, Interface.of(env)
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
-    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, context)
+    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
     storage_device = settings.device
     if storage_device == "auto":
         on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
@@ -160,6 +161,7 @@ def make_run_replay(
         transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,
         reward_keys=reward_terms(env),
+        latents=latents,
         prefetch=2 if config.device != "cpu" and storage_device == "cpu" else None,
         **windows,
     )

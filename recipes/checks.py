@@ -68,6 +68,7 @@ RANGES = {
     "loss.representation_scale": NOT_NEGATIVE,
     "loss.free_nats": NOT_NEGATIVE,
     "loss.privileged_scale": NOT_NEGATIVE,
+    "loss.embedding_scale": NOT_NEGATIVE,
     "loss.barlow_scale": NOT_NEGATIVE,
     "loss.replay_value_scale": NOT_NEGATIVE,
     "network.layers": NOT_NEGATIVE,

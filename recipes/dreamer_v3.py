@@ -151,7 +151,6 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     acting = acting_copy(policy) if overlapped else policy
     collector = make_collector(config, env, acting)
     curriculum = make_curriculum(config)
-    size = learner.size
     return assemble(
         DreamerRun,
         config,
@@ -168,8 +167,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
             curriculum,
             config.model.batch_size,
             config.model.batch_length,
-            context=(size.belief, size.latents) if config.replay.context else (0, 0),
-            latents=size.latents if config.replay.context else None,
+            latents=learner.agent.world_model.rssm.latent_format if config.replay.context else None,
             recent_share=config.replay.recent_share,
             recent_records=config.replay.recent_records,
             held_out=config.replay.held_out,

@@ -37,6 +37,7 @@ class ModelConfig:
     """Size of the networks and the numbers that go with it: `auto` chooses by device, what is missing by size."""
 
     size: str = MISSING
+    sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
     batch_size: int = MISSING  # windows in a batch
     batch_length: int = MISSING  # records in a window
     replay_ratio: float = MISSING  # records trained on per environment step
@@ -66,6 +67,7 @@ class LossConfig:
     free_nats: float = 1.0
     kl_mode: str = "separate"  # separate | per_latent
     privileged_scale: float = 1.0  # of decoding the privileged state: losses informed and privileged
+    embedding_scale: float = 0.0  # of decoding it from one image's embedding too; 0: not
     barlow_scale: float = 0.05  # of the redundancy reduction: loss decoder_free
     continuation: bool = True  # predicted ends of episodes cut imagined returns
     replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off

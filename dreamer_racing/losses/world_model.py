@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules.rssm import Posterior, mix_uniform
-from dreamer_racing.modules.stored_latents import CONTEXT, unpack_latents
+from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ class WorldModelLoss(LossModule):
             embedding,
             tensordict.get("previous_action"),
             tensordict.get("is_init").squeeze(-1),
-            initial=None if context is None else unpack_latents(context[:, 0], rssm.classes),
+            initial=None if context is None else rssm.latent_format.unpack(context[:, 0]),
         )
         features = join_features(posterior.belief, posterior.state)
         losses = self.represent(posterior, features, embedding, tensordict)

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear, unrolled
 
 
@@ -175,6 +176,8 @@ class RSSM(nn.Module):
         norm: ``"rms"`` or ``"layer"``.
         learned_initial: Whether the initial belief is learned (then the initial state is the prior's mode) or zero.
         unimix: Share of the uniform distribution in every categorical.
+        sampled: Whether a state is a sample of its categoricals, as in DreamerV3, or their probabilities themselves:
+            then nothing is drawn, in acting, training and imagination alike.
 
     Example:
         >>> import torch
@@ -200,9 +203,10 @@ class RSSM(nn.Module):
         norm: str = "rms",
         learned_initial: bool = False,
         unimix: float = 0.01,
+        sampled: bool = True,
     ) -> None:
         super().__init__()
-        self.latents, self.classes, self.unimix = latents, classes, unimix
+        self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
         state = latents * classes
         self.cell = CELLS[recurrence](belief, state, action, hidden, norm, blocks)
         widths = [belief] + [hidden] * prior_layers
@@ -221,6 +225,11 @@ class RSSM(nn.Module):
         if not self.learned_initial:
             return belief, belief.new_zeros(1, self.latents * self.classes)
         return belief, self._sample(self.prior_logits(belief), None)
+
+    @property
+    def latent_format(self) -> LatentFormat:
+        """How a replay keeps its latents."""
+        return LatentFormat(self.initial_belief.shape[-1], self.latents, self.classes, self.sampled)
 
     def prior_logits(self, belief: Tensor) -> Tensor:
         """Map beliefs ``(..., D)`` to the prior's logits ``(..., L, K)``."""
@@ -339,5 +348,6 @@ class RSSM(nn.Module):
         return belief, self._sample(logits, noise), logits
 
     def _sample(self, logits: Tensor, noise: Tensor | None) -> Tensor:
-        """Sample a state ``(N, S)`` from logits ``(N, L, K)``."""
-        return sample_one_hot(mix_uniform(logits, self.unimix), noise).flatten(-2)
+        """Return a state ``(N, S)`` by logits ``(N, L, K)``."""
+        probabilities = mix_uniform(logits, self.unimix)
+        return (sample_one_hot(probabilities, noise) if self.sampled else probabilities).flatten(-2)

@@ -31,6 +31,8 @@ class ModelSize:
         cnn_patch: Side of the pixel blocks folded into channels before the first convolution (1: none). With 2, the
             widest maps and their normalisation disappear, at nearly the same FLOPs.
         bins: Bins of the two-hot reward and value distributions.
+        sampled: Whether z is a sample of its categoricals, as in DreamerV3, or their probabilities (an extension: the
+            latents are then deterministic, and so is imagination but for the actor's noise).
     """
 
     name: str
@@ -53,6 +55,7 @@ class ModelSize:
     strided: bool = False
     cnn_patch: int = 1
     bins: int = 255
+    sampled: bool = True
 
     @property
     def state(self) -> int:

@@ -5,6 +5,8 @@ Shape legend: N any batch, D belief, L latents, K classes, S state = L·K.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -13,34 +15,43 @@ CONTEXT = "context"
 """Key of a record under which lie the latents *before* its observation: ``belief`` and ``state``, packed."""
 
 
-def pack_latents(belief: Tensor, state: Tensor, latents: int) -> TensorDict:
-    """Pack latents into 2·D + L bytes each.
+class LatentFormat(NamedTuple):
+    """How latents are packed: the belief as float16, the state as the class of each latent, or its probabilities.
 
-    Args:
-        belief: h, in [−1, 1], ``(*N, D)``.
-        state: z as flattened one-hots, ``(*N, S)``.
+    Attributes:
+        belief: D.
         latents: L.
-
-    Returns:
-        ``belief`` float16 ``(*N, D)``, within 5e-4 of the original, and ``state`` uint8 ``(*N, L)``, the class of each
-        latent; batch ``[*N]``.
+        classes: K.
+        sampled: Whether states are one-hots, of which the class is kept (uint8), or probabilities (float16).
 
     Example:
         >>> import torch
-        >>> packed = pack_latents(torch.zeros(2, 3), torch.eye(4)[:2], latents=1)
+        >>> packed = LatentFormat(belief=3, latents=1, classes=4, sampled=True).pack(torch.zeros(2, 3), torch.eye(4)[:2])
         >>> packed["state"].tolist()
         [[0], [1]]
     """
-    classes = state.unflatten(-1, (latents, -1)).argmax(-1).to(torch.uint8)
-    return TensorDict({"belief": belief.half(), "state": classes}, belief.shape[:-1], device=belief.device)
 
+    belief: int
+    latents: int
+    classes: int
+    sampled: bool = True
 
-def unpack_latents(packed: TensorDictBase, classes: int) -> tuple[Tensor, Tensor]:
-    """Return belief float32 ``(*N, D)`` and state float32 ``(*N, S)`` of packed latents ``[*N]``.
+    @property
+    def bytes(self) -> int:
+        """What the latents of one record take."""
+        return 2 * self.belief + self.latents * (1 if self.sampled else 2 * self.classes)
 
-    Args:
-        packed: What ``pack_latents`` returned.
-        classes: K.
-    """
-    one_hot = torch.nn.functional.one_hot(packed.get("state").long(), classes)
-    return packed.get("belief").float(), one_hot.flatten(-2).float()
+    def pack(self, belief: Tensor, state: Tensor) -> TensorDict:
+        """Pack belief ``(*N, D)``, in [−1, 1], and state ``(*N, S)``; batch ``[*N]``. Floats are within 5e-4 after."""
+        if self.sampled:
+            state = state.unflatten(-1, (self.latents, self.classes)).argmax(-1).to(torch.uint8)
+        else:
+            state = state.half()
+        return TensorDict({"belief": belief.half(), "state": state}, belief.shape[:-1], device=belief.device)
+
+    def unpack(self, packed: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return belief ``(*N, D)`` and state ``(*N, S)``, float32, of packed latents ``[*N]``."""
+        belief, state = packed.get("belief").float(), packed.get("state")
+        if self.sampled:
+            state = torch.nn.functional.one_hot(state.long(), self.classes).flatten(-2)
+        return belief, state.float()

@@ -61,6 +61,7 @@ class WorldModel(nn.Module):
             prior_layers=size.prior_layers,
             norm=size.norm,
             learned_initial=size.learned_initial,
+            sampled=size.sampled,
         )
         self.decoder = self._image_decoder() if decode and interface.pixels else None
         self.vector_decoder = (
