@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -96,26 +97,49 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "overrides", "words"),
+    ("settings", "words"),
     [
-        ("fly", ["image_size=64"], ["image_size=64", "image_size=32"]),
-        ("fly", ["control_rate=50"], ["control_rate=50.0", "control_rate=25.0"]),
-        ("fly", ["camera_tilt=10"], ["camera_tilt=10.0", "camera_tilt=25.0"]),
-        ("fly", ["pilot=hover"], ["pilot=hover and agent=", "one of them"]),
-        ("evaluate", ["weights=trained"], ["weights=trained", "mine holds the averaged weights only"]),
-        ("export", ["agent=again"], ["is an agent already"]),
-        ("export", ["agent=again", "output=x/actor.onnx"], ["output=x/actor.onnx and agent=again"]),
-        ("export", ["commit=abc"], ["commit=abc is for agent=FOLDER"]),
+        ({"image_size": 64}, "image_size=64: .*mine was trained with image_size=32, and flies with nothing else"),
+        ({"control_rate": 50.0}, "control_rate=50.0: .*mine was trained with control_rate=25.0"),
+        ({"camera_tilt": 10.0}, "camera_tilt=10.0: .*mine was trained with camera_tilt=25.0"),
+        ({"track": "monza"}, "monza"),
     ],
-    ids=lambda value: value[0] if isinstance(value, list) else value,
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_bad_input_gets_a_plain_error(
-    agent: Path, name: str, overrides: list[str], words: list[str], tmp_path: Path
+def test_what_an_agent_cannot_fly_is_refused(
+    agent: Path, settings: dict, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    field = "agent" if name == "fly" else "checkpoint"
-    done = recipe(name, f"{field}={agent}", *overrides, cwd=tmp_path)
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
+    fly = recipe_module("fly")
+    config = fly.FlyConfig(agent=str(agent), **settings)
+    fly.check(config)
+    with pytest.raises(SystemExit, match="2"):
+        fly.fly_agent(config)
+    assert re.search(f"^error: .*{words}", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+def test_weights_that_an_agent_does_not_hold_are_refused(agent: Path) -> None:
+    settings = recipe_module("schema").EvaluateConfig(checkpoint=str(agent), weights="trained", device="cpu")
+    with pytest.raises(ValueError, match="weights=trained: .*mine holds the averaged weights only"):
+        recipe_module("restoring").restore(settings)
+
+
+def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> None:
+    fly, export, schema = (recipe_module(name) for name in ("fly", "export", "schema"))
+    for settings in ({"pilot": "hover"}, {"viewer": True}):
+        with pytest.raises(ValueError, match="and agent=kidney: give one of them"):
+            fly.check(fly.FlyConfig(agent="kidney", **settings))
+    with pytest.raises(ValueError, match="pilot=human: there are scripted, hover"):
+        fly.check(fly.FlyConfig(pilot="human"))
+    (tmp_path / "agent.json").write_text("{}")
+    for settings, words in (
+        ({"commit": "abc"}, "commit=abc is for agent=FOLDER"),
+        ({"agent": "new", "output": "x.onnx"}, "output=x.onnx and agent=new: give one"),
+        ({"agent": "new", "latent": "sample"}, "latent=sample: agents ship with latent=mode"),
+        ({"agent": "new"}, "checkpoint=there is an agent already"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            export.check_agent(schema.ExportConfig(checkpoint="there", **settings), tmp_path)
 
 
 def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,6 +156,7 @@ def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monk
     assert restoring.find_trained("kidney") == restoring.find_trained(str(tmp_path / "kidney")) == tmp_path / "kidney"
 
 
+@pytest.mark.slow
 def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path: Path) -> None:
     arena = recipe_module("arena")
     shutil.copytree(run_dir, tmp_path / "run")
