@@ -228,6 +228,41 @@ def load_components(
     return _restore(_bind(components), latest_checkpoint(path), map_location)
 
 
+def load_state(
+    path: str | Path, part: str, map_location: torch.device | str = "cpu"
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Reads the state of one part of a checkpoint without the part itself.
+
+    Args:
+        path: run directory, folder of checkpoints, or one checkpoint.
+        part: the name that it was saved under.
+        map_location: as in `RunCheckpoints.load`.
+
+    Returns:
+        The state, and the metadata of the checkpoint, with ``env_steps``.
+
+    Raises:
+        FileNotFoundError: if there is no complete checkpoint.
+        CheckpointError: if it has no such part.
+    """
+    state = _PlainState()
+    metadata = load_components(path, {part: state}, map_location)
+    return dict(state.value), metadata
+
+
+class _PlainState:
+    """Takes whatever a checkpoint holds of a part."""
+
+    def __init__(self) -> None:
+        self.value: Mapping[str, Any] = {}
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return self.value
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.value = state
+
+
 def latest_checkpoint(path: str | Path) -> Path:
     """Finds the newest complete checkpoint. Folders that a killed process left incomplete are passed over.
 

@@ -21,15 +21,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dreamer_racing.checkpoint import ensure_writable, load_components
+from dreamer_racing.checkpoint import ensure_writable
 from dreamer_racing.export_parity import ACTION_TOLERANCE, Flight, TorchActor, check_parity, check_steps
 from dreamer_racing.learner import Agent
-from dreamer_racing.modules import Interface, ModelSize, join_features
+from dreamer_racing.modules import join_features
 from dreamer_racing.modules.rssm import mix_uniform
 from dreamer_racing.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
+from dreamer_racing.weights_file import write_weights
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 OUTPUTS = ("action", "h_next", "z_next")
+WEIGHTS = "weights.safetensors"
 PROTOBUF_LIMIT = 2_000_000_000
 """Bytes that an ONNX file may have without external data."""
 
@@ -172,48 +174,6 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
     return LATENTS[latent](agent)
 
 
-class _LearnerState:
-    """Takes what a checkpoint holds of a learner, whatever its losses were."""
-
-    def __init__(self) -> None:
-        self.value: Mapping[str, Any] = {}
-
-    def state_dict(self) -> Mapping[str, Any]:
-        return self.value
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.value = state
-
-
-def load_agent(checkpoint: str | Path, interface: Interface) -> tuple[Agent, dict[str, Any]]:
-    """Restore the agent of a checkpoint, without decoders, on the CPU.
-
-    Args:
-        checkpoint: Run directory, folder of checkpoints, or one checkpoint.
-        interface: What the agent sees and does.
-
-    Returns:
-        The agent and the checkpoint's metadata, with ``env_steps``.
-
-    Raises:
-        FileNotFoundError: If there is no complete checkpoint.
-        CheckpointError: If it has no learner.
-        ValueError: If its networks do not fit the interface.
-    """
-    state = _LearnerState()
-    metadata = load_components(checkpoint, {"learner": state})
-    saved = state.value["size"].items()
-    size: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in saved}
-    agent = Agent(ModelSize(**size), interface, decode=False)
-    try:
-        missing = agent.load_state_dict(state.value["agent"], strict=False).missing_keys
-    except RuntimeError as error:
-        raise ValueError(f"The networks of {checkpoint} do not fit {interface}: {error}") from error
-    if missing:
-        raise ValueError(f"The networks of {checkpoint} do not fit {interface}: {', '.join(missing[:3])} are missing.")
-    return agent.requires_grad_(False), metadata
-
-
 def check_output(output: str | Path) -> Path:
     """Refuse what could only fail after the work is done.
 
@@ -249,7 +209,12 @@ def check_output(output: str | Path) -> Path:
 
 
 def export_actor(
-    step: ActorStep, contract: Mapping[str, Any], flight: Flight, output: str | Path, seed: int = 0
+    step: ActorStep,
+    contract: Mapping[str, Any],
+    flight: Flight,
+    output: str | Path,
+    seed: int = 0,
+    shared_weights: bool = False,
 ) -> dict[str, float]:
     """Write a step as ``.onnx`` and ``.pt2`` with contract.json beside them, if both fly as the original does.
 
@@ -259,6 +224,8 @@ def export_actor(
         flight: To compare them over, at least ``MIN_STEPS`` steps.
         output: Path of the ``.onnx`` file; the ``.pt2`` has the same stem. Those of an earlier export are replaced.
         seed: Of the noise that samples latents in the comparison.
+        shared_weights: Keep the weights in a file beside the ``.onnx``, which torch can read too, instead of inside of
+            it; the ``.pt2``, which would hold them once more, is compared and left out.
 
     Returns:
         Largest deviation of an action from the original's, of either.
@@ -276,10 +243,11 @@ def export_actor(
     try:
         onnx, program = partial / output.name, partial / output.with_suffix(".pt2").name
         write_step(step, onnx, program)
-        files = {
-            kind: {"name": path.name, "sha256": hash_file(path)}
-            for kind, path in (("onnx", onnx), ("torch_export", program))
-        }
+        written = {"onnx": onnx, "torch_export": program}
+        if shared_weights:
+            written = {"onnx": onnx, "weights": partial / WEIGHTS}
+            share_weights(step, onnx, written["weights"])
+        files = {kind: {"name": path.name, "sha256": hash_file(path)} for kind, path in written.items()}
         full = {**contract, "files": files}
         _write_json(partial / CONTRACT, full)
         actors: dict[str, RecurrentActor] = {
@@ -296,7 +264,7 @@ def export_actor(
             "latent_flips": 0,
         }
         _write_json(partial / CONTRACT, full)
-        for path in (program, onnx, partial / CONTRACT):
+        for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -328,6 +296,24 @@ def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
         external_data=False,
         verbose=False,
     )
+
+
+def share_weights(step: ActorStep, onnx: Path, weights: Path) -> None:
+    """Write the weights of a step to a file, and have its ONNX file point into that instead of holding them.
+
+    What the exporter has transformed, or has found to be equal to another weight, stays inside of the ONNX file.
+    """
+    import onnx as onnx_format
+
+    extents = write_weights(weights, step.state_dict())
+    content = weights.read_bytes()
+    model = onnx_format.load(onnx)
+    for tensor in model.graph.initializer:
+        extent = extents.get(tensor.name)
+        if extent and tensor.raw_data == content[extent.offset : extent.offset + extent.length]:
+            onnx_format.external_data_helper.set_external_data(tensor, weights.name, *extent)
+            tensor.ClearField("raw_data")
+    onnx.write_bytes(model.SerializeToString())
 
 
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:

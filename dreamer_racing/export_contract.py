@@ -58,7 +58,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
             if step.interface.pixels
             else "Divide the numbers as 'vector' says; the graph computes their symlog."
         ),
-        "camera": _describe_camera(camera) if step.interface.pixels else None,
+        "camera": describe_camera(camera) if step.interface.pixels else None,
         "vector": None if step.interface.pixels else _describe_vector(),
         "control": {"rate_hz": 1.0 / parameters.control_dt, "period_s": parameters.control_dt},
         "frames": {
@@ -97,7 +97,8 @@ def _describe(tensors: Mapping[str, Tensor]) -> list[dict[str, Any]]:
     ]
 
 
-def _describe_camera(camera: Camera) -> dict[str, Any]:
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """Return what a contract says of a camera."""
     return {
         "width_px": camera.width,
         "height_px": camera.height,

@@ -105,18 +105,23 @@ class LearnerConfig:
     critic_loss: str = "two_hot"
 
 
-class Learner(Protocol):
-    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do."""
+class Flyer(Protocol):
+    """What can be evaluated: every learner, and a `ShippedAgent`."""
 
     device: torch.device
+
+    def evaluation_policy(self, deterministic: bool = False) -> Any:
+        """Return the acting step to evaluate, which may be one of averaged weights."""
+        ...
+
+
+class Learner(Flyer, Protocol):
+    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do."""
+
     updates: int
 
     def policy(self, deterministic: bool = False) -> Any:
         """Return the acting step that is trained, which shares the learner's parameters."""
-        ...
-
-    def evaluation_policy(self, deterministic: bool = False) -> Any:
-        """Return the acting step to evaluate, which may be one of averaged weights."""
         ...
 
     def check_finite(self) -> None:
@@ -302,9 +307,7 @@ class DreamerLearner:
             rate = max(self.config.average_rate, 1.0 / self.updates)
             torch._foreach_lerp_(list(self.averaged.parameters()), list(self.agent.parameters()), rate)
 
-    def adjust(
-        self, *, rates: float = 1.0, discount: float | None = None, entropy_scale: float | None = None
-    ) -> None:
+    def adjust(self, *, rates: float = 1.0, discount: float | None = None, entropy_scale: float | None = None) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named is as configured.
 
         Args:

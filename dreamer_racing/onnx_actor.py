@@ -135,18 +135,28 @@ class OnnxActor(RecurrentActor):
         if not path.is_file():
             raise FileNotFoundError(f"There is no file {path}: give the .onnx file that recipes/export.py wrote.")
         super().__init__(read_contract(path.parent / CONTRACT), seed)
+        self._check_files(path)
         self._session = _open_session(path, threads)
         self._check_session(path)
         self._outputs = [entry["name"] for entry in self.contract["outputs"]]
 
+    def _check_files(self, path: Path) -> None:
+        """Refuse a contract that belongs to other files; there are `weights` where the ONNX file holds none."""
+        described = self.contract["files"]
+        files = {"onnx": path}
+        if "weights" in described:
+            files["weights"] = path.parent / described["weights"]["name"]
+        for kind, file in files.items():
+            if not file.is_file():
+                raise FileNotFoundError(f"There is no {file}: it belongs beside {path.name}, from the same export.")
+            if hash_file(file) != described[kind]["sha256"]:
+                raise ValueError(
+                    f"{path.parent / CONTRACT} does not describe {file}: the SHA-256 of the file differs from the one "
+                    "written there. Copy both from the same export."
+                )
+
     def _check_session(self, path: Path) -> None:
-        """Refuse a contract that belongs to another file."""
-        described = self.contract["files"]["onnx"]["sha256"]
-        if hash_file(path) != described:
-            raise ValueError(
-                f"{path.parent / CONTRACT} does not describe {path}: the SHA-256 of the file differs from the one "
-                "written there. Copy both from the same export."
-            )
+        """Refuse a contract that promises what the file does not have."""
         for kind, arguments in (("inputs", self._session.get_inputs()), ("outputs", self._session.get_outputs())):
             there = [(argument.name, list(argument.shape)) for argument in arguments]
             promised = [(entry["name"], entry["shape"]) for entry in self.contract[kind]]

@@ -17,7 +17,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
 from dreamer_racing.flights import write_trajectory
-from dreamer_racing.learner import DreamerLearner, Learner
+from dreamer_racing.learner import DreamerLearner, Flyer
 from dreamer_racing.plotting import plot_top_down
 from dreamer_racing.recording import side_by_side, write_video
 
@@ -40,7 +40,7 @@ class EvaluationReport:
     def __init__(
         self,
         directory: str | Path,
-        learner: Learner,
+        learner: Flyer,
         worlds: dict[str, Any],
         episodes: int,
         video_steps: int = 500,
@@ -123,7 +123,7 @@ class ReturnReport:
     """
 
     def __init__(
-        self, directory: str | Path, learner: Learner, env: EnvBase, episodes: int, video_steps: int = 500
+        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
     ) -> None:
         self.directory = Path(directory)
         self.episodes = episodes

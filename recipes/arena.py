@@ -9,16 +9,17 @@ from omegaconf import DictConfig, OmegaConf
 from schema import RECIPES, DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
 
 from dreamer_racing.baselines import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.checkpoint import load_components
+from dreamer_racing.checkpoint import load_components, load_state
 from dreamer_racing.envs.dmc import ControlSuiteEnv
 from dreamer_racing.envs.gates import CrashCause
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
-from dreamer_racing.learner import DreamerLearner, Learner, LearnerConfig
+from dreamer_racing.learner import DreamerLearner, Flyer, Learner, LearnerConfig
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.reporting import EvaluationReport, ReturnReport
+from dreamer_racing.trained_agent import AVERAGED, ShippedAgent, choose_weights, kept_weights
 
 Environment = DroneRacingEnv | ControlSuiteEnv
 SUITES = ("race", "dmc")
@@ -103,7 +104,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
 def make_report(
     config: RunConfig,
     directory: Path,
-    learner: Learner,
+    learner: Flyer,
     episodes: int,
     video_steps: int,
     start_noise: float = 0.0,
@@ -177,16 +178,43 @@ def trained_config(run_dir: Path) -> RunConfig:
     return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved)))
 
 
-def restore_learner(config: RunConfig, checkpoint: Path, device: torch.device) -> tuple[Learner, dict[str, int]]:
-    """Bring back the learner of a checkpoint of a run, and the run's counters."""
+def restore_learner(
+    config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
+) -> tuple[Learner, dict[str, int]]:
+    """Bring back the learner of a checkpoint of a run, and the run's counters.
+
+    Raises:
+        ValueError: the checkpoint does not have the weights asked for.
+    """
     config.env.device = "cpu"  # wherever it was trained
+    chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
     if isinstance(config, DreamerConfig):
         config.model.compile = config.model.cuda_graph = False
-    no_line = replace(config, env=replace(config.env, start_on_line=0.0))  # whose planning takes seconds
-    env = make_env(no_line, num_envs=1)
+        config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
+    env = _probe(config)
     interface = Interface.of(env)
     env.close()
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
     load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
     return learner, counters
+
+
+def restore_shipped(config: RunConfig, folder: Path, device: torch.device) -> ShippedAgent:
+    """Bring back an agent that ships, for the environment of its configuration.
+
+    Raises:
+        FileNotFoundError: a file of it is missing.
+        ValueError: it was trained in an environment of another camera or control rate.
+    """
+    config.env.device = "cpu"
+    env = _probe(config)
+    try:
+        return ShippedAgent.load(folder, cast(DroneRacingEnv, env), device)
+    finally:
+        env.close()
+
+
+def _probe(config: RunConfig) -> Environment:
+    """Make a single world, to look at what an agent sees in it."""
+    return make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # a line takes seconds

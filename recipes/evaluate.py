@@ -2,6 +2,7 @@
 
     python recipes/evaluate.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 episodes=100
     python recipes/evaluate.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 protocol=full
+    python recipes/evaluate.py checkpoint=agents/kidney
 
 Flies the deterministic and the stochastic policy from the start pose for the track's laps, prints both, and writes
 evaluation.json beside plots, videos and the episodes' own numbers. protocol=full does it under every condition of
@@ -82,7 +83,7 @@ def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: P
     report = make_report(
         restored.trained,
         directory,
-        restored.learner,
+        restored.flyer,
         config.episodes,
         config.video_steps,
         config.start_noise,
@@ -109,7 +110,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
     worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
-    policy = restored.learner.policy()
+    policy = restored.flyer.evaluation_policy()
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)

@@ -1,24 +1,31 @@
 """Export a trained actor for flight: ONNX, a torch.export program, and the contract of both.
 
     python recipes/export.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 output=exports/kidney/actor.onnx
+    python recipes/export.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 agent=agents/kidney
 
 Flies the policy on the track that it was trained on, replays that flight through every copy, and writes them only if
 they do the same; then measures how long a step takes. What flies them is dreamer_racing/onnx_actor.py.
+
+With agent= the folder gets everything that other recipes need to fly the agent too, see docs/agents.md: an evaluation
+of just these weights must have been made before.
 """
 
+import json
 import logging
+import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import hydra
 import torch
 from arena import camera_of, is_race, trained_config
-from command_line import plain_errors, start_logging
+from command_line import override_key, plain_errors, start_logging
 from omegaconf import DictConfig, OmegaConf
+from restoring import config_folder, find_trained, results_of
 from schema import DreamerConfig, ExportConfig, register
 
-from dreamer_racing.checkpoint import latest_checkpoint
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import (
     LATENTS,
@@ -26,13 +33,26 @@ from dreamer_racing.export import (
     MissingPackagesError,
     check_output,
     export_actor,
-    load_agent,
     make_step,
 )
-from dreamer_racing.export_contract import make_contract
+from dreamer_racing.export_contract import hash_weights, make_contract
 from dreamer_racing.export_parity import Flight, ParityError, TorchActor, episode_steps, record_flight
 from dreamer_racing.modules import Interface
 from dreamer_racing.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
+from dreamer_racing.protocol import MODES
+from dreamer_racing.trained_agent import (
+    ACTOR,
+    AGENT,
+    CONFIG,
+    FILES,
+    ShippedAgent,
+    choose_weights,
+    is_agent,
+    load_agent,
+)
+
+BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
+OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that say nothing of what was learned
 
 register()
 
@@ -56,27 +76,31 @@ def export(config: ExportConfig) -> None:
     """Do all of it, and print what came of it."""
     if config.latent not in LATENTS:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
-    checkpoint = latest_checkpoint(config.checkpoint)
-    run_dir = checkpoint.parent.parent
-    trained = trained_config(run_dir)
+    checkpoint = find_trained(config.checkpoint)
+    trained = trained_config(config_folder(checkpoint))
     if not isinstance(trained, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; this recipe exports actors of dreamer_v3.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
-    output = check_output(config.output or run_dir / "export" / "actor.onnx")
+    check_agent(config, checkpoint)
+    output = check_output(config.output or Path(config.agent or results_of(checkpoint) / "export") / ACTOR)
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
-    deviation = export_actor(step, contract, flight, output, config.seed)
+    about = describe(config, trained, checkpoint, step, contract) if config.agent else None
+    deviation = export_actor(step, contract, flight, output, config.seed, shared_weights=about is not None)
     print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, no latent flipped")
     for name, value in deviation.items():
         print(f"largest deviation of an action, {name} from torch: {value:.1e}")
     measure(step, flight, output)
-    print(f"written to {output.parent}: {output.name}, {output.with_suffix('.pt2').name}, {CONTRACT}")
+    names: tuple[str, ...] = (output.name, output.with_suffix(".pt2").name, CONTRACT)
+    if about:
+        write_agent(output.parent, trained, about)
+        names = FILES
+    size = sum((output.parent / name).stat().st_size for name in names)
+    print(f"written to {output.parent}: {', '.join(names)} ({size / 1e6:.2f} MB)")
 
 
-def prepare(
-    config: ExportConfig, trained: DreamerConfig, checkpoint: Path
-) -> tuple[ActorStep, dict[str, object], Flight]:
+def prepare(config: ExportConfig, trained: DreamerConfig, checkpoint: Path) -> tuple[ActorStep, dict[str, Any], Flight]:
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
         trained.track,
@@ -91,7 +115,13 @@ def prepare(
         num_threads=1,
     )
     try:
-        agent, metadata = load_agent(checkpoint, Interface.of(env))
+        if is_agent(checkpoint):
+            shipped = ShippedAgent.load(checkpoint, env)
+            agent, metadata = shipped.agent, shipped.about
+            choose_weights(config.weights, metadata["weights"], checkpoint)
+        else:
+            agent, metadata = load_agent(checkpoint, Interface.of(env), config.weights)
+        print(f"weights: {metadata['weights']}{' (weights=auto)' if config.weights == 'auto' else ''}")
         step = make_step(agent, config.latent)
         flight = record_flight(env, agent, config.steps)
     finally:
@@ -102,10 +132,94 @@ def prepare(
         env.worlds.camera,
         checkpoint=checkpoint.name,
         env_steps=metadata["env_steps"],
+        weights=metadata["weights"],
         track=trained.track,
         preset=trained.env.preset,
     )
     return step, contract, flight
+
+
+def check_agent(config: ExportConfig, checkpoint: Path) -> None:
+    """Refuse settings that go with no agent, or of which one would be ignored.
+
+    Raises:
+        ValueError: the message names the field.
+    """
+    if not config.agent:
+        if given := [name for name in ("evaluation", "commit") if getattr(config, name) is not None]:
+            raise ValueError(f"{given[0]}={getattr(config, given[0])} is for agent=FOLDER: leave it out.")
+        return
+    if config.output:
+        raise ValueError(f"output={config.output} and agent={config.agent}: give one of them.")
+    if config.latent != "mode":
+        raise ValueError(f"latent={config.latent}: agents ship with latent=mode, with which they are evaluated.")
+    if is_agent(checkpoint):
+        raise ValueError(f"checkpoint={config.checkpoint} is an agent already: copy its folder.")
+
+
+def describe(
+    config: ExportConfig, trained: DreamerConfig, checkpoint: Path, step: ActorStep, contract: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what agent.json says: where the agent comes from, and how well it flies."""
+    source = contract["source"]
+    if config.commit is None:
+        print("commit of the training: not noted, for commit= does not say it")
+    return {
+        "algorithm": trained.algorithm,
+        "track": trained.track,
+        "decoys": trained.decoys,
+        "preset": trained.env.preset,
+        "control_rate": trained.env.control_rate,
+        "env_steps": source["env_steps"],
+        "weights": source["weights"],
+        "training": {"command": training_command(trained, checkpoint), "commit": config.commit, "seed": trained.seed},
+        "evaluation": read_evaluation(config, trained, checkpoint, hash_weights(step)),
+    }
+
+
+def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
+    """Return the command that trains such an agent, without what is of one machine; None if the run did not keep it."""
+    run_dir = config_folder(checkpoint)
+    kept = [folder / "overrides.yaml" for folder in (run_dir, run_dir.parent)]  # the best of a run lies inside of it
+    path = next((path for path in kept if path.exists()), None)
+    if path is None:
+        return None
+    overrides = [text for text in map(str, OmegaConf.load(path)) if override_key(text) not in OF_A_MACHINE]
+    return shlex.join(["python", f"recipes/{trained.algorithm}.py", *overrides])
+
+
+def read_evaluation(
+    config: ExportConfig, trained: DreamerConfig, checkpoint: Path, weights_sha256: str
+) -> dict[str, Any]:
+    """Return the statistics of an evaluation of these weights on the track that they were trained on.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is of other weights or another track; the message says how to make one.
+    """
+    path = Path(config.evaluation or results_of(checkpoint) / "evaluation" / "evaluation.json")
+    how = f"Make it with: python recipes/evaluate.py checkpoint={shlex.quote(config.checkpoint)} episodes=100"
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
+    written = json.loads(path.read_text())
+    made = written["provenance"]
+    if made.get("weights_sha256") != weights_sha256:
+        raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
+    if made["track"] != trained.track:
+        raise ValueError(f"{path} was flown on {made['track']}, and the agent was trained on {trained.track}. {how}")
+    names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
+    statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
+    return {**{name: made[name] for name in names}, **statistics}
+
+
+def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:
+    """Write configuration and agent.json, the latter last: with it the folder is an agent."""
+    (folder / AGENT).unlink(missing_ok=True)
+    env = replace(trained.env, device="cpu")
+    OmegaConf.save(
+        OmegaConf.structured(replace(trained, run_dir=None, resume=None, device="auto", env=env)), folder / CONFIG
+    )
+    (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def measure(step: ActorStep, flight: Flight, output: Path) -> None:

@@ -1,22 +1,27 @@
-"""Fly a track with a scripted pilot and look at it: lap times, a plot from above, an on-board video and a small GIF.
+"""Fly a track and look at it: lap times, a plot from above, an on-board video and a small GIF.
 
     python recipes/fly.py track=kidney preset=easy pilot=scripted run_dir=runs/fly
+    python recipes/fly.py agent=kidney
 
-`viewer=true` opens dm_control's interactive viewer instead, which needs a display. The pilot sees the true state, not
-images: it shows what a track asks for, and what lap times are in reach.
+A scripted pilot sees the true state, not images: it shows what a track asks for, and what lap times are in reach. An
+agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path. For
+pilots, `viewer=true` opens dm_control's interactive viewer instead, which needs a display.
 """
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import hydra
 import numpy as np
 import torch
+from arena import worlds_of
 from command_line import CONFIG_DIR, plain_errors, start_logging
 from hydra.core.config_store import ConfigStore
+from restoring import restore
+from schema import EvaluateConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
@@ -27,10 +32,12 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
 from dreamer_racing.plotting import plot_top_down
+from dreamer_racing.protocol import fly as fly_races
 from dreamer_racing.recording import onboard_beside_map, write_gif, write_video
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
+PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
 GIF_STEPS = 300  # control steps shown if there is no second lap
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -40,11 +47,14 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 class FlyConfig:
     """`recipes/fly.py`."""
 
-    track: str = "kidney"  # name of a built-in track, or path to a YAML file
-    preset: str = "easy"  # physics: easy | faithful
-    pilot: str = "scripted"  # scripted | hover
+    agent: str | None = None  # name of one in agents/, or path to an agent, a run directory or a checkpoint
+    pilot: str | None = None  # scripted | hover; null: scripted, if there is no agent
+    track: str | None = None  # built-in track, or path to a YAML file; null: kidney, or what the agent was trained on
+    preset: str | None = None  # physics: easy | faithful; null: easy, or what the agent was trained on
     run_dir: str = "runs/fly"
-    image_size: int = 64  # pixels, side of the nose camera's image
+    image_size: int | None = None  # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
+    camera_tilt: float | None = None  # degrees upwards; null: 25
+    control_rate: float | None = None  # Hz; null: 50
     renderer: str = "auto"  # auto | egl | osmesa | warp
     viewer: bool = False  # watch in a window instead of writing files
     seed: int = 0
@@ -85,33 +95,71 @@ def check(config: FlyConfig) -> None:
     Raises:
         ValueError: bad value; the message names the field and what is allowed.
     """
-    if config.pilot not in PILOTS:
+    if config.agent is not None and (config.pilot is not None or config.viewer):
+        other = f"pilot={config.pilot}" if config.pilot is not None else "viewer=true, which shows pilots,"
+        raise ValueError(f"{other} and agent={config.agent}: give one of them.")
+    if config.pilot not in (None, *PILOTS):
         raise ValueError(f"pilot={config.pilot}: there are {', '.join(PILOTS)}.")
-    if config.image_size < 1:
-        raise ValueError(f"image_size={config.image_size}: must be at least 1.")
+    for name in ("image_size", "control_rate"):
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name}={value}: must be at least 1.")
 
 
 def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
     with plain_errors():
         Path(config.run_dir).mkdir(parents=True, exist_ok=True)
-        camera = Camera(width=config.image_size, height=config.image_size)
-        worlds: dict[str, Any] = {"evaluation": True, "camera": camera, "renderer": config.renderer}
-        env = DroneRacingEnv(config.track, 1, preset=config.preset, seed=config.seed, **worlds)
-    print(f"{config.pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {config.preset}")
-    result = evaluate(env, PILOTS[config.pilot](env.track, env.worlds.parameters), episodes=1)
-    env.close()
+    track, result = fly_pilot(config) if config.agent is None else fly_agent(config)
     laps = ", ".join(f"{time:.2f} s" for time in result.lap_times)
     print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-    write(Path(config.run_dir), env.track, result)
+    write(Path(config.run_dir), track, result)
+
+
+def fly_pilot(config: FlyConfig) -> tuple[Track, Evaluation]:
+    """Fly by the true state."""
+    pilot, preset = config.pilot or PILOT, config.preset or PRESET
+    camera = Camera()
+    if config.image_size is not None:
+        camera = replace(camera, width=config.image_size, height=config.image_size)
+    if config.camera_tilt is not None:
+        camera = replace(camera, tilt=config.camera_tilt)
+    worlds: dict[str, Any] = {"evaluation": True, "camera": camera, "renderer": config.renderer}
+    if config.control_rate is not None:
+        worlds["control_rate"] = config.control_rate
+    with plain_errors():
+        env = DroneRacingEnv(config.track or TRACK, 1, preset=preset, seed=config.seed, **worlds)
+    print(f"{pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {preset}")
+    result = evaluate(env, PILOTS[pilot](env.track, env.worlds.parameters), episodes=1)
+    env.close()
+    return env.track, result
+
+
+def fly_agent(config: FlyConfig) -> tuple[Track, Evaluation]:
+    """Fly the deterministic policy of a trained agent."""
+    with plain_errors():
+        race = EvaluateConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
+        restored = restore(replace(race, checkpoint=str(config.agent)))
+        for name in ("image_size", "camera_tilt", "control_rate"):
+            given, trained = getattr(config, name), getattr(restored.trained.env, name)
+            if given is not None and given != trained:
+                raise ValueError(
+                    f"{name}={given}: {config.agent} was trained with {name}={trained}, and flies with nothing else."
+                )
+        worlds = worlds_of(restored.trained) | {"from_pixels": restored.trained.env.from_pixels, "seed": config.seed}
+        track = load_track(worlds["track"])
+    print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
+    return track, fly_races(restored.flyer.evaluation_policy(), worlds, episodes=1)
 
 
 def write(directory: Path, track: Track, result: Evaluation) -> None:
-    """Write numbers, plot, video and GIF, and say where."""
+    """Write numbers, plot and, of flights with images, video and GIF, and say where."""
     trajectory = result.trajectories[0]
-    assert trajectory.pixels is not None
     (directory / "evaluation.json").write_text(result.to_json())
     plot_top_down(track, trajectory, directory / "top_down.png")
+    if trajectory.pixels is None:
+        print(f"{'files':<18} {directory}: evaluation.json, top_down.png (there is no video: the agent sees numbers)")
+        return
     write_video(directory / "onboard.mp4", trajectory.pixels, fps=1 / trajectory.control_dt)
     frames = onboard_beside_map(track, second_lap(trajectory), GIF_SIZE)[::GIF_STRIDE]
     size = write_gif(directory / "onboard.gif", frames, fps=1 / (GIF_STRIDE * trajectory.control_dt))
@@ -133,8 +181,9 @@ def watch(config: FlyConfig) -> None:
     try:
         check_viewer()
         with plain_errors():
-            pilot = PILOTS[config.pilot](load_track(config.track), load_preset(config.preset))
-        view(config.track, config.preset, on_time_steps(pilot), evaluation=True)
+            track, preset = config.track or TRACK, config.preset or PRESET
+            pilot = PILOTS[config.pilot or PILOT](load_track(track), load_preset(preset))
+        view(track, preset, on_time_steps(pilot), evaluation=True)
     except ViewerUnavailableError as error:
         print(f"error: {error} viewer=false writes a plot, a video and a GIF instead.", file=sys.stderr)
         raise SystemExit(2) from error

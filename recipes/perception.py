@@ -94,7 +94,7 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
     looked = {}
     for name, track in tracks.items():
         flown = fly(
-            restored.learner.policy(),
+            restored.flyer.evaluation_policy(),
             {**worlds, "track": track},
             config.episodes,
             num_envs=config.num_envs,
@@ -114,7 +114,7 @@ def fly_lesioned(config: PerceptionConfig, restored: Restored, start_noise: floa
     results = []
     for name, lesion in LESIONS.items():
         for mode in MODES:
-            policy = LesionedPolicy(restored.learner.policy(), lesion())
+            policy = LesionedPolicy(restored.flyer.evaluation_policy(), lesion())
             flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
             results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
             print(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")

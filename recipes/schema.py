@@ -250,7 +250,8 @@ class ExperimentConfig(RunConfig):
 class EvaluateConfig:
     """`recipes/evaluate.py`."""
 
-    checkpoint: str = MISSING  # run directory or checkpoint
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
     protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
     start_noise: float = 0.0  # with protocol=nominal: of starts, as a multiple of the noise of training
     episodes: int = 100  # of each condition
@@ -269,7 +270,8 @@ class EvaluateConfig:
 class PerceptionConfig:
     """`recipes/perception.py`."""
 
-    checkpoint: str = MISSING  # run directory or checkpoint
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
     episodes: int = 100  # of each kind of flight
     num_envs: int = 100  # the first flight in each is looked at
     track: str | None = None  # null: the track it was trained on
@@ -285,8 +287,12 @@ class PerceptionConfig:
 class ExportConfig:
     """`recipes/export.py`."""
 
-    checkpoint: str = MISSING  # run directory or checkpoint
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged where they are kept
     output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
+    agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
+    evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
+    commit: str | None = None  # with agent=: that it was trained at, to be noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
     steps: int = 200  # of a recorded flight, over which the export must fly as the original does
     renderer: str = "auto"

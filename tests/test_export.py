@@ -11,7 +11,6 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing import export, onnx_actor
-from dreamer_racing.checkpoint import RunCheckpoints
 from dreamer_racing.envs.quadrotor import PRESETS
 from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
@@ -29,7 +27,6 @@ from dreamer_racing.export import (
     SampledActorStep,
     check_output,
     export_actor,
-    load_agent,
     make_step,
 )
 from dreamer_racing.export_contract import hash_weights, make_contract
@@ -42,9 +39,10 @@ from dreamer_racing.export_parity import (
     episode_steps,
     record_flight,
 )
-from dreamer_racing.learner import Agent, DreamerLearner
+from dreamer_racing.learner import Agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.rssm import mix_uniform
+from dreamer_racing.trained_agent import load_agent
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -489,25 +487,6 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(export, "PACKAGES", ("onnx", "no_such_package"))
     with pytest.raises(MissingPackagesError, match=r"needs no_such_package.*dreamer_racing\[export\]"):
         check_output(tmp_path / "actor.onnx")
-
-
-def test_an_agent_is_restored_whatever_its_losses_were(tmp_path: Path) -> None:
-    learner = DreamerLearner("debug", seed=1)
-    RunCheckpoints(tmp_path, {"learner": learner}).save(env_steps=40)
-    agent, metadata = load_agent(tmp_path, Interface())
-    assert metadata["env_steps"] == 40 and agent.world_model.decoder is None
-    assert hash_weights(ActorStep(agent)) == hash_weights(ActorStep(learner.agent))
-    with pytest.raises(ValueError, match="do not fit"):
-        load_agent(tmp_path, Interface(action_dim=3))
-    with pytest.raises(ValueError, match="do not fit"):
-        load_agent(tmp_path, Interface(pixels=False, vector_dim=21))
-    incomplete = {"size": learner.state_dict()["size"], "agent": {}}
-    part = SimpleNamespace(state_dict=lambda: incomplete, load_state_dict=None)
-    RunCheckpoints(tmp_path / "incomplete", {"learner": part}).save(env_steps=40)
-    with pytest.raises(ValueError, match="do not fit .* are missing"):
-        load_agent(tmp_path / "incomplete", Interface())
-    with pytest.raises(FileNotFoundError, match="No complete checkpoint"):
-        load_agent(tmp_path / "nothing", Interface())
 
 
 # --- the recipe -------------------------------------------------------------------------------------------------------

@@ -1,0 +1,85 @@
+"""Weights as a safetensors file, which torch reads and an ONNX file may point into.
+
+A file is the length of a JSON header (8 bytes, little-endian), the header (name → type, shape, begin and end), and
+the bytes of all tensors. Nothing in it is executed when it is read.
+
+Reference: huggingface/safetensors, ``README.md``, section Format.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_LENGTH = 8  # bytes of the header's length
+_ALIGNMENT = 8  # bytes, to a multiple of which the header is filled up with blanks
+_TYPE, _NUMPY = "F32", np.dtype("<f4")
+
+
+class Extent(NamedTuple):
+    """Where in the file the bytes of a tensor lie."""
+
+    offset: int
+    length: int
+
+
+def write_weights(path: str | Path, weights: Mapping[str, Tensor]) -> dict[str, Extent]:
+    """Write float32 tensors in order of their names.
+
+    Args:
+        path: Of the file.
+        weights: Tensors of any shape.
+
+    Returns:
+        Where each of them lies.
+
+    Raises:
+        ValueError: If one is not float32.
+    """
+    header: dict[str, dict[str, Any]] = {}
+    buffers, end = [], 0
+    for name, value in sorted(weights.items()):
+        if value.dtype != torch.float32:
+            raise ValueError(f"{name} is {value.dtype}: only float32 is written.")
+        buffers.append(value.detach().cpu().contiguous().numpy().astype(_NUMPY).tobytes())
+        begin, end = end, end + len(buffers[-1])
+        header[name] = {"dtype": _TYPE, "shape": list(value.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _ALIGNMENT)
+    first = _LENGTH + len(text)
+    Path(path).write_bytes(len(text).to_bytes(_LENGTH, "little") + text + b"".join(buffers))
+    offsets = {name: entry["data_offsets"] for name, entry in header.items()}
+    return {name: Extent(first + begin, end - begin) for name, (begin, end) in offsets.items()}
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """Read what `write_weights` wrote.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no such file, was cut off, or holds other than float32.
+    """
+    content = Path(path).read_bytes()
+    first = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
+    try:
+        header = json.loads(content[_LENGTH:first])
+        entries = {name: entry for name, entry in header.items() if name != "__metadata__"}
+        return {name: _tensor(entry, content[first:]) for name, entry in entries.items()}
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path} is no complete safetensors file of float32 weights ({error!r}).") from error
+
+
+def _tensor(entry: Mapping[str, Any], data: bytes) -> Tensor:
+    shape, (begin, end) = entry["shape"], entry["data_offsets"]
+    if entry["dtype"] != _TYPE:
+        raise ValueError(f"type {entry['dtype']}")
+    if not 0 <= begin <= end <= len(data) or end - begin != math.prod(shape) * _NUMPY.itemsize:
+        raise ValueError(f"{len(data)} bytes of tensors")
+    return torch.from_numpy(np.frombuffer(data[begin:end], _NUMPY).astype(np.float32)).reshape(shape)
