@@ -473,7 +473,7 @@ class DreamerLearner:
                     "environment of other observations. Choose those it was trained with."
                 )
             for key, value in wanted.items():
-                if value.shape != found[key].shape:
+                if value.numel() and value.shape != found[key].shape:  # empty: a buffer that takes the first shape
                     raise ValueError(
                         f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
                         f"{list(value.shape)}: it was trained {where}."

@@ -9,6 +9,8 @@ Shape legend: K updates, H horizon, N starts, M records of a minibatch, F featur
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -75,10 +77,10 @@ class PPOActorLoss(ActorLoss):
     ``−weight · (min(r·advantage, clip(r, 1 ± ε)·advantage) + entropy_scale · H[π])``, r being the ratio of new to old
     probability of an action.
 
-    The rollouts are buffers of the module, so a checkpoint holds them and a CUDA graph can fill them.
+    The rollouts are buffers of the module, so a checkpoint holds them and a CUDA graph can fill them. They take the
+    number of starts from the first batch; a batch of another number begins anew.
 
     Args:
-        starts: N, starts that every call of ``forward`` brings.
         ppo: Numbers of the improvement.
         args, kwargs: Of ``ActorLoss``.
 
@@ -93,26 +95,21 @@ class PPOActorLoss(ActorLoss):
     weight: Tensor
     cursor: Tensor
 
-    def __init__(self, *args: Any, starts: int, ppo: ImaginedPPOConfig | None = None, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, ppo: ImaginedPPOConfig | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.ppo = ppo or ImaginedPPOConfig()
-        self.starts = starts
-        features, actions = self.world_model.size.features, self.world_model.interface.action_dim
-        widths = {"features": features, "action": actions, "old": 2 * actions, "advantage": 1, "weight": 1}
-        for name, width in widths.items():
-            self.register_buffer(name, torch.zeros(self.ppo.updates, self.horizon, starts, width))
+        for name in Minibatch._fields:
+            self.register_buffer(name, torch.empty(0))
         self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
     def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
         """Make the loss of an agent with a learner's numbers."""
-        records = config.batch_size * config.batch_length
         return cls(
             agent.world_model,
             agent.actor,
             agent.critic,
-            starts=min(config.imagination_starts or records, records),
             ppo=config.ppo,
             horizon=config.imagination_horizon,
             discount=config.discount,
@@ -124,11 +121,6 @@ class PPOActorLoss(ActorLoss):
 
     @torch.no_grad()
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        if len(belief) != self.starts:
-            raise ValueError(
-                f"{type(self).__name__} was made for {self.starts} starts an update, got {len(belief)}: batch_size, "
-                "batch_length and imagination_starts of the learner's configuration must be those of its batches."
-            )
         features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
         judged = self._judge(features, terminated)
         policy = self.actor(features[:-1])
@@ -144,9 +136,20 @@ class PPOActorLoss(ActorLoss):
 
     def _keep(self, **rollout: Tensor) -> None:
         """Write a rollout of ``(H, N, ...)`` into the next of the K places."""
+        if self.weight.shape[1:] != rollout["weight"].shape:
+            for name, value in rollout.items():
+                self.register_buffer(name, value.new_zeros((self.ppo.updates, *value.shape), dtype=torch.float32))
+            self.cursor.zero_()
         for name, value in rollout.items():
             self.get_buffer(name).index_copy_(0, self.cursor, value.unsqueeze(0).float())
         self.cursor.add_(1).remainder_(self.ppo.updates)
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Take the number of starts from what is loaded."""
+        for name in Minibatch._fields:
+            if (saved := state_dict.get(prefix + name)) is not None:
+                self.register_buffer(name, torch.zeros_like(saved, device=self.cursor.device))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Train the actor if the rollouts of K updates are there.
@@ -158,7 +161,7 @@ class PPOActorLoss(ActorLoss):
             Nothing, or ``loss_actor``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
             ``gradient_norm/actor`` of what was done; scalars.
         """
-        if updates % self.ppo.updates:
+        if updates % self.ppo.updates or not len(self.weight):
             return {}
         records = self._normalised()
         number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
@@ -169,8 +172,8 @@ class PPOActorLoss(ActorLoss):
                 metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)))
                 done.append(metrics)
                 if metrics["ppo/kl"] > self.ppo.kl_stop:  # waits for the device, some times an improvement
-                    return self._summary(done, number / size)
-        return self._summary(done, number / size)
+                    return _summary(done, math.ceil(number / size))
+        return _summary(done, math.ceil(number / size))
 
     def _normalised(self) -> Minibatch:
         """Return all imagined steps, with advantages of mean 0 and deviation 1 under their weights."""
@@ -193,11 +196,11 @@ class PPOActorLoss(ActorLoss):
         self.optimizer.zero_grad(set_to_none=True)
         return {"loss_actor": loss.detach(), **metrics, "gradient_norm/actor": norm}
 
-    def _summary(self, done: list[dict[str, Tensor]], minibatches: float) -> dict[str, Tensor]:
-        """Average over the gradient steps; the divergence is the last."""
-        means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
-        epochs = torch.tensor(len(done) / minibatches)
-        return means | {"ppo/kl": done[-1]["ppo/kl"], "ppo/epochs": epochs}
+
+def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:
+    """Average over the gradient steps; the divergence is the last."""
+    means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
+    return means | {"ppo/kl": done[-1]["ppo/kl"], "ppo/epochs": torch.tensor(len(done) / minibatches)}
 
 
 def clipped_objective(

@@ -1,0 +1,162 @@
+"""PPO on imagined rollouts: the objective by hand, when the actor moves, and what survives a checkpoint."""
+
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Independent, Normal, kl_divergence
+
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.losses import ImaginedPPOConfig, imagine
+from dreamer_racing.losses.ppo_actor import Minibatch, clipped_objective, normal_divergence
+from dreamer_racing.modules.actor import ActionDistribution
+
+PPO = ImaginedPPOConfig(updates=3, epochs=2, minibatch=16, learning_rate=1e-2)
+CONFIG = LearnerConfig(imagination_horizon=4, actor_loss="ppo", ppo=PPO, lr=1e-3, warmup_updates=0, entropy_scale=0.0)
+
+
+def make_starts(number: int = 6) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    state = torch.eye(4)[torch.randint(4, (number, 4), generator=generator)].flatten(1)
+    return TensorDict(
+        {
+            "belief": torch.rand(number, 32, generator=generator) * 2 - 1,
+            "state": state,
+            "terminated": torch.zeros(number, 1, dtype=torch.bool),
+        },
+        [number],
+    )
+
+
+def make_learner(**changes) -> DreamerLearner:
+    """With heads that say something: fresh ones predict zero, and nothing is better than anything else."""
+    learner = DreamerLearner("debug", config=replace(CONFIG, **changes), seed=0)
+    generator = torch.Generator().manual_seed(0)
+    for head in (learner.agent.world_model.reward_head, learner.agent.critic.head):
+        torch.nn.init.normal_(head.mlp.output.weight, generator=generator)
+    return learner
+
+
+def one_action(mean: float, std: float, number: int = 1) -> ActionDistribution:
+    return ActionDistribution(torch.full((number, 1), mean), torch.full((number, 1), std))
+
+
+@pytest.mark.parametrize(
+    ("advantage", "shift", "expected"),
+    [
+        (1.0, 0.0, 1.0),  # the old policy: the ratio is 1
+        (1.0, 0.5, 1.2),  # likelier than the clip allows: no more to gain
+        (-1.0, 0.5, -math.exp(0.375)),  # likelier and bad: counted in full, exp((1² − 0.5²) / 2)
+        (1.0, -0.5, math.exp(-0.625)),  # less likely and good: counted in full, exp((1² − 1.5²) / 2)
+        (-1.0, -0.5, -0.8),  # less likely than the clip asks: no more to gain
+    ],
+)
+def test_objective_by_hand(advantage, shift, expected):
+    """The action lies one deviation above the old mean; the new mean is ``shift`` nearer to it."""
+    batch = Minibatch(
+        features=torch.zeros(1, 1),
+        action=torch.ones(1, 1),
+        old=torch.tensor([[0.0, 1.0]]),
+        advantage=torch.full((1, 1), advantage),
+        weight=torch.full((1, 1), 0.5),
+    )
+    loss, metrics = clipped_objective(one_action(shift, 1.0), batch, clip_epsilon=0.2, entropy_scale=0.1)
+    entropy = 0.5 * math.log(2 * math.pi * math.e)
+    assert loss.item() == pytest.approx(-0.5 * (expected + 0.1 * entropy), abs=1e-5)
+    assert metrics["ppo/kl"].item() == pytest.approx(shift**2 / 2, abs=1e-6)
+    assert metrics["ppo/clipped"].item() == (abs(shift) > 0)
+
+
+def test_divergence_is_that_of_torch():
+    torch.manual_seed(0)
+    old, new = (ActionDistribution(torch.randn(5, 3), torch.rand(5, 3) + 0.1) for _ in range(2))
+    reference = kl_divergence(*(Independent(Normal(policy.mean, policy.std), 1) for policy in (old, new)))
+    torch.testing.assert_close(normal_divergence(old, new).squeeze(-1), reference)
+
+
+def test_the_actor_stands_still_until_the_rollouts_are_there():
+    learner = make_learner(ppo=replace(PPO, kl_stop=1e9))
+    loss, starts = learner.losses["actor"], make_starts()
+    for update in (1, 2, 3):
+        before = copy.deepcopy(learner.agent.actor.state_dict())
+        written = loss(starts)
+        assert written["loss_actor"].item() == 0.0 and not written["loss_actor"].requires_grad
+        metrics = loss.improve(update)
+        moved = any(not torch.equal(value, before[name]) for name, value in learner.agent.actor.state_dict().items())
+        assert moved == bool(metrics) == (update == 3)
+    assert set(metrics) == {"loss_actor", "ppo/kl", "ppo/clipped", "ppo/epochs", "gradient_norm/actor"}
+    assert metrics["ppo/epochs"].item() == PPO.epochs
+    others = (*learner.agent.world_model.parameters(), *learner.agent.critic.parameters())
+    assert all(parameter.grad is None for parameter in others)
+
+
+def test_an_improvement_stops_where_the_policy_has_moved_far():
+    learner = make_learner(ppo=replace(PPO, kl_stop=1e-9, learning_rate=1e-3))
+    loss = learner.losses["actor"]
+    for update in (1, 2, 3):
+        loss(make_starts())
+        metrics = loss.improve(update)
+    # The first minibatch still sees the old policy, the second one that has moved.
+    assert metrics["ppo/epochs"].item() == pytest.approx(2 / 5)  # of the 5 minibatches that 3 · 4 · 6 steps make
+
+
+def test_what_is_rewarded_becomes_likelier():
+    """Advantages that are the first dimension of the sampled action: its mean rises, the others' stay."""
+    torch.manual_seed(0)
+    learner = make_learner(ppo=replace(PPO, updates=1, minibatch=64, epochs=4))
+    loss, agent, starts = learner.losses["actor"], learner.agent, make_starts(64)
+    for update in range(1, 31):
+        with torch.no_grad():
+            features, action = imagine(agent.world_model.rssm, agent.actor, starts["belief"], starts["state"], 4)
+            policy = agent.actor(features[:-1])
+        loss._keep(
+            features=features[:-1],
+            action=action,
+            old=torch.cat((policy.mean, policy.std), -1),
+            advantage=action[..., :1],
+            weight=torch.ones_like(action[..., :1]),
+        )
+        loss.improve(update)
+    mean = agent.actor(torch.cat((starts["belief"], starts["state"]), -1)).mean
+    assert mean[:, 0].mean() > 0.5
+    assert (mean[:, 0] > 0.5).float().mean() > mean[:, 1:].gt(0.5).float().mean() + 0.3
+
+
+def test_advantages_are_normalised_under_their_weights():
+    learner = make_learner()
+    loss = learner.losses["actor"]
+    for _ in range(3):
+        loss(make_starts())
+    loss.weight.uniform_()
+    records = loss._normalised()
+    share = records.weight / records.weight.sum()
+    mean = (share * records.advantage).sum()
+    assert mean.item() == pytest.approx(0.0, abs=1e-4)
+    assert (share * (records.advantage - mean).square()).sum().item() == pytest.approx(1.0, abs=1e-3)
+    loss.advantage[0, 0, 0], loss.weight[0, 0, 0] = 1e6, 1e-3
+    assert loss._normalised().advantage.max().item() == PPO.advantage_clip
+
+
+def test_a_checkpoint_between_two_improvements_loses_nothing():
+    from tests.test_learner import make_batch
+
+    learner = make_learner()
+    for _ in range(4):
+        learner.update(make_batch())
+    resumed = make_learner()
+    resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for each in (learner, resumed):
+        torch.manual_seed(5)
+        for _ in range(3):
+            each.update(make_batch())
+    for name, value in learner.agent.state_dict().items():
+        assert torch.equal(value, resumed.agent.state_dict()[name]), name
+
+
+def test_the_learning_rate_of_the_actor_falls_with_the_others():
+    learner = make_learner()
+    learner.adjust(rates=0.25)
+    assert learner.losses["actor"].optimizer.param_groups[0]["lr"] == pytest.approx(0.25 * PPO.learning_rate)
