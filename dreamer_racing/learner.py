@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,12 +21,14 @@ from dreamer_racing.losses import (
     ACTOR_LOSSES,
     CRITIC_LOSSES,
     WORLD_MODEL_LOSSES,
+    ActorLoss,
     ImaginedPPOConfig,
     LossClass,
     find_loss,
 )
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
 from dreamer_racing.modules.layers import autocast
+from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.timing import Timer, untimed
 
 
@@ -48,7 +50,6 @@ class LearnerConfig:
         free_nats: KL below which there is no gradient, nats.
         kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
         privileged_scale: Weight of decoding the privileged state, where the loss does.
-        embedding_scale: Weight of decoding it from the encoder's embedding too, which is not in the reference; 0: not.
         barlow_scale: Weight of the redundancy reduction, where the loss has it.
         continuation: Whether predicted ends of episodes cut imagined returns.
         slow_critic_scale: Weight of the regularisation towards the slow critic.
@@ -84,7 +85,6 @@ class LearnerConfig:
     free_nats: float = 1.0
     kl_mode: str = "separate"
     privileged_scale: float = 1.0
-    embedding_scale: float = 0.0
     barlow_scale: float = 0.05
     continuation: bool = True
     slow_critic_scale: float = 1.0
@@ -297,7 +297,7 @@ class DreamerLearner:
         self.updates += 1
         if self._actor_optimizer is not None:
             with timed("improve"), self.autocast():
-                metrics |= self.losses["actor"].improve(self.updates)
+                metrics |= cast(ActorLoss, self.losses["actor"]).improve(self.updates)
         self._average()
         return metrics
 
@@ -391,6 +391,11 @@ class DreamerLearner:
     def evaluation_policy(self, deterministic: bool = False) -> DreamerPolicy:
         """Return the acting step of `flying_agent`, which shares its parameters."""
         return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor, deterministic)
+
+    @property
+    def latent_format(self) -> LatentFormat:
+        """How a replay keeps this learner's latents."""
+        return self.agent.world_model.rssm.latent_format
 
     @property
     def flying_agent(self) -> Agent:

@@ -89,7 +89,10 @@ def records_from_rollout(
 
 
 def _check_rollout(
-    rollout: TensorDictBase, observation_keys: Sequence[NestedKey], reward_keys: Sequence[str], latents: LatentFormat | None
+    rollout: TensorDictBase,
+    observation_keys: Sequence[NestedKey],
+    reward_keys: Sequence[str],
+    latents: LatentFormat | None,
 ) -> None:
     if rollout.ndim < 2:
         raise ValueError(f"Expected a rollout of batch [environments, time], got batch {list(rollout.shape)}.")

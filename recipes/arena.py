@@ -156,8 +156,8 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
-        size = replace(get_size(config.model.size), sampled=config.model.sampled)
-        return DreamerLearner(size, interface, learner_config(config), device, config.seed)
+        shape = replace(get_size(config.model.size), sampled=config.model.sampled)
+        return DreamerLearner(shape, interface, learner_config(config), device, config.seed)
     assert isinstance(config, (PPORunConfig, SACRunConfig))
     size = NetworkSize(config.network.layers, config.network.units)
     if isinstance(config, SACRunConfig):

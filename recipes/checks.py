@@ -68,7 +68,6 @@ RANGES = {
     "loss.representation_scale": NOT_NEGATIVE,
     "loss.free_nats": NOT_NEGATIVE,
     "loss.privileged_scale": NOT_NEGATIVE,
-    "loss.embedding_scale": NOT_NEGATIVE,
     "loss.barlow_scale": NOT_NEGATIVE,
     "loss.replay_value_scale": NOT_NEGATIVE,
     "network.layers": NOT_NEGATIVE,

@@ -144,7 +144,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     check_dreamer(config)
     lock = claim(config)
     env = make_env(config)
-    learner = make_learner(config, Interface.of(env), config.device)
+    learner = cast(DreamerLearner, make_learner(config, Interface.of(env), config.device))
     seed_generators(config.seed)
     policy = learner.policy()
     overlapped = config.collection is Collection.overlapped
@@ -167,7 +167,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
             curriculum,
             config.model.batch_size,
             config.model.batch_length,
-            latents=learner.agent.world_model.rssm.latent_format if config.replay.context else None,
+            latents=learner.latent_format if config.replay.context else None,
             recent_share=config.replay.recent_share,
             recent_records=config.replay.recent_records,
             held_out=config.replay.held_out,

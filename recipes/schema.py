@@ -67,7 +67,6 @@ class LossConfig:
     free_nats: float = 1.0
     kl_mode: str = "separate"  # separate | per_latent
     privileged_scale: float = 1.0  # of decoding the privileged state: losses informed and privileged
-    embedding_scale: float = 0.0  # of decoding it from one image's embedding too; 0: not
     barlow_scale: float = 0.05  # of the redundancy reduction: loss decoder_free
     continuation: bool = True  # predicted ends of episodes cut imagined returns
     replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off

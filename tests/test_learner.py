@@ -299,7 +299,7 @@ def test_losses_are_chosen_by_name(monkeypatch):
         """Has ten times the entropy."""
 
         def forward(self, tensordict):
-            self.entropy_scale = 3e-3
+            self.entropy_scale.fill_(3e-3)
             return super().forward(tensordict)
 
     monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss)
@@ -351,15 +351,52 @@ def test_rates_are_the_settings_of_the_learner_that_goes_on():
     assert other.updates == 1
 
 
-def test_rates_fall_from_the_first_update_on_also_after_a_restart():
-    config = replace(CONFIG, lr=1e-3, behavior_lr=4e-4, decay_updates=4, decay_to=0.5)
-    learner = DreamerLearner("debug", config=config, seed=0)
-    rates = []
-    for _ in range(6):
+def test_what_is_scheduled_reaches_optimiser_and_losses_and_returns_to_what_is_configured():
+    learner = DreamerLearner("debug", config=replace(CONFIG, lr=1e-3, behavior_lr=4e-4), seed=0)
+
+    def settings() -> list[float]:
+        actor, critic = learner.losses["actor"], learner.losses["critic"]
+        rates = [group["lr"] for group in learner.optimizer.param_groups]
+        return [*rates, learner.discount, float(actor.discount), float(critic.discount), float(actor.entropy_scale)]
+
+    learner.adjust(rates=0.5, discount=0.9, entropy_scale=0.1)
+    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    learner.update(make_batch())
+    learner.adjust()
+    configured = CONFIG.discount
+    assert settings() == pytest.approx([1e-3, 4e-4, configured, configured, configured, CONFIG.entropy_scale])
+
+
+def test_a_discount_of_zero_leaves_only_the_next_reward():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
+    learner.adjust(discount=0.0)
+    context = learner.losses["world_model"](make_batch()).pop("replay_context")
+    imagined = learner.losses["actor"](learner._choose_starts(context, make_batch()))
+    returns = imagined["imagination"]["lambda_return"]
+    assert returns.mean().item() == pytest.approx(imagined["imagined_reward"].item(), abs=1e-5)
+
+
+def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
+    learner = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=0)
+    assert learner.evaluation_policy().actor is learner.averaged.actor
+    assert learner.policy().actor is learner.agent.actor
+    before = {name: value.clone() for name, value in learner.averaged.named_parameters()}
+    learner.update(make_batch())
+    trained = dict(learner.agent.named_parameters())
+    for name, value in learner.averaged.named_parameters():  # the first update: the mean of all there are
+        torch.testing.assert_close(value, trained[name].detach())
+    for _ in range(4):  # 1/2, 1/3, then the rate itself
+        before = {name: value.clone() for name, value in learner.averaged.named_parameters()}
         learner.update(make_batch())
-        rates.append([group["lr"] for group in learner.optimizer.param_groups])
-        restarted = DreamerLearner("debug", config=config, seed=1)
-        restarted.load_state_dict(copy.deepcopy(learner.state_dict()))
-        learner = restarted
-    left = torch.tensor([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
-    torch.testing.assert_close(torch.tensor(rates), left[:, None] * torch.tensor([1e-3, 4e-4]))
+    for name, value in learner.averaged.named_parameters():
+        torch.testing.assert_close(value, torch.lerp(before[name], trained[name].detach(), 0.25))
+    resumed = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=1)
+    resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for name, value in resumed.averaged.named_parameters():
+        assert torch.equal(value, dict(learner.averaged.named_parameters())[name]), name
+
+
+def test_without_averages_the_trained_weights_fly():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor

@@ -186,9 +186,7 @@ class PPOActorLoss(ActorLoss):
 
     def _minibatch(self, batch: Minibatch) -> dict[str, Tensor]:
         """Make one gradient step; the divergence is that from before it."""
-        loss, metrics = clipped_objective(
-            self.actor(batch.features), batch, self.ppo.clip_epsilon, self.entropy_scale
-        )
+        loss, metrics = clipped_objective(self.actor(batch.features), batch, self.ppo.clip_epsilon, self.entropy_scale)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.ppo.gradient_clip)
@@ -204,7 +202,7 @@ def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tenso
 
 
 def clipped_objective(
-    policy: ActionDistribution, batch: Minibatch, clip_epsilon: float, entropy_scale: float
+    policy: ActionDistribution, batch: Minibatch, clip_epsilon: float, entropy_scale: float | Tensor
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Compute PPO's loss on a minibatch, a scalar, and what to watch: ``ppo/kl`` and ``ppo/clipped``.
 

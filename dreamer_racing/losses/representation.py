@@ -64,12 +64,10 @@ class PrivilegedLoss(WorldModelLoss):
         world_model: The module to train.
         privileged_dim: P.
         privileged_scale: Weight of the squared error.
-        embedding_scale: Weight of the same error of a second decoder, which sees the encoder's embedding of one image
-            only; 0: there is none. From the latents the encoder learns by way of sampled classes, a noisy one.
         kwargs: Of ``WorldModelLoss``.
 
     Reads ``("privileged", "vector")`` ``(B, T, P)`` too. Adds ``loss_privileged`` (squared error of symlogs, summed
-    over P, scaled), with an ``embedding_scale`` ``loss_embedding``, and the metric ``privileged_error`` (the same, unscaled mean over P).
+    over P, scaled) and the metric ``privileged_error`` (the same, unscaled mean over P).
 
     Raises:
         ValueError: If ``privileged_dim`` is 0.
@@ -81,13 +79,7 @@ class PrivilegedLoss(WorldModelLoss):
     represent_keys: ClassVar[tuple[str, ...]] = ("loss_privileged", "privileged_error")
 
     def __init__(
-        self,
-        world_model: WorldModel,
-        privileged_dim: int,
-        *,
-        privileged_scale: float = 1.0,
-        embedding_scale: float = 0.0,
-        **kwargs: Any,
+        self, world_model: WorldModel, privileged_dim: int, *, privileged_scale: float = 1.0, **kwargs: Any
     ) -> None:
         super().__init__(world_model, **kwargs)
         if privileged_dim < 1:
@@ -99,15 +91,7 @@ class PrivilegedLoss(WorldModelLoss):
         self.privileged_decoder = VectorDecoder(
             size.features, privileged_dim, size.vector_layers, size.units, size.norm
         )
-        self.embedding_decoder = (
-            VectorDecoder(
-                world_model.encoder.embedding_size, privileged_dim, size.vector_layers, size.units, size.norm
-            )
-            if embedding_scale
-            else None
-        )
         self.privileged_scale = privileged_scale
-        self.embedding_scale = embedding_scale
         self.in_keys = [*self.in_keys, PRIVILEGED]
 
     @classmethod
@@ -117,7 +101,6 @@ class PrivilegedLoss(WorldModelLoss):
             agent.world_model,
             agent.interface.privileged_dim,
             privileged_scale=config.privileged_scale,
-            embedding_scale=config.embedding_scale,
             dynamics_scale=config.dynamics_scale,
             representation_scale=config.representation_scale,
             free_nats=config.free_nats,
@@ -130,14 +113,10 @@ class PrivilegedLoss(WorldModelLoss):
         """Return the privileged loss."""
         target = tensordict.get(PRIVILEGED)
         error = self.privileged_decoder.squared_error(features, target)
-        losses = {
+        return {
             "loss_privileged": self.privileged_scale * error,
             "privileged_error": error.detach() / target.shape[-1],
         }
-        if self.embedding_decoder is not None:
-            seen = self.embedding_decoder.squared_error(embedding, target)
-            losses["loss_embedding"] = self.embedding_scale * seen
-        return losses
 
 
 class InformedLoss(PrivilegedLoss, ReconstructionLoss):

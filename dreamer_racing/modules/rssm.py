@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear, unrolled
+from dreamer_racing.modules.stored_latents import LatentFormat
 
 
 class Posterior(NamedTuple):

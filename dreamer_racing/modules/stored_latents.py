@@ -26,7 +26,8 @@ class LatentFormat(NamedTuple):
 
     Example:
         >>> import torch
-        >>> packed = LatentFormat(belief=3, latents=1, classes=4, sampled=True).pack(torch.zeros(2, 3), torch.eye(4)[:2])
+        >>> keep = LatentFormat(belief=3, latents=1, classes=4)
+        >>> packed = keep.pack(torch.zeros(2, 3), torch.eye(4)[:2])
         >>> packed["state"].tolist()
         [[0], [1]]
     """
