@@ -33,7 +33,7 @@ NUM_ENVS = 32
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
-  training episodes begin in flight on a planned racing line, fewer and fewer of them; a missed gate ends them
+  70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
   25 actions a second; the actor is trained by PPO on imagined rollouts; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
