@@ -221,6 +221,7 @@ class DreamerLearner:
         latents: Belief and state of the last batch's records, ``[B, T]``, for the replay's context; on a CUDA device
             with ``cuda_graph`` the next update writes over them.
         discount: γ as it is now, see ``adjust``.
+        actor_waits: Whether an actor with an optimiser of its own stands still; settable.
 
     Example:
         >>> learner = DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3), seed=0)
@@ -256,6 +257,7 @@ class DreamerLearner:
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(self.agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
         self.discount = self.config.discount
+        self.actor_waits = False
         self._networks = self._trained_parameters()
         self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(self.losses["actor"], "optimizer", None)
@@ -295,7 +297,7 @@ class DreamerLearner:
             if not self.config.cuda_graph:
                 self.optimizer.zero_grad(set_to_none=True)
         self.updates += 1
-        if self._actor_optimizer is not None:
+        if self._actor_optimizer is not None and not self.actor_waits:
             with timed("improve"), self.autocast():
                 metrics |= cast(ActorLoss, self.losses["actor"]).improve(self.updates)
         self._average()

@@ -294,11 +294,31 @@ def check_schedule(config: DreamerConfig) -> None:
         ramp.check(f"schedule.{name}")
         if ramp.to is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
+    if config.schedule.wait_for_model is not None:
+        check_wait(config)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
     if to is not None and not config.env.start_on_line:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
+
+
+def check_wait(config: DreamerConfig) -> None:
+    """Refuse a limit that cannot be kept, and one for an actor that cannot wait.
+
+    Raises:
+        ValueError: the message names the setting to change.
+    """
+    limit = config.schedule.wait_for_model
+    if limit is not None and limit <= 1:
+        raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
+    if config.loss.actor != "ppo":
+        raise ValueError(
+            f"schedule.wait_for_model={limit} is for loss.actor=ppo, whose actor has an optimiser of its own; with "
+            f"loss.actor={config.loss.actor} leave it at null."
+        )
+    if not config.replay.held_out:
+        raise ValueError(f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0.")
 
 
 def check_image_size(image_size: int, size: str) -> None:

@@ -20,6 +20,7 @@ from command_line import CONFIG_DIR, choose_device, computes_bfloat16
 from omegaconf import DictConfig, OmegaConf
 from schema import Collection, DreamerConfig, register
 from tensordict import TensorDictBase
+from torch import Tensor
 from training import ReplayRun, launch
 
 from dreamer_racing.checkpoint import GracefulExit
@@ -28,6 +29,7 @@ from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.model_lag import ModelLag
 
 NUM_ENVS = 32
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
@@ -36,6 +38,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
   25 actions a second; the actor is trained by PPO on imagined rollouts; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
+LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -47,6 +50,7 @@ class DreamerRun(ReplayRun):
 
     config: DreamerConfig
     learner: DreamerLearner
+    lag: ModelLag
 
     remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
 
@@ -59,7 +63,10 @@ class DreamerRun(ReplayRun):
         length = CONTEXT + self.config.model.imagination_horizon
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is not None and self.counters["updates"]:
-            self.metrics.push(held_out_metrics(self.learner, windows))
+            measured = held_out_metrics(self.learner, windows)
+            self.metrics.push(measured)
+            error = next(measured[f"held_out/{name}"] for name in LAG_ERRORS if f"held_out/{name}" in measured)
+            self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Put what is scheduled where it belongs by now, and make the updates that are due."""
@@ -69,6 +76,7 @@ class DreamerRun(ReplayRun):
     def keep_to_schedule(self) -> None:
         """Set everything that is scheduled to its value at this share of the run."""
         schedule, loss = self.config.schedule, self.config.loss
+        self.learner.actor_waits = self.lag.waits
         progress = self.counters["env_steps"] / self.config.total_env_steps
         now = {
             "rates": (schedule.learning_rates, 1.0),
@@ -80,8 +88,9 @@ class DreamerRun(ReplayRun):
             share = schedule.start_on_line.at(self.config.env.start_on_line, progress)
             cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 
-    def after_update(self, batch: TensorDictBase) -> None:
-        """Let later windows go on from what the world model makes of these records now."""
+    def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
+        """Take note of the model's error; let later windows go on from what the model makes of these records now."""
+        self.lag.trained(next(metrics[name] for name in LAG_ERRORS if name in metrics))
         if self.config.replay.context:
             latents = self.learner.latents
             assert latents is not None, "the update left them"
@@ -161,6 +170,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         collector,
         curriculum,
         OverlappedRollouts(collector, acting, policy) if overlapped else None,
+        lag=ModelLag(config.schedule.wait_for_model),
         replay=make_run_replay(
             config,
             env,

@@ -16,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from schema import RECIPES
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
@@ -145,11 +146,12 @@ class ReplayRun(Run):
                 return
             with self.clock.timed("sample"):
                 batch = self.replay.sample()
-            self.metrics.push(self.learner.update(batch, self.clock.timed))
+            metrics = self.learner.update(batch, self.clock.timed)
+            self.metrics.push(metrics)
             self.counters["updates"] += 1
-            self.after_update(batch)
+            self.after_update(batch, metrics)
 
-    def after_update(self, batch: TensorDictBase) -> None:
+    def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
         """Do what a recipe does with a batch that was learned from."""
 
 
