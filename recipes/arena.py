@@ -175,7 +175,26 @@ def trained_config(run_dir: Path) -> RunConfig:
     algorithm = saved.get("algorithm", DreamerConfig.algorithm)
     if algorithm not in RECIPES:
         raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
-    return cast(RunConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved)))
+    return cast(RunConfig, OmegaConf.to_object(with_schema(saved, algorithm)))
+
+
+def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
+    """Type a saved configuration: what it does not say is at its default, what is unknown here is left out."""
+    schema = OmegaConf.structured(RECIPES[algorithm])
+    if unknown := drop_unknown(saved, schema):
+        print(f"settings of another version, left out: {', '.join(unknown)}")
+    return cast(DictConfig, OmegaConf.merge(schema, saved))
+
+
+def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> list[str]:
+    """Remove from a saved configuration what a schema does not have; return `name=value` of each."""
+    unknown = [name for name in map(str, saved) if name not in set(schema.keys())]  # `in` overlooks what is missing
+    dropped = [f"{prefix}{name}={saved.pop(name)}" for name in unknown]
+    for name in map(str, saved):
+        inner, known = saved[name], schema._get_node(name)
+        if isinstance(inner, DictConfig) and isinstance(known, DictConfig):
+            dropped += drop_unknown(inner, known, f"{prefix}{name}.")
+    return dropped
 
 
 def restore_learner(

@@ -210,7 +210,8 @@ def assemble(
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
-    parts |= {name: own[name] for name in ("replay", "lag") if name in own}
+    parts |= {"replay": own["replay"]} if "replay" in own else {}
+    parts |= {"lag": own["lag"]} if "lag" in own and own["lag"].limit is not None else {}
     checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
     clock = RunClock(counters)
     if config.resume:

@@ -9,12 +9,11 @@ from typing import Any, ClassVar, cast
 
 import hydra
 import torch
-from arena import Environment, Report
+from arena import Environment, Report, with_schema
 from checks import ReplayRatio, check_overrides
 from command_line import merge_overrides, override_key, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from schema import RECIPES
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -231,7 +230,7 @@ def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved))
+    return with_schema(saved, algorithm)
 
 
 def changed_settings(config: DictConfig) -> list[str]:

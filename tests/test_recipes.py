@@ -53,9 +53,9 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
 def test_every_group_composes(path: Path) -> None:
     group = path.parent.name
-    append = "+" if group in ("decoys", "tuned") else ""  # not among the defaults
+    append = "+" if group == "decoys" else ""  # not among the defaults
     config = compose({"network": "ppo"}.get(group, "dreamer_v3"), f"{append}{group}={path.stem}")
-    assert group == "tuned" or OmegaConf.select(config, group) is not None
+    assert OmegaConf.select(config, group) is not None
 
 
 def test_every_model_config_names_a_known_size() -> None:
@@ -283,7 +283,11 @@ REFUSED = [
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
-    (["model.decay_to=0.1"], ["model.decay_to=0.1 has no effect without model.decay_updates"]),
+    (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
+    (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
+    (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
+    (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for loss.actor=ppo"]),
+    (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
@@ -449,13 +453,42 @@ def test_a_loss_that_is_not_finite_ends_the_run(every: int, tmp_path: Path) -> N
     assert int(kept.name.rpartition("-")[2]) >= 100
 
 
-def test_settings_tuned_for_a_cpu_yield_to_the_command_line() -> None:
-    tuned = compose("dreamer_v3", "+tuned=cpu")
+def test_settings_that_race_yield_to_the_command_line() -> None:
+    tuned = compose("dreamer_v3", "tuned=race")
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
-    assert (tuned.env.miss_radius, tuned.model.decay_updates) == (3, 8000)
-    changed = compose("dreamer_v3", "+tuned=cpu", "loss=informed", "env.control_rate=50")
+    assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("ppo", False, True)
+    changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
+
+
+def test_dreamer_as_published_is_one_word_away() -> None:
+    """Every number of losses, model and schedule as in the reference, or as its size says."""
+    faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("schema")
+    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.LossConfig))
+    assert OmegaConf.to_container(faithful.env) | {"num_envs": None} == OmegaConf.to_container(
+        OmegaConf.structured(schema.EnvConfig(num_envs=1))
+    ) | {"num_envs": None}
+    assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
+    assert all(ramp is None or ramp.to is None for ramp in faithful.schedule.values())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["track=kidney"], "race"),
+        (["track=kidney", "env=faithful", "loss=informed", "budget=cpu"], "race"),
+        (["model=debug"], "none"),
+        (["budget=smoke"], "none"),
+        (["env.from_pixels=false"], "none"),
+        (["env=dmc", "task=walker_walk"], "none"),
+    ],
+)
+def test_what_races_is_chosen_where_it_does(
+    overrides: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert recipe_module("dreamer_v3").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
+    assert ("tuned=race" in capsys.readouterr().out) == (expected == "race")
 
 
 def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_path: Path) -> None:
@@ -492,5 +525,12 @@ def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:
     config = training.saved_config("dreamer_v3", run_dir)
     config.run_dir = str(run_dir)
     assert training.changed_settings(config) == []
-    config.loss.discount, config.model.decay_updates = 0.9, 8  # by an override, or by another version's defaults
-    assert training.changed_settings(config) == ["model.decay_updates=8 (was null)", "loss.discount=0.9 (was 0.997)"]
+    config.loss.discount, config.model.average_rate = 0.9, 0.5  # by an override, or by another version's defaults
+    assert training.changed_settings(config) == ["model.average_rate=0.5 (was null)", "loss.discount=0.9 (was 0.997)"]
+
+
+def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
+    saved = OmegaConf.create({"algorithm": "dreamer_v3", "model": {"size": "debug", "decay_updates": 8}, "old": 1})
+    config = recipe_module("arena").with_schema(saved, "dreamer_v3")
+    assert config.model.size == "debug" and "decay_updates" not in config.model
+    assert "settings of another version, left out: old=1, model.decay_updates=8" in capsys.readouterr().out

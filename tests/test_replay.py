@@ -11,6 +11,7 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
+from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.replay import make_replay, records_from_rollout, replay_bytes
 
 REWARDS = ("reward", "reward_base", "body_rate_norm")
@@ -383,6 +384,65 @@ def test_size_is_known_before_allocation():
     replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
     assert replay.storage._storage.bytes() == replay_bytes(60, (2, 2, 2))
     assert replay_bytes(1_000_000) == pytest.approx(12.3e9, rel=0.01)
+
+
+FORMAT = LatentFormat(belief=2, latents=1, classes=3)
+
+
+def with_latents(rollout: TensorDict, first: int) -> TensorDict:
+    """Latents that tell the step at which they were left: belief (step, environment) / 1000, state step mod 3."""
+    envs, steps = rollout.shape
+    step = first + torch.arange(steps).expand(envs, steps)
+    env = torch.arange(envs).unsqueeze(-1).expand(envs, steps)
+    rollout["next", "belief"] = torch.stack((step, env), -1) / 1000
+    rollout["next", "state"] = torch.nn.functional.one_hot(step % 3, 3).float()
+    return rollout
+
+
+def test_context_is_what_was_left_before_each_observation_and_zero_at_first_ones():
+    replay = make_replay(60, 3, 6, 4, latents=FORMAT)
+    (rollout,) = collect(CountingEnv(3), steps=12, batches=1)
+    replay.extend(with_latents(rollout, first=1))
+    for env in range(3):
+        records = replay.records(env)
+        arrived = ~records["is_init"].squeeze(-1)
+        belief, state = FORMAT.unpack(records["context"])
+        expected = torch.stack((torch.arange(1, 13), torch.full((12,), env)), -1) / 1000
+        torch.testing.assert_close(belief[arrived], expected, atol=1e-5, rtol=0)
+        assert state[arrived].argmax(-1).tolist() == [step % 3 for step in range(1, 13)]
+        assert not belief[~arrived].any()
+
+
+def test_refreshing_reaches_the_records_after_those_seen_and_no_others():
+    replay = make_replay(39, 3, 2, 4, latents=FORMAT)  # full
+    (rollout,) = collect(CountingEnv(3, end=0.0), steps=12, batches=1)
+    replay.extend(with_latents(rollout, first=1))
+    before = replay.storage._storage.clone()
+    batch = replay.sample()
+    belief, state = torch.full((2, 4, 2), 0.5), torch.nn.functional.one_hot(torch.full((2, 4), 2), 3).float()
+    replay.refresh(batch["index"], belief, state)
+    after = replay.storage._storage
+    touched = torch.zeros(len(before), dtype=torch.bool)
+    touched[batch["index"][:, 1:].flatten()] = True
+    assert (after["context", "belief"][touched] == 0.5).all() and (after["context", "state"][touched] == 2).all()
+    for key, value in before.items(include_nested=True, leaves_only=True):
+        unchanged = ~touched if key[0] == "context" else slice(None)
+        assert torch.equal(after[key][unchanged], value[unchanged]), key
+
+
+def test_context_survives_a_checkpoint_and_counts_in_the_size(tmp_path):
+    replay, restored = (make_replay(60, 3, 6, 4, seed=seed, latents=FORMAT) for seed in (5, 6))
+    replay.extend(with_latents(collect(CountingEnv(3), steps=5, batches=1)[0], first=1))
+    assert replay.storage._storage.bytes() == replay_bytes(60, (2, 2, 2), latents=FORMAT)
+    replay.dump(tmp_path)
+    restored.load(tmp_path)
+    assert (replay.sample() == restored.sample()).all()
+
+
+def test_a_rollout_without_latents_is_refused_where_they_are_kept():
+    replay = make_replay(60, 3, 6, 4, latents=FORMAT)
+    with pytest.raises(KeyError, match="'belief'.*'state'"):
+        replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
 
 
 def test_samples_are_delivered_where_the_learner_is():

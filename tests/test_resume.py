@@ -78,9 +78,21 @@ def assert_same(first: Any, second: Any, where: str) -> None:
         assert first == second, where
 
 
+RACE = [
+    "tuned=race", "schedule.learning_rates.to=null", "schedule.discount.to=null", "evaluation.start_noise=0",
+    "evaluation.stochastic=false", "loss.ppo.updates=7", "model.mixed_precision=false",
+]  # fmt: skip
+"""What races on a CPU, without the ramps over a run's length, which here is another before and after."""
+
+
 @pytest.mark.slow
-def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    settings = [*SETTINGS, "track=circle", "env=faithful"]
+@pytest.mark.parametrize(
+    ("tuned", "parts_of_its_own"), [(["tuned=none"], set()), (RACE, {"lag"})], ids=["none", "race"]
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    tuned: list[str], parts_of_its_own: set[str], tmp_path: Path
+) -> None:
+    settings = [*SETTINGS, *tuned, "track=circle", "env=faithful"]
     train(tmp_path, 2000, *settings, "run_dir=whole")
     train(tmp_path, 1024, *settings, "run_dir=parted")
     before = parts(tmp_path / "parted")
@@ -88,7 +100,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
     assert learner_updates(whole) - learner_updates(before) >= 200
     names = {name.split("/")[1].partition("-")[2] for name in whole}
-    assert names == {"learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "random_state"}
+    common = {"learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "random_state"}
+    assert names == common | parts_of_its_own
     assert_same(whole, parted, "checkpoint")
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,6 +11,8 @@ from dreamer_racing.learner import Agent
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.sizes import SIZES
+from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.replay import records_from_rollout
 
 
 class NoiseEnv(EnvBase):
@@ -53,9 +57,9 @@ class NoiseEnv(EnvBase):
         self.generator.manual_seed(seed or 0)
 
 
-def make_policy(deterministic: bool = False) -> tuple[Agent, DreamerPolicy]:
+def make_policy(deterministic: bool = False, sampled: bool = True) -> tuple[Agent, DreamerPolicy]:
     torch.manual_seed(0)
-    agent = Agent(SIZES["debug"], Interface())
+    agent = Agent(replace(SIZES["debug"], sampled=sampled), Interface())
     with torch.no_grad():
         agent.actor.mlp.output.weight.mul_(200.0)  # so that actions differ from one another
     return agent, DreamerPolicy(agent.world_model, agent.actor, deterministic)
@@ -82,6 +86,33 @@ def test_collected_latents_equal_those_of_training():
     follows = ~is_init[:, 1:]
     assert torch.equal(data["previous_action"][:, 1:][follows], data["action"][:, :-1][follows])
     assert data["action"].std() > 0.01
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_stored_context_lets_a_window_go_on_from_where_acting_was(sampled):
+    """At every record of a window: also where an episode ends inside it, and at the first record of all."""
+    agent, policy = make_policy(deterministic=True, sampled=sampled)
+    collector = Collector(make_env(policy), policy, frames_per_batch=36, total_frames=36)
+    data = next(iter(collector))
+    collector.shutdown()
+    rssm = agent.world_model.rssm
+    records = records_from_rollout(data, reward_keys=("reward",), latents=rssm.latent_format)
+    for stream in range(3):
+        own = records[records["stream"] == stream]
+        own = own[own["order"].argsort()]
+        acted = agent.world_model.observe(
+            own.unsqueeze(0), own["previous_action"][None], own["is_init"].squeeze(-1)[None], deterministic=True
+        )
+        for start in range(len(own)):
+            window = own[start:].unsqueeze(0)
+            seen = rssm.observe(
+                agent.world_model.encoder(window),
+                window["previous_action"],
+                window["is_init"].squeeze(-1),
+                initial=rssm.latent_format.unpack(window[CONTEXT][:, 0]),
+                deterministic=True,
+            )
+            torch.testing.assert_close(seen.belief, acted.belief[:, start:], atol=2e-3, rtol=0)
 
 
 def test_rollout_of_the_policy_samples_and_needs_no_gradient():
