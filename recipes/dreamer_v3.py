@@ -71,6 +71,11 @@ class DreamerRun(ReplayRun):
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Put what is scheduled where it belongs by now, and make the updates that are due."""
         self.keep_to_schedule()
+        restart = self.config.schedule.restart_actor
+        if rollout is not None and restart is not None:
+            due = restart * self.config.total_env_steps
+            if self.counters["env_steps"] - rollout.numel() < due <= self.counters["env_steps"]:
+                self.learner.restart_actor()
         super().learn(rollout, stop)
 
     def keep_to_schedule(self) -> None:

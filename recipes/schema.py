@@ -147,6 +147,7 @@ class ScheduleConfig:
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
+    restart_actor: float | None = None  # loss.actor=ppo: share of the run at which the actor begins anew; null: never
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None
 

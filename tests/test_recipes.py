@@ -286,6 +286,8 @@ REFUSED = [
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
+    (["schedule.restart_actor=0.2"], ["schedule.restart_actor=0.2 is for loss.actor=ppo"]),
+    (["schedule.restart_actor=1.5", "loss.actor=ppo"], ["schedule.restart_actor=1.5: a share of the run"]),
     (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for loss.actor=ppo"]),
     (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
