@@ -64,6 +64,10 @@ class LearnerConfig:
         behavior_lr: Learning rate of actor and critic; None for the same. A lower one lets the world model get ahead of
             the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
         warmup_updates: Updates over which the learning rate rises from zero.
+        imagine_recent: Imagine from the batch's newest windows only, as far as they go, so that the actor learns where
+            it flies now; the batch must say which they are (``recent``), as the replay does.
+        min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
+            first way of doing something has made it sure of itself.
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         ppo: Numbers of the actor loss of that name.
@@ -98,6 +102,8 @@ class LearnerConfig:
     lr: float = 4e-5
     behavior_lr: float | None = None
     warmup_updates: int = 1000
+    imagine_recent: bool = False
+    min_std: float = 0.1
     average_rate: float | None = None
     ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)
     world_model_loss: str = "reconstruction"
@@ -255,6 +261,7 @@ class DreamerLearner:
                 "critic": find_loss(CRITIC_LOSSES, self.config.critic_loss),
             }
             self.agent = Agent(self.size, interface or Interface(), world_model_loss.decodes).to(self.device)
+            self.agent.actor.min_std.fill_(self.config.min_std)
             self.losses = nn.ModuleDict(
                 {name: loss.from_config(self.agent, self.config) for name, loss in losses.items()}
             ).to(self.device)
@@ -313,19 +320,33 @@ class DreamerLearner:
             rate = max(self.config.average_rate, 1.0 / self.updates)
             torch._foreach_lerp_(list(self.averaged.parameters()), list(self.agent.parameters()), rate)
 
-    def adjust(self, *, rates: float = 1.0, discount: float | None = None, entropy_scale: float | None = None) -> None:
+    def adjust(
+        self,
+        *,
+        rates: float = 1.0,
+        discount: float | None = None,
+        entropy_scale: float | None = None,
+        min_std: float | None = None,
+    ) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named is as configured.
 
         Args:
             rates: Share of the configured learning rates, of all optimisers.
             discount: γ.
             entropy_scale: Weight of the actor's entropy.
+            min_std: Smallest standard deviation of actions.
         """
+        self._set_min_std(self.config.min_std if min_std is None else min_std)
         for group, rate in zip(self._groups, self._rates, strict=True):
             group["lr"] = rate * rates
         self.discount = self.config.discount if discount is None else discount
         self._set_in_losses("discount", self.discount)
         self._set_in_losses("entropy_scale", self.config.entropy_scale if entropy_scale is None else entropy_scale)
+
+    def _set_min_std(self, value: float) -> None:
+        for agent in (self.agent, self.averaged):
+            if agent is not None:
+                agent.actor.min_std.fill_(value)
 
     def restart_actor(self) -> None:
         """Give the actor fresh weights, from the device's global generator; model, critic and replay stay.
@@ -493,7 +514,8 @@ class DreamerLearner:
             if there == here
             else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
         )
-        parts = {"networks": (self.agent.state_dict(), saved["agent"])}
+        older = {"actor.min_std": self.agent.actor.min_std}  # they do not say
+        parts = {"networks": (self.agent.state_dict(), older | saved["agent"])}
         parts |= {f"{name} loss": (_own_state(loss), saved["losses"][name]) for name, loss in self.losses.items()}
         for part, (wanted, found) in parts.items():
             lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
@@ -541,8 +563,11 @@ class DreamerLearner:
         count = self.config.imagination_starts
         if count is None:
             return starts
+        order = torch.rand(len(starts), device=self.device)
+        if self.config.imagine_recent:
+            order = order + batch.get("recent").flatten()
         # Not randperm, which a CUDA graph cannot capture.
-        return starts[torch.rand(len(starts), device=self.device).topk(min(count, len(starts))).indices]
+        return starts[order.topk(min(count, len(starts))).indices]
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

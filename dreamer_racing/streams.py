@@ -232,7 +232,9 @@ class StreamSampler(RandomSampler):
         self._held_out_rng = torch.Generator().manual_seed(0)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
-        """Returns the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and an empty dictionary.
+        """Returns the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and which are among the newest.
+
+        The latter as ``{"recent": bool (B, T)}``, which a replay delivers with the records.
 
         Raises:
             RuntimeError: if no stream holds T records yet.
@@ -247,7 +249,8 @@ class StreamSampler(RandomSampler):
         slots = [self._draw(batch_size - recent, self.batch_length, filled, self._rng)]
         if recent:
             slots.append(self._draw(recent, self.batch_length, filled.clamp(max=self.recent_length), self._rng))
-        return torch.cat(slots), {}
+        is_recent = torch.arange(batch_size) >= batch_size - recent  # (B,)
+        return torch.cat(slots), {"recent": is_recent.unsqueeze(-1).expand(-1, self.batch_length)}
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
         """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`."""

@@ -144,6 +144,7 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
         lr=model.learning_rate,
         behavior_lr=model.behavior_learning_rate,
         warmup_updates=model.warmup_updates,
+        imagine_recent=model.imagine_recent,
         average_rate=model.average_rate,
         compile=model.compile,
         cuda_graph=model.cuda_graph,

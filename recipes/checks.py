@@ -64,6 +64,7 @@ RANGES = {
     "loss.discount": SHARE,
     "loss.lambda_": SHARE,
     "loss.entropy_scale": NOT_NEGATIVE,
+    "loss.min_std": Range(0, 1, open_below=True),
     "loss.dynamics_scale": NOT_NEGATIVE,
     "loss.representation_scale": NOT_NEGATIVE,
     "loss.free_nats": NOT_NEGATIVE,
@@ -251,6 +252,10 @@ def check_dreamer(config: DreamerConfig) -> None:
     check(config)
     check_replay(config)
     check_schedule(config)
+    if config.model.imagine_recent and not config.replay.recent_share:
+        raise ValueError(
+            "model.imagine_recent=true, and replay.recent_share=0 draws no newest windows: give it a share."
+        )
     check_image_size(config.env.image_size, config.model.size)
     model = config.model
     prefilled = config.prefill // config.env.num_envs
@@ -287,6 +292,7 @@ def check_schedule(config: DreamerConfig) -> None:
         "learning_rates": POSITIVE,
         "discount": RANGES["loss.discount"],
         "entropy_scale": RANGES["loss.entropy_scale"],
+        "min_std": RANGES["loss.min_std"],
         "start_on_line": RANGES["env.start_on_line"],
     }
     for name, allowed in targets.items():

@@ -69,13 +69,13 @@ class DreamerRun(ReplayRun):
             self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
-        """Put what is scheduled where it belongs by now, and make the updates that are due."""
-        self.keep_to_schedule()
+        """Restart the actor if it is time, put what is scheduled where it belongs, make the updates that are due."""
         restart = self.config.schedule.restart_actor
         if rollout is not None and restart is not None:
             due = restart * self.config.total_env_steps
             if self.counters["env_steps"] - rollout.numel() < due <= self.counters["env_steps"]:
                 self.learner.restart_actor()
+        self.keep_to_schedule()
         super().learn(rollout, stop)
 
     def keep_to_schedule(self) -> None:
@@ -87,6 +87,7 @@ class DreamerRun(ReplayRun):
             "rates": (schedule.learning_rates, 1.0),
             "discount": (schedule.discount, loss.discount),
             "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
+            "min_std": (schedule.min_std, loss.min_std),
         }
         self.learner.adjust(**{name: ramp.at(value, progress) for name, (ramp, value) in now.items()})
         if schedule.start_on_line.to is not None:

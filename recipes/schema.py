@@ -50,6 +50,7 @@ class ModelConfig:
     average_rate: float | None = None  # of the averaged weights, which fly evaluations and exports; null: none
     imagination_horizon: int = MISSING
     imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
+    imagine_recent: bool = False  # from those of its newest windows only (replay.recent_share)
 
 
 @dataclass
@@ -62,6 +63,7 @@ class LossConfig:
     discount: float = 0.997
     lambda_: float = 0.95
     entropy_scale: float = 3e-4
+    min_std: float = 0.1  # smallest standard deviation of actions
     dynamics_scale: float = 1.0
     representation_scale: float = 0.1
     free_nats: float = 1.0
@@ -146,6 +148,7 @@ class ScheduleConfig:
     learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
+    min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     restart_actor: float | None = None  # loss.actor=ppo: share of the run at which the actor begins anew; null: never
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never

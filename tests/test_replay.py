@@ -151,7 +151,7 @@ def test_collector_rollouts_in_every_storage(storage, image_shape, tmp_path):
     sample = replay.sample()
     assert sample.batch_size == (4, 5)
     assert sample["pixels"].shape == (4, 5, *image_shape)
-    assert set(sample.keys()) == {*KEYS, "index"}
+    assert set(sample.keys()) == {*KEYS, "index", "recent"}
 
 
 def test_collector_can_write_to_the_replay_itself():

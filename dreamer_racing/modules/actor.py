@@ -6,7 +6,7 @@ Shape legend: N any batch, F features, A action.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -56,7 +56,7 @@ class Actor(nn.Module):
         layers: Number of hidden layers.
         units: Width of the hidden layers.
         norm: ``"rms"`` or ``"layer"``.
-        min_std: Smallest standard deviation.
+        min_std: Smallest standard deviation; a scalar that may change while the actor is trained.
         max_std: Largest standard deviation.
 
     Reference: danijar/dreamerv3, ``heads.bounded_normal``: std = lo + (hi − lo)·sigmoid(raw + 2).
@@ -74,8 +74,13 @@ class Actor(nn.Module):
     ) -> None:
         super().__init__()
         self.mlp = MLP(in_features, 2 * action_dim, layers, units, norm, output_scale=0.01)
-        self.min_std = min_std
+        self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = max_std
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Leave the smallest deviation as it is where older weights do not say."""
+        state_dict.setdefault(f"{prefix}min_std", self.min_std)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
