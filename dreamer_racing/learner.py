@@ -160,15 +160,11 @@ class Agent(nn.Module):
 
     def __init__(self, size: ModelSize, interface: Interface, decode: bool = True) -> None:
         super().__init__()
+        head = (size.actor_critic_layers, size.units, size.norm)
         self.interface = interface
         self.world_model = WorldModel(size, interface, decode)
-        self.actor = make_actor(size, interface)
-        self.critic = Critic(size.features, size.actor_critic_layers, size.units, size.norm, size.bins)
-
-
-def make_actor(size: ModelSize, interface: Interface) -> Actor:
-    """Make an actor with fresh weights."""
-    return Actor(size.features, interface.action_dim, size.actor_critic_layers, size.units, size.norm)
+        self.actor = Actor(size.features, interface.action_dim, *head)
+        self.critic = Critic(size.features, *head, size.bins)
 
 
 ParameterGroups = list[dict[str, Any]]
@@ -347,26 +343,6 @@ class DreamerLearner:
         for agent in (self.agent, self.averaged):
             if agent is not None:
                 agent.actor.min_std.fill_(value)
-
-    def restart_actor(self) -> None:
-        """Give the actor fresh weights, from the device's global generator; model, critic and replay stay.
-
-        What it learned first, from a model that knew little, then no longer holds it where it came to.
-
-        Raises:
-            ValueError: If the actor has no optimiser of its own, whose state could be forgotten.
-
-        Reference: Nikishin et al. 2022, "The primacy bias in deep reinforcement learning".
-        """
-        if self._actor_optimizer is None:
-            raise ValueError(
-                f"actor_loss={self.config.actor_loss!r}: only an actor with an optimiser of its own restarts."
-            )
-        fresh = make_actor(self.size, self.agent.interface).to(self.device).state_dict()
-        for agent in (self.agent, self.averaged):
-            if agent is not None:
-                agent.actor.load_state_dict(fresh)
-        cast(ActorLoss, self.losses["actor"]).restart()
 
     def _set_in_losses(self, name: str, value: float) -> None:
         """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""

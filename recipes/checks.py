@@ -302,30 +302,11 @@ def check_schedule(config: DreamerConfig) -> None:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     if config.schedule.wait_for_model is not None:
         check_wait(config)
-    check_restart(config)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
     if to is not None and not config.env.start_on_line:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
-
-
-def check_restart(config: DreamerConfig) -> None:
-    """Refuse to restart an actor that cannot, or outside the run.
-
-    Raises:
-        ValueError: the message names the setting to change.
-    """
-    share = config.schedule.restart_actor
-    if share is None:
-        return
-    if not 0 < share < 1:
-        raise ValueError(f"schedule.restart_actor={share}: a share of the run, must be above 0 and below 1.")
-    if config.loss.actor != "ppo":
-        raise ValueError(
-            f"schedule.restart_actor={share} is for loss.actor=ppo, whose actor has an optimiser of its own; with "
-            f"loss.actor={config.loss.actor} leave it at null."
-        )
 
 
 def check_wait(config: DreamerConfig) -> None:

@@ -69,12 +69,7 @@ class DreamerRun(ReplayRun):
             self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
-        """Restart the actor if it is time, put what is scheduled where it belongs, make the updates that are due."""
-        restart = self.config.schedule.restart_actor
-        if rollout is not None and restart is not None:
-            due = restart * self.config.total_env_steps
-            if self.counters["env_steps"] - rollout.numel() < due <= self.counters["env_steps"]:
-                self.learner.restart_actor()
+        """Put what is scheduled where it belongs by now, and make the updates that are due."""
         self.keep_to_schedule()
         super().learn(rollout, stop)
 

@@ -150,7 +150,6 @@ class ScheduleConfig:
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
-    restart_actor: float | None = None  # loss.actor=ppo: share of the run at which the actor begins anew; null: never
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None
 

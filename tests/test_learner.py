@@ -400,3 +400,34 @@ def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
 def test_without_averages_the_trained_weights_fly():
     learner = DreamerLearner("debug", config=CONFIG, seed=0)
     assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor
+
+
+def test_imagination_begins_in_the_newest_windows_where_it_is_told_to():
+    config = replace(CONFIG, imagination_starts=8, imagine_recent=True)
+    learner, batch = DreamerLearner("debug", config=config, seed=0), make_batch(batch=4, time=6)
+    batch["recent"] = torch.tensor([False, False, True, True]).unsqueeze(-1).expand(4, 6)
+    latents = TensorDict({"belief": torch.zeros(4, 6, 32), "state": torch.zeros(4, 6, 16)}, [4, 6])
+    latents["belief"][2:] = 1.0
+    for _ in range(10):
+        assert learner._choose_starts(latents, batch)["belief"].min() == 1.0
+    learner.config = replace(config, imagination_starts=20)  # more than the 12 there are: the others fill up
+    assert learner._choose_starts(latents, batch)["belief"][:, 0].sum() == 12
+
+
+def test_the_smallest_deviation_is_scheduled_saved_and_flown():
+    learner = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=0)
+    features = torch.zeros(1, 48)
+    assert learner.agent.actor(features).std.min() >= 0.4
+    learner.adjust(min_std=0.2)
+    with torch.no_grad():
+        learner.agent.actor.mlp.output.bias.fill_(-50.0)
+    assert learner.agent.actor(features).std.max().item() == pytest.approx(0.2)
+    restored = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=1)
+    restored.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for agent in (restored.agent, restored.averaged):
+        assert agent.actor.min_std.item() == pytest.approx(0.2)
+    older = learner.state_dict()
+    del older["agent"]["actor.min_std"]
+    other = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4), seed=1)
+    other.load_state_dict(older)
+    assert other.agent.actor.min_std.item() == pytest.approx(0.4)

@@ -132,9 +132,6 @@ class ActorLoss(LossModule):
         )
         return TensorDict({"loss_actor": loss, **judged, "imagination": imagination}, [])
 
-    def restart(self) -> None:
-        """Take note that the actor begins anew; for losses with an optimiser of their own."""
-
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.
 

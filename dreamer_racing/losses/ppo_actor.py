@@ -144,12 +144,6 @@ class PPOActorLoss(ActorLoss):
             self.get_buffer(name).index_copy_(0, self.cursor, value.unsqueeze(0).float())
         self.cursor.add_(1).remainder_(self.ppo.updates)
 
-    def restart(self) -> None:
-        """Forget the rollouts that are kept, and all that the optimiser knows: the actor has begun anew."""
-        for name in Minibatch._fields:
-            self.register_buffer(name, torch.empty(0, device=self.cursor.device))
-        self.optimizer.state.clear()
-
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Take the number of starts from what is loaded."""
         for name in Minibatch._fields:

@@ -157,27 +157,6 @@ def test_a_checkpoint_between_two_improvements_loses_nothing():
         assert torch.equal(value, resumed.agent.state_dict()[name]), name
 
 
-def test_an_actor_that_restarts_forgets_all_but_its_model():
-    from tests.test_learner import make_batch
-
-    learner = make_learner(average_rate=0.1)
-    for _ in range(4):
-        learner.update(make_batch())
-    before = copy.deepcopy(learner.agent.state_dict())
-    learner.restart_actor()
-    for name, value in learner.agent.state_dict().items():
-        assert torch.equal(value, before[name]) != name.startswith("actor.mlp."), name
-    for name, value in learner.agent.actor.state_dict().items():
-        assert torch.equal(value, learner.averaged.actor.state_dict()[name]), name
-    assert not learner.losses["actor"].optimizer.state and not len(learner.losses["actor"].weight)
-    assert learner.update(make_batch())["loss_actor"].isfinite()
-
-
-def test_only_an_actor_with_an_optimiser_of_its_own_restarts():
-    with pytest.raises(ValueError, match="actor_loss='reinforce': only an actor with an optimiser of its own"):
-        make_learner(actor_loss="reinforce").restart_actor()
-
-
 def test_the_learning_rate_of_the_actor_falls_with_the_others():
     learner = make_learner()
     learner.adjust(rates=0.25)
