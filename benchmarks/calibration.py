@@ -75,7 +75,7 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
     return {
         "benchmark": "calibration", "track": config.track, "actor": config.loss.actor, **counters,
         "num_envs": num_envs, "steps": steps, "horizon": learner.config.imagination_horizon,
-        "discount": learner.config.discount, **compare(learner, fly(learner, config, num_envs, steps)),
+        "discount": learner.discount, **compare(learner, fly(learner, config, num_envs, steps)),
     }  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def compare(learner: DreamerLearner, flight: TensorDict) -> dict[str, Any]:
     means = {name: torch.stack([row[name] for row in rows]).nanmean().item() for name in rows[0]}
     if "gate_error" in means:
         means["gate_error"] = math.sqrt(means["gate_error"])
-    paid, half = monte_carlo(flight, learner.config.discount), len(flight) // 2
+    paid, half = monte_carlo(flight, learner.discount), len(flight) // 2
     return means | {
         "value": value[:half].mean().item(),
         "monte_carlo": paid[:half].mean().item(),

@@ -171,6 +171,11 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
     """
     if latent not in LATENTS:
         raise ValueError(f"latent={latent}: there are {' and '.join(LATENTS)}.")
+    if latent == "sample" and not agent.world_model.rssm.sampled:
+        raise ValueError(
+            "latent=sample: this agent's states are the probabilities of their categoricals, of which nothing is drawn "
+            "(model.sampled=false): export it with latent=mode."
+        )
     return LATENTS[latent](agent)
 
 

@@ -26,6 +26,7 @@ from dreamer_racing.losses import (
     LossClass,
     find_loss,
 )
+from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
@@ -296,6 +297,8 @@ class DreamerLearner:
         """
         self._timed = untimed if self.config.compile else timed  # a clock would break the compiled graph in pieces
         batch = batch.to(self.device, non_blocking=True)
+        if self._actor_optimizer is not None:
+            cast(ActorLoss, self.losses["actor"]).prepare(self._number_of_starts(batch))
         metrics = self._step(batch)
         self._guard.check(metrics, batch)
         with timed("optimise"):
@@ -306,7 +309,11 @@ class DreamerLearner:
         self.updates += 1
         if self._actor_optimizer is not None and not self.actor_waits:
             with timed("improve"), self.autocast():
-                metrics |= cast(ActorLoss, self.losses["actor"]).improve(self.updates)
+                improved = cast(ActorLoss, self.losses["actor"]).improve(self.updates)
+            norms = {f"gradient_norm/{name}": value for name, value in improved.items() if name.endswith("norm")}
+            if norms:
+                self._guard.check(norms, batch)
+            metrics |= improved
         self._average()
         return metrics
 
@@ -383,7 +390,11 @@ class DreamerLearner:
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with self._timed("optimise"):
             total.backward()
-            norms = {f"gradient_norm/{name}": _gradient_norm(parameters) for name, parameters in self._networks.items()}
+            norms = {
+                f"gradient_norm/{name}": _gradient_norm(parameters)
+                for name, parameters in self._networks.items()
+                if any(parameter.grad is not None for parameter in parameters)  # none, where the actor steps alone
+            }
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
 
     def compute_losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -536,14 +547,18 @@ class DreamerLearner:
             batch.batch_size,
         )
         starts = starts.detach().flatten()
-        count = self.config.imagination_starts
-        if count is None:
+        if self.config.imagination_starts is None:
             return starts
         order = torch.rand(len(starts), device=self.device)
         if self.config.imagine_recent:
+            require_keys(self, batch, ["recent"])
             order = order + batch.get("recent").flatten()
         # Not randperm, which a CUDA graph cannot capture.
-        return starts[order.topk(min(count, len(starts))).indices]
+        return starts[order.topk(self._number_of_starts(batch)).indices]
+
+    def _number_of_starts(self, batch: TensorDictBase) -> int:
+        """Return how many records of a batch ``[B, T]`` imagination begins from."""
+        return min(self.config.imagination_starts or batch.numel(), batch.numel())
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

@@ -229,7 +229,6 @@ class StreamSampler(RandomSampler):
         self.recent_share = recent_share
         self.recent_length = max(batch_length, writer.stream_length if recent_length is None else recent_length)
         self._held_out = torch.arange(writer.num_streams) >= writer.num_streams - held_out  # (N,)
-        self._held_out_rng = torch.Generator().manual_seed(0)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
         """Returns the slots of ``batch_size`` windows, int64 ``(B, T)`` on the CPU, and which are among the newest.
@@ -253,12 +252,16 @@ class StreamSampler(RandomSampler):
         return torch.cat(slots), {"recent": is_recent.unsqueeze(-1).expand(-1, self.batch_length)}
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> Tensor | None:
-        """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`."""
+        """Returns the slots of windows in the streams that are held out, or None; see `StreamReplay.held_out`.
+
+        Which they are depends on what has been written alone: looking more or less often changes nothing.
+        """
         reach = self.writer.filled.masked_fill(~self._held_out, 0)  # (N,)
         reach = reach if recent is None else reach.clamp(max=recent)
         if int(reach.max()) < length:
             return None
-        return self._draw(num_windows, length, reach, self._held_out_rng)
+        generator = torch.Generator().manual_seed(self.writer._write_count)
+        return self._draw(num_windows, length, reach, generator)
 
     def _draw(self, count: int, length: int, reach: Tensor, generator: torch.Generator | None) -> Tensor:
         """Slots ``(count, length)`` of windows in the newest ``reach`` records ``(N,)`` of the streams."""

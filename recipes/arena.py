@@ -154,6 +154,18 @@ def learner_config(config: DreamerConfig) -> LearnerConfig:
     )
 
 
+def scheduled(config: DreamerConfig, env_steps: int) -> dict[str, float]:
+    """Arguments of `DreamerLearner.adjust` after so many env_steps of a run."""
+    schedule, loss, progress = config.schedule, config.loss, env_steps / config.total_env_steps
+    now = {
+        "rates": (schedule.learning_rates, 1.0),
+        "discount": (schedule.discount, loss.discount),
+        "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
+        "min_std": (schedule.min_std, loss.min_std),
+    }
+    return {name: ramp.at(value, progress) for name, (ramp, value) in now.items()}
+
+
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
@@ -187,6 +199,15 @@ def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
     return cast(DictConfig, OmegaConf.merge(schema, saved))
 
 
+def is_known(name: str, schema: DictConfig) -> bool:
+    """Whether a schema has a setting or a group of this dotted name."""
+    first, _, rest = name.partition(".")
+    if first not in set(schema.keys()):
+        return False
+    inner = schema._get_node(first)
+    return not rest or (isinstance(inner, DictConfig) and is_known(rest, inner))
+
+
 def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> list[str]:
     """Remove from a saved configuration what a schema does not have; return `name=value` of each."""
     unknown = [name for name in map(str, saved) if name not in set(schema.keys())]  # `in` overlooks what is missing
@@ -217,6 +238,8 @@ def restore_learner(
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
     load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
+    if isinstance(learner, DreamerLearner):
+        learner.adjust(**scheduled(cast(DreamerConfig, config), counters["env_steps"]))
     return learner, counters
 
 

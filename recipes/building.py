@@ -162,7 +162,8 @@ def make_run_replay(
         observation_keys=interface.replay_keys,
         reward_keys=reward_terms(env),
         latents=latents,
-        prefetch=2 if config.device != "cpu" and storage_device == "cpu" else None,
+        # Samples drawn ahead would not have the latents that the update before them leaves.
+        prefetch=2 if config.device != "cpu" and storage_device == "cpu" and latents is None else None,
         **windows,
     )
 

@@ -61,10 +61,19 @@ RANGES = {
     "model.warmup_updates": NOT_NEGATIVE,
     "model.imagination_horizon": Range(1),
     "model.imagination_starts": Range(1),
+    "model.average_rate": Range(0, 1, open_below=True),
     "loss.discount": SHARE,
     "loss.lambda_": SHARE,
     "loss.entropy_scale": NOT_NEGATIVE,
     "loss.min_std": Range(0, 1, open_below=True),
+    "loss.ppo.updates": Range(1),
+    "loss.ppo.epochs": Range(1),
+    "loss.ppo.minibatch": Range(1),
+    "loss.ppo.clip_epsilon": POSITIVE,
+    "loss.ppo.advantage_clip": POSITIVE,
+    "loss.ppo.kl_stop": POSITIVE,
+    "loss.ppo.learning_rate": POSITIVE,
+    "loss.ppo.gradient_clip": POSITIVE,
     "loss.dynamics_scale": NOT_NEGATIVE,
     "loss.representation_scale": NOT_NEGATIVE,
     "loss.free_nats": NOT_NEGATIVE,
@@ -252,10 +261,7 @@ def check_dreamer(config: DreamerConfig) -> None:
     check(config)
     check_replay(config)
     check_schedule(config)
-    if config.model.imagine_recent and not config.replay.recent_share:
-        raise ValueError(
-            "model.imagine_recent=true, and replay.recent_share=0 draws no newest windows: give it a share."
-        )
+    check_imagination(config)
     check_image_size(config.env.image_size, config.model.size)
     model = config.model
     prefilled = config.prefill // config.env.num_envs
@@ -279,6 +285,27 @@ def check_dreamer(config: DreamerConfig) -> None:
         raise ValueError(
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
+        )
+
+
+def check_imagination(config: DreamerConfig) -> None:
+    """Refuse to imagine from the newest windows where there are none, or from all records anyway.
+
+    Raises:
+        ValueError: the message names the settings.
+    """
+    model, share = config.model, config.replay.recent_share
+    if not model.imagine_recent:
+        return
+    if not round(share * model.batch_size):
+        raise ValueError(
+            f"model.imagine_recent=true, and replay.recent_share={share:g} draws none of model.batch_size="
+            f"{model.batch_size} windows from the newest records: raise the share, or set model.imagine_recent=false."
+        )
+    if model.imagination_starts is None:
+        raise ValueError(
+            "model.imagine_recent=true, and model.imagination_starts=null begins from all records of a batch: give a "
+            "number of them, or set model.imagine_recent=false."
         )
 
 
@@ -321,7 +348,7 @@ def check_wait(config: DreamerConfig) -> None:
     if config.loss.actor != "ppo":
         raise ValueError(
             f"schedule.wait_for_model={limit} is for loss.actor=ppo, whose actor has an optimiser of its own; with "
-            f"loss.actor={config.loss.actor} leave it at null."
+            f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null (tuned=race sets it)."
         )
     if not config.replay.held_out:
         raise ValueError(f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0.")

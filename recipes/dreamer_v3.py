@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import ClassVar, cast
 
 import hydra
-from arena import make_env, make_learner
+from arena import make_env, make_learner, scheduled
 from building import assemble, claim, make_collector, make_curriculum, make_run_replay, resolve_common, seed_generators
 from checks import check_dreamer
 from command_line import CONFIG_DIR, choose_device, computes_bfloat16
@@ -39,6 +39,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   25 actions a second; the actor is trained by PPO on imagined rollouts; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
+LAG_EVERY = 2_000  # env_steps
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -60,38 +61,47 @@ class DreamerRun(ReplayRun):
         names = ("learning_rate/world_model", "learning_rate/behavior")
         rates = (group["lr"] for group in self.learner.optimizer.param_groups)
         self.metrics.push(dict(zip(names, rates, strict=True)))
+        self.metrics.push(self.held_out())
+
+    def held_out(self) -> dict[str, Tensor]:
+        """What the world model makes of the newest records that it is never trained on; nothing, if there are none."""
         length = CONTEXT + self.config.model.imagination_horizon
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
-        if windows is not None and self.counters["updates"]:
-            measured = held_out_metrics(self.learner, windows)
-            self.metrics.push(measured)
-            error = next(measured[f"held_out/{name}"] for name in LAG_ERRORS if f"held_out/{name}" in measured)
+        if windows is None or not self.counters["updates"]:
+            return {}
+        return held_out_metrics(self.learner, windows)
+
+    def look_at_lag(self) -> None:
+        """Every so many env_steps, whatever is logged: see whether the model still knows where its policy flies."""
+        periods = self.counters["env_steps"] // LAG_EVERY
+        if self.lag.limit is None or periods <= self.lag.periods:
+            return
+        self.lag.periods, measured = periods, self.held_out()
+        error = next((measured[f"held_out/{name}"] for name in LAG_ERRORS if f"held_out/{name}" in measured), None)
+        if error is not None:
             self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Put what is scheduled where it belongs by now, and make the updates that are due."""
         self.keep_to_schedule()
         super().learn(rollout, stop)
+        if not stop.signal_name:  # else after what is owed then
+            self.look_at_lag()
 
     def keep_to_schedule(self) -> None:
         """Set everything that is scheduled to its value at this share of the run."""
-        schedule, loss = self.config.schedule, self.config.loss
         self.learner.actor_waits = self.lag.waits
-        progress = self.counters["env_steps"] / self.config.total_env_steps
-        now = {
-            "rates": (schedule.learning_rates, 1.0),
-            "discount": (schedule.discount, loss.discount),
-            "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
-            "min_std": (schedule.min_std, loss.min_std),
-        }
-        self.learner.adjust(**{name: ramp.at(value, progress) for name, (ramp, value) in now.items()})
+        self.learner.adjust(**scheduled(self.config, self.counters["env_steps"]))
+        schedule, progress = self.config.schedule, self.counters["env_steps"] / self.config.total_env_steps
         if schedule.start_on_line.to is not None:
             share = schedule.start_on_line.at(self.config.env.start_on_line, progress)
             cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
         """Take note of the model's error; let later windows go on from what the model makes of these records now."""
-        self.lag.trained(next(metrics[name] for name in LAG_ERRORS if name in metrics))
+        error = next((metrics[name] for name in LAG_ERRORS if name in metrics), None)
+        if error is not None:
+            self.lag.trained(error)
         if self.config.replay.context:
             latents = self.learner.latents
             assert latents is not None, "the update left them"
@@ -119,8 +129,8 @@ def main(config: DictConfig) -> None:
 def tune(config: DictConfig) -> str:
     """Choose the file of the group `tuned` for what is to be trained, and say what it means."""
     on_cpu = choose_device(config.device).type == "cpu"
-    short = config.model.size == "debug" or config.budget in ("smoke", "paper")
-    if not on_cpu or short or config.env.suite != "race" or not config.env.from_pixels:
+    meant = config.model.size in ("auto", "cpu_small") and config.budget not in ("smoke", "paper")
+    if not on_cpu or not meant or config.env.suite != "race" or not config.env.from_pixels:
         return "none"
     print(RACE_SETTINGS)
     return "race"
@@ -144,8 +154,8 @@ def resolve(config: DictConfig) -> DictConfig:
         state, ability = ("on", "computes") if config.model.mixed_precision else ("off", "does not compute")
         print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
     if config.env.num_envs == 1 and config.replay.held_out:
-        print("held out: nothing, because there is a single world (replay.held_out=0)")
-        config.replay.held_out = 0
+        print("held out: nothing, because there is a single world (replay.held_out=0, schedule.wait_for_model=null)")
+        config.replay.held_out, config.schedule.wait_for_model = 0, None
     return config
 
 

@@ -9,11 +9,12 @@ from typing import Any, ClassVar, cast
 
 import hydra
 import torch
-from arena import Environment, Report, with_schema
+from arena import Environment, Report, is_known, with_schema
 from checks import ReplayRatio, check_overrides
 from command_line import merge_overrides, override_key, plain_errors, start_logging
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from schema import RECIPES
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -215,9 +216,20 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
                 f"{run_dir} was trained with {name}={trained}, and goes on with it: {override} would be "
                 "another run. Leave it out, or begin anew."
             )
-    begun_with = merge_overrides(list(OmegaConf.load(run_dir / "overrides.yaml")), [f"run_dir={run_dir}"])
-    merged = merge_overrides(begun_with, overrides)
+    merged = merge_overrides([*begun_with(algorithm, run_dir), f"run_dir={run_dir}"], overrides)
     return hydra.compose(algorithm, merged), merged
+
+
+def begun_with(algorithm: str, run_dir: Path) -> list[str]:
+    """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
+    schema = OmegaConf.structured(RECIPES[algorithm])
+    overrides = [str(override) for override in OmegaConf.load(run_dir / "overrides.yaml")]
+    if "tuned" in schema and "tuned" not in OmegaConf.load(run_dir / "config.yaml"):
+        overrides = merge_overrides(overrides, ["tuned=none"])  # begun before there was a choice
+    known = [override for override in overrides if is_known(override_key(override), schema)]
+    if unknown := [override for override in overrides if override not in known]:
+        print(f"overrides of another version, left out: {', '.join(unknown)}")
+    return [override for override in known if override_key(override) != "run_dir"]
 
 
 def saved_config(algorithm: str, run_dir: Path) -> DictConfig:

@@ -132,6 +132,9 @@ class ActorLoss(LossModule):
         )
         return TensorDict({"loss_actor": loss, **judged, "imagination": imagination}, [])
 
+    def prepare(self, starts: int) -> None:
+        """Make room for what a loss keeps of an update with so many starts."""
+
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.
 

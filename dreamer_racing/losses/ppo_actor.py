@@ -10,7 +10,6 @@ Shape legend: K updates, H horizon, N starts, M records of a minibatch, F featur
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -78,7 +77,7 @@ class PPOActorLoss(ActorLoss):
     probability of an action.
 
     The rollouts are buffers of the module, so a checkpoint holds them and a CUDA graph can fill them. They take the
-    number of starts from the first batch; a batch of another number begins anew.
+    number of starts from the first batch; with another number, or another K or H, they begin anew.
 
     Args:
         ppo: Numbers of the improvement.
@@ -94,13 +93,15 @@ class PPOActorLoss(ActorLoss):
     advantage: Tensor
     weight: Tensor
     cursor: Tensor
+    kept: Tensor
 
     def __init__(self, *args: Any, ppo: ImaginedPPOConfig | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.ppo = ppo or ImaginedPPOConfig()
         for name in Minibatch._fields:
             self.register_buffer(name, torch.empty(0))
-        self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))
+        self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))  # the place that is written next
+        self.register_buffer("kept", torch.zeros(1, dtype=torch.int64))  # places written so far, at most K
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
@@ -119,8 +120,23 @@ class PPOActorLoss(ActorLoss):
             continuation=config.continuation,
         )
 
+    def prepare(self, starts: int) -> None:
+        """Make room for K rollouts from so many starts each; what was kept of another shape is forgotten.
+
+        The learner calls this before an update, so that nothing is allocated inside a captured or compiled step.
+        """
+        shape = (self.ppo.updates, self.horizon, starts)
+        if self.weight.shape[:-1] == shape:
+            return
+        features, actions = self.world_model.size.features, self.world_model.interface.action_dim
+        for name, width in zip(Minibatch._fields, (features, actions, 2 * actions, 1, 1), strict=True):
+            self.register_buffer(name, torch.zeros(*shape, width, device=self.cursor.device))
+        self.cursor.zero_()
+        self.kept.zero_()
+
     @torch.no_grad()
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        self.prepare(len(belief))
         features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
         judged = self._judge(features, terminated)
         policy = self.actor(features[:-1])
@@ -136,20 +152,20 @@ class PPOActorLoss(ActorLoss):
 
     def _keep(self, **rollout: Tensor) -> None:
         """Write a rollout of ``(H, N, ...)`` into the next of the K places."""
-        if self.weight.shape[1:] != rollout["weight"].shape:
-            for name, value in rollout.items():
-                self.register_buffer(name, value.new_zeros((self.ppo.updates, *value.shape), dtype=torch.float32))
-            self.cursor.zero_()
         for name, value in rollout.items():
             self.get_buffer(name).index_copy_(0, self.cursor, value.unsqueeze(0).float())
         self.cursor.add_(1).remainder_(self.ppo.updates)
+        self.kept.add_(1).clamp_(max=self.ppo.updates)
 
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Take the number of starts from what is loaded."""
-        for name in Minibatch._fields:
-            if (saved := state_dict.get(prefix + name)) is not None:
-                self.register_buffer(name, torch.zeros_like(saved, device=self.cursor.device))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Take the number of starts from what is loaded; rollouts of another number or horizon are left out."""
+        saved = state_dict.get(f"{prefix}weight")
+        if saved is not None and saved.shape[:2] == (self.ppo.updates, self.horizon):
+            self.prepare(saved.shape[2])
+        else:
+            for name in (*Minibatch._fields, "cursor", "kept"):
+                state_dict.pop(prefix + name, None)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Train the actor if the rollouts of K updates are there.
@@ -158,10 +174,10 @@ class PPOActorLoss(ActorLoss):
             updates: Updates of the learner so far.
 
         Returns:
-            Nothing, or ``loss_actor``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
-            ``gradient_norm/actor`` of what was done; scalars.
+            Nothing, or ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
+            ``ppo/gradient_norm`` of what was done; scalars. A step whose gradient is not finite is not made.
         """
-        if updates % self.ppo.updates or not len(self.weight):
+        if updates % self.ppo.updates or int(self.kept) < self.ppo.updates:
             return {}
         records = self._normalised()
         number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
@@ -171,7 +187,7 @@ class PPOActorLoss(ActorLoss):
             for chosen in order.split(size):
                 metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)))
                 done.append(metrics)
-                if metrics["ppo/kl"] > self.ppo.kl_stop:  # waits for the device, some times an improvement
+                if not metrics["ppo/kl"] <= self.ppo.kl_stop:  # waits for the device, some times an improvement
                     return _summary(done, math.ceil(number / size))
         return _summary(done, math.ceil(number / size))
 
@@ -190,15 +206,17 @@ class PPOActorLoss(ActorLoss):
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.ppo.gradient_clip)
-        self.optimizer.step()
+        if norm.isfinite():
+            self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        return {"loss_actor": loss.detach(), **metrics, "gradient_norm/actor": norm}
+        return {"ppo/loss": loss.detach(), **metrics, "ppo/gradient_norm": norm}
 
 
 def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:
     """Average over the gradient steps; the divergence is the last."""
     means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
-    return means | {"ppo/kl": done[-1]["ppo/kl"], "ppo/epochs": torch.tensor(len(done) / minibatches)}
+    kl = done[-1]["ppo/kl"]
+    return means | {"ppo/kl": kl, "ppo/epochs": torch.full_like(kl, len(done) / minibatches)}
 
 
 def clipped_objective(
@@ -220,7 +238,8 @@ def clipped_objective(
     gain = torch.minimum(ratio * batch.advantage, bounded * batch.advantage)
     loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
     with torch.no_grad():
-        kl = normal_divergence(old, policy).mean()
+        reached = batch.weight.sum().clamp_min(1e-8)
+        kl = (batch.weight * normal_divergence(old, policy)).sum() / reached  # of what the objective counts
         clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
     return loss, {"ppo/kl": kl, "ppo/clipped": clipped}
 

@@ -18,8 +18,15 @@ class ModelLag:
     A policy that improves faster than its model flies where the model errs, and finds those of its errors that promise
     most. Then the fresh records' error stands above the other, and the policy should wait.
 
+    The two are not measured alike: fresh records are of the newest flights, and their windows are longer and begin with
+    latents that no update has refreshed. So a ratio somewhat above one is no lag yet.
+
     Args:
         limit: Ratio of the two above which the policy waits; None: it never does.
+
+    Attributes:
+        waits: Whether the policy should wait.
+        periods: How many periods of a run have been measured, for whoever keeps time; saved with the rest.
 
     Example:
         >>> import torch
@@ -34,6 +41,7 @@ class ModelLag:
     def __init__(self, limit: float | None) -> None:
         self.limit = limit
         self.waits = False
+        self.periods = 0
         self._sum: Tensor | float = 0.0  # of the errors of updates since the last measurement
         self._count = 0
         self._trained = self._held_out = math.nan
@@ -58,6 +66,7 @@ class ModelLag:
         """Return everything that a checkpoint needs."""
         return {
             "waits": self.waits,
+            "periods": self.periods,
             "sum": float(self._sum),
             "count": self._count,
             "trained": self._trained,
@@ -66,7 +75,7 @@ class ModelLag:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.waits = state_dict["waits"]
+        self.waits, self.periods = state_dict["waits"], state_dict["periods"]
         self._sum, self._count = torch.tensor(state_dict["sum"]), state_dict["count"]
         self._trained, self._held_out = state_dict["trained"], state_dict["held_out"]
 

@@ -87,7 +87,7 @@ def test_the_actor_stands_still_until_the_rollouts_are_there():
         metrics = loss.improve(update)
         moved = any(not torch.equal(value, before[name]) for name, value in learner.agent.actor.state_dict().items())
         assert moved == bool(metrics) == (update == 3)
-    assert set(metrics) == {"loss_actor", "ppo/kl", "ppo/clipped", "ppo/epochs", "gradient_norm/actor"}
+    assert set(metrics) == {"ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "ppo/gradient_norm"}
     assert metrics["ppo/epochs"].item() == PPO.epochs
     others = (*learner.agent.world_model.parameters(), *learner.agent.critic.parameters())
     assert all(parameter.grad is None for parameter in others)
@@ -108,6 +108,7 @@ def test_what_is_rewarded_becomes_likelier():
     torch.manual_seed(0)
     learner = make_learner(ppo=replace(PPO, updates=1, minibatch=64, epochs=4))
     loss, agent, starts = learner.losses["actor"], learner.agent, make_starts(64)
+    loss.prepare(64)
     for update in range(1, 31):
         with torch.no_grad():
             features, action = imagine(agent.world_model.rssm, agent.actor, starts["belief"], starts["state"], 4)
@@ -161,3 +162,47 @@ def test_the_learning_rate_of_the_actor_falls_with_the_others():
     learner = make_learner()
     learner.adjust(rates=0.25)
     assert learner.losses["actor"].optimizer.param_groups[0]["lr"] == pytest.approx(0.25 * PPO.learning_rate)
+
+
+def test_rollouts_of_another_number_of_starts_begin_anew():
+    """Places that were never written hold no policy: an improvement waits until all are."""
+    learner = make_learner()
+    loss = learner.losses["actor"]
+    loss(make_starts(6))
+    for update in (2, 3, 4):
+        loss(make_starts(9))
+        assert bool(loss.improve(update)) == (update == 6)
+    for update in (5, 6):
+        loss(make_starts(9))
+        metrics = loss.improve(update)
+    assert metrics["ppo/gradient_norm"].isfinite()
+
+
+@pytest.mark.parametrize("changes", [{"ppo": replace(PPO, updates=2)}, {"ppo": replace(PPO, updates=7)},
+                                     {"imagination_horizon": 3}], ids=["fewer", "more", "shorter"])  # fmt: skip
+def test_a_checkpoint_of_other_rollouts_is_continued_without_them(changes):
+    from tests.test_learner import make_batch
+
+    learner = make_learner()
+    for _ in range(4):
+        learner.update(make_batch())
+    resumed = make_learner(**changes)
+    resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for _ in range(10):
+        metrics = resumed.update(make_batch())
+        assert all(value.isfinite() for value in metrics.values())
+
+
+def test_a_gradient_that_is_not_finite_leaves_the_actor_as_it_was():
+    from dreamer_racing.finite_guard import NonFiniteLossError
+    from tests.test_learner import make_batch
+
+    learner = make_learner()
+    for _ in range(2):
+        learner.update(make_batch())
+    learner.losses["actor"].advantage[0, 0, 0] = math.nan
+    before = copy.deepcopy(learner.agent.actor.state_dict())
+    with pytest.raises(NonFiniteLossError):
+        learner.update(make_batch())
+    for name, value in learner.agent.actor.state_dict().items():
+        assert torch.equal(value, before[name]), name

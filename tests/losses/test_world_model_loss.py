@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
+from dreamer_racing.learner import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ReconstructionLoss, kl_losses
 from dreamer_racing.modules import Interface, WorldModel
 
@@ -114,3 +115,48 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in world_model.named_parameters():
         assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
+
+
+def test_a_window_begins_with_the_first_records_context():
+    from dreamer_racing.modules.stored_latents import CONTEXT
+    from tests.test_learner import make_batch
+
+    learner = DreamerLearner("debug", seed=0)
+    loss, batch = learner.losses["world_model"], make_batch()
+    batch["is_init"] = torch.zeros_like(batch["is_init"])
+    belief, state = torch.rand(3, 6, 32) * 2 - 1, torch.eye(4)[torch.randint(4, (3, 6, 4))].flatten(2)
+    batch[CONTEXT] = learner.latent_format.pack(belief, state)
+    torch.manual_seed(1)
+    context = loss(batch)["replay_context"]
+    torch.manual_seed(1)
+    rssm = learner.agent.world_model.rssm
+    expected = rssm.observe(
+        learner.agent.world_model.encoder(batch),
+        batch["previous_action"],
+        batch["is_init"].squeeze(-1),
+        initial=rssm.latent_format.unpack(batch[CONTEXT][:, 0]),
+    )
+    torch.testing.assert_close(context["belief"], expected.belief)
+    cold = loss(batch.exclude(CONTEXT))["replay_context"]
+    assert not torch.allclose(context["belief"][:, 0], cold["belief"][:, 0])
+
+
+def test_a_refreshed_context_is_what_the_next_window_begins_with():
+    """From the learner's update through the replay into the next sample."""
+    from dreamer_racing.modules.stored_latents import CONTEXT
+    from dreamer_racing.replay import make_replay
+    from tests.test_replay import CountingEnv, collect
+
+    config = LearnerConfig(imagination_horizon=2, imagination_starts=4, lr=1e-3, warmup_updates=0)
+    learner = DreamerLearner("debug", config=config, seed=0)
+    rollout = collect(CountingEnv(2, end=0.0, image_shape=(64, 64, 3)), steps=9, batches=1)[0]
+    rollout["next", "belief"], rollout["next", "state"] = torch.zeros(2, 9, 32), torch.zeros(2, 9, 16)
+    replay = make_replay(20, 2, 1, 10, latents=learner.latent_format)
+    replay.extend(rollout)
+    batch = replay.sample()
+    learner.update(batch)
+    replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
+    again = replay.records(int(batch["index"][0, 0]) // 10)[CONTEXT]
+    belief, state = learner.latent_format.unpack(again)
+    torch.testing.assert_close(belief[1:], learner.latents["belief"][0, :-1], atol=5e-4, rtol=0)
+    assert torch.equal(state[1:], learner.latents["state"][0, :-1].round())
