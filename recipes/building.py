@@ -148,7 +148,10 @@ def make_run_replay(
     where = storage_device if settings.storage is Storage.tensor else "files"
     if settings.storage is Storage.tensor:
         check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
-    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
+    print(
+        f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}, and as much on disk "
+        f"in each of checkpoint.keep={config.checkpoint.keep} checkpoints"
+    )
     return make_replay(
         settings.capacity,
         config.env.num_envs,
