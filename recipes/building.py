@@ -149,7 +149,7 @@ def make_run_replay(
     if settings.storage is Storage.tensor:
         check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
     print(
-        f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}, and as much on disk "
+        f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}; as much on disk "
         f"in each of checkpoint.keep={config.checkpoint.keep} checkpoints"
     )
     return make_replay(

@@ -156,9 +156,7 @@ def resolve(config: DictConfig) -> DictConfig:
         print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
     if config.tuned in ("race", "explore"):
         hours = config.total_env_steps / RACE_SPEED / 3600
-        print(
-            f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at {RACE_SPEED} a second, one core's speed"
-        )
+        print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
     if config.env.num_envs == 1 and config.replay.held_out:
         print("held out: nothing, because there is a single world (replay.held_out=0, schedule.wait_for_model=null)")
         config.replay.held_out, config.schedule.wait_for_model = 0, None
