@@ -503,7 +503,14 @@ class DreamerLearner:
         )
         older = {"actor.min_std": self.agent.actor.min_std}  # they do not say
         parts = {"networks": (self.agent.state_dict(), older | saved["agent"])}
-        parts |= {f"{name} loss": (_own_state(loss), saved["losses"][name]) for name, loss in self.losses.items()}
+        for name, loss in self.losses.items():
+            # What a loss keeps from update to update it may do without; older versions keep less.
+            kept = {key for key, _ in loss.named_buffers()}
+            own, there = (
+                {key: value for key, value in state.items() if key not in kept}
+                for state in (_own_state(loss), saved["losses"][name])
+            )
+            parts[f"{name} loss"] = (own, there)
         for part, (wanted, found) in parts.items():
             lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
             if lacking or surplus:
