@@ -99,6 +99,7 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
     training = recipe_module("training")
     with pytest.raises(ValueError, match="trained with decoys=None"):
         training.resumed_config("dreamer_v3", str(run_dir), ["+decoys=paper"])
+    recipe_module("schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         _, overrides = training.resumed_config("dreamer_v3", str(run_dir), ["track=circle", "seed=1"])
     names = [override.partition("=")[0] for override in overrides]
