@@ -13,7 +13,7 @@ from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.losses import imagine
 from dreamer_racing.modules.world_model import join_features
 
-CONTEXT = 16
+SEEN = 16
 """Records that the model sees before it has to predict."""
 
 
@@ -25,7 +25,7 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
 
     Args:
         learner: Whose networks are measured; they are not changed.
-        batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them, T ≥ ``CONTEXT`` + horizon.
+        batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them, T ≥ ``SEEN`` + horizon.
 
     Returns:
         Scalars on the learner's device:
@@ -44,11 +44,11 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
         ValueError: If the windows are too short.
     """
     horizon = learner.config.imagination_horizon
-    if batch.shape[1] < CONTEXT + horizon:
-        raise ValueError(f"Windows of {batch.shape[1]} records: {CONTEXT} + horizon {horizon} are needed.")
+    if batch.shape[1] < SEEN + horizon:
+        raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():
-        return _measure(learner, batch.to(learner.device)[:, : CONTEXT + horizon], horizon)
+        return _measure(learner, batch.to(learner.device)[:, : SEEN + horizon], horizon)
 
 
 def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> dict[str, Tensor]:
@@ -57,14 +57,14 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
     context = losses.pop("replay_context")
     metrics = {f"held_out/{name}": value for name, value in losses.items()}
     belief, state = context["belief"], context["state"]  # (W, T, ·)
-    start = (belief[:, CONTEXT - 1], state[:, CONTEXT - 1])
-    alive = (~batch["is_init"].squeeze(-1)[:, CONTEXT:]).cumprod(1).float()  # (W, H) of the start's episode
-    alive = alive * (1 - batch["terminated"].squeeze(-1)[:, CONTEXT - 1 : CONTEXT].float())
-    reward = batch["reward"].squeeze(-1)[:, CONTEXT:] * alive
+    start = (belief[:, SEEN - 1], state[:, SEEN - 1])
+    alive = (~batch["is_init"].squeeze(-1)[:, SEEN:]).cumprod(1).float()  # (W, H) of the start's episode
+    alive = alive * (1 - batch["terminated"].squeeze(-1)[:, SEEN - 1 : SEEN].float())
+    reward = batch["reward"].squeeze(-1)[:, SEEN:] * alive
 
-    open_loop = _open_loop_features(learner, start, batch["previous_action"][:, CONTEXT:])  # (W, H, F)
+    open_loop = _open_loop_features(learner, start, batch["previous_action"][:, SEEN:])  # (W, H, F)
     predicted = (model.reward_head.mean(open_loop).squeeze(-1) * alive).sum(1)
-    goes_on_at_first = ~(batch["terminated"] | batch["truncated"])[:, CONTEXT - 1, 0]  # (W,)
+    goes_on_at_first = ~(batch["terminated"] | batch["truncated"])[:, SEEN - 1, 0]  # (W,)
     if goes_on_at_first.any():
         predicted, paid = predicted[goes_on_at_first], reward.sum(1)[goes_on_at_first]
         metrics["held_out/open_loop_reward_error"] = (predicted - paid).abs().mean()
@@ -88,7 +88,7 @@ def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) 
 
     A crash inside the horizon stays; a time limit there hides what the world would have paid.
     """
-    cut_off = (batch["truncated"].squeeze(-1)[:, CONTEXT:] & alive.bool()).any(1)
+    cut_off = (batch["truncated"].squeeze(-1)[:, SEEN:] & alive.bool()).any(1)
     return goes_on_at_first & ~cut_off
 
 

@@ -267,8 +267,8 @@ class DreamerLearner:
         self.discount = self.config.discount
         self.actor_waits = False
         self._networks = self._trained_parameters()
-        self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(self.losses["actor"], "optimizer", None)
+        self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
         self._rates = [group["lr"] for group in self._groups]
         self.updates = 0
         self._timed: Timer = untimed
@@ -310,9 +310,8 @@ class DreamerLearner:
         if self._actor_optimizer is not None and not self.actor_waits:
             with timed("improve"), self.autocast():
                 improved = cast(ActorLoss, self.losses["actor"]).improve(self.updates)
-            norms = {f"gradient_norm/{name}": value for name, value in improved.items() if name.endswith("norm")}
-            if norms:
-                self._guard.check(norms, batch)
+            if improved:
+                self._guard.check(improved, batch)
             metrics |= improved
         self._average()
         return metrics
@@ -520,7 +519,7 @@ class DreamerLearner:
                     "environment of other observations. Choose those it was trained with."
                 )
             for key, value in wanted.items():
-                if value.numel() and value.shape != found[key].shape:  # empty: a buffer that takes the first shape
+                if value.shape != found[key].shape:
                     raise ValueError(
                         f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
                         f"{list(value.shape)}: it was trained {where}."
@@ -540,8 +539,7 @@ class DreamerLearner:
         """Return the world model's parameters, and actor's and critic's, with their learning rates."""
         networks, config = self._networks, self.config
         behavior_lr = config.lr if config.behavior_lr is None else config.behavior_lr
-        stepped_alone = getattr(self.losses["actor"], "optimizer", None) is not None
-        actor = [] if stepped_alone else networks["actor"]
+        actor = networks["actor"] if self._actor_optimizer is None else []  # else the loss steps it
         return [
             {"params": networks["world_model"], "lr": config.lr},
             {"params": actor + networks["critic"], "lr": behavior_lr},

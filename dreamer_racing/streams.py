@@ -60,22 +60,19 @@ class RecordStorage(TensorStorage):
         """Writes records ``[M]`` to slots ``(M,)``; the first write allocates."""
         if not self.initialized:
             self._init(data[0])
-        for key, stored in self.fields():
-            new = data.get(key).to(self.device, non_blocking=self.device.type == "cuda")
-            check_layout(key, new, stored)
-            if isinstance(cursor, slice):
-                stored[cursor] = new
-            else:
-                _rows(stored).index_copy_(0, cursor.to(self.device), _rows(new))
-        self._bump_mutation_revision()
+        self._write(cursor, data, dict(self.fields()))
 
     def overwrite(self, slots: Tensor, data: TensorDictBase) -> None:
-        """Replaces what records in slots ``(M,)`` have of the keys of data ``[M]``; where slots repeat, one of them."""
-        for key, stored in self.fields():
-            new = data.get(key, None)
-            if new is not None:
-                new = new.to(self.device, non_blocking=self.device.type == "cuda")
-                check_layout(key, new, stored)
+        """Replaces some fields, data ``[M]``, of the records in slots ``(M,)``, none of them twice."""
+        self._write(slots, data, {key: stored for key, stored in self.fields() if key in data.keys(True, True)})
+
+    def _write(self, slots: Tensor | slice, data: TensorDictBase, fields: dict[NestedKey, Tensor]) -> None:
+        for key, stored in fields.items():
+            new = data.get(key).to(self.device, non_blocking=self.device.type == "cuda")
+            check_layout(key, new, stored)
+            if isinstance(slots, slice):
+                stored[slots] = new
+            else:
                 _rows(stored).index_copy_(0, slots.to(self.device), _rows(new))
         self._bump_mutation_revision()
 

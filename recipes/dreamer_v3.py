@@ -25,7 +25,7 @@ from training import ReplayRun, launch
 
 from dreamer_racing.checkpoint import GracefulExit
 from dreamer_racing.collection import OverlappedRollouts, acting_copy
-from dreamer_racing.diagnostics import CONTEXT, held_out_metrics
+from dreamer_racing.diagnostics import SEEN, held_out_metrics
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learner import DreamerLearner
 from dreamer_racing.modules import Interface
@@ -66,7 +66,7 @@ class DreamerRun(ReplayRun):
 
     def held_out(self) -> dict[str, Tensor]:
         """What the world model makes of the newest records that it is never trained on; nothing, if there are none."""
-        length = CONTEXT + self.config.model.imagination_horizon
+        length = SEEN + self.config.model.imagination_horizon
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is None or not self.counters["updates"]:
             return {}
@@ -78,7 +78,7 @@ class DreamerRun(ReplayRun):
         if self.lag.limit is None or periods <= self.lag.periods:
             return
         self.lag.periods, measured = periods, self.held_out()
-        error = next((measured[f"held_out/{name}"] for name in LAG_ERRORS if f"held_out/{name}" in measured), None)
+        error = lag_error(measured, "held_out/")
         if error is not None:
             self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
@@ -100,7 +100,7 @@ class DreamerRun(ReplayRun):
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
         """Take note of the model's error; let later windows go on from what the model makes of these records now."""
-        error = next((metrics[name] for name in LAG_ERRORS if name in metrics), None)
+        error = lag_error(metrics)
         if error is not None:
             self.lag.trained(error)
         if self.config.replay.context:
@@ -119,6 +119,11 @@ class DreamerRun(ReplayRun):
         if isinstance(self.rollouts, OverlappedRollouts):
             self.rollouts.close()
         super().close()
+
+
+def lag_error(metrics: dict[str, Tensor], prefix: str = "") -> Tensor | None:
+    """The error by which a model is seen to lag; None if none of them was measured."""
+    return next((metrics[prefix + name] for name in LAG_ERRORS if prefix + name in metrics), None)
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="dreamer_v3")

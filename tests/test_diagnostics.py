@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.diagnostics import CONTEXT, correlation, held_out_metrics
+from dreamer_racing.diagnostics import SEEN, correlation, held_out_metrics
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
 from dreamer_racing.modules import Interface
 
@@ -21,7 +21,7 @@ def make_learner(**config) -> DreamerLearner:
     return DreamerLearner("debug", Interface(pixels=False, vector_dim=3), config, seed=0)
 
 
-def make_batch(windows: int, length: int = CONTEXT + HORIZON) -> TensorDict:
+def make_batch(windows: int, length: int = SEEN + HORIZON) -> TensorDict:
     """Windows of one episode without an end, and a reward of 0."""
     generator = torch.Generator().manual_seed(0)
     flag = torch.zeros(windows, length, 1, dtype=torch.bool)
@@ -52,20 +52,20 @@ def predictable(monkeypatch: pytest.MonkeyPatch) -> DreamerLearner:
 
 
 IMAGINED = REWARD + DISCOUNT * CONTINUATION * REWARD + DISCOUNT**2 * CONTINUATION**2 * VALUE
-FIRST, SECOND = CONTEXT, CONTEXT + 1  # records of the horizon
+FIRST, SECOND = SEEN, SEEN + 1  # records of the horizon
 
 
 @pytest.mark.parametrize(
     ("ends", "real", "reward_error"),
     [
         ({}, 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE, 3 - 2 * REWARD),
-        ({"terminated": CONTEXT - 1}, None, None),
-        ({"truncated": CONTEXT - 1, "is_init": FIRST}, None, None),
+        ({"terminated": SEEN - 1}, None, None),
+        ({"truncated": SEEN - 1, "is_init": FIRST}, None, None),
         ({"truncated": FIRST, "is_init": SECOND}, None, 1 - REWARD),
         ({"is_init": FIRST}, 0.0, 0.0),
         ({"terminated": FIRST, "is_init": SECOND}, 1.0, 1 - REWARD),
         ({"terminated": SECOND}, 1 + DISCOUNT * 2, 3 - 2 * REWARD),
-        ({"is_init": CONTEXT - 1}, 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE, 3 - 2 * REWARD),
+        ({"is_init": SEEN - 1}, 1 + DISCOUNT * 2 + DISCOUNT**2 * VALUE, 3 - 2 * REWARD),
     ],
     ids=[
         "goes on",
@@ -83,7 +83,7 @@ def test_real_returns_by_hand(
 ) -> None:
     batch = make_batch(windows=1)
     batch["reward"][:, FIRST], batch["reward"][:, SECOND] = 1.0, 2.0
-    batch["reward"][:, CONTEXT - 1] = 100.0  # was paid before the horizon
+    batch["reward"][:, SEEN - 1] = 100.0  # was paid before the horizon
     for key, record in ends.items():
         batch[key][:, record] = True
     metrics = held_out_metrics(predictable, batch)
@@ -123,7 +123,7 @@ def test_measuring_leaves_no_trace(mixed_precision: bool) -> None:
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    metrics = held_out_metrics(learner, make_batch(windows=3, length=CONTEXT + HORIZON + 4))
+    metrics = held_out_metrics(learner, make_batch(windows=3, length=SEEN + HORIZON + 4))
     assert torch.equal(torch.rand(4), expected)
     assert {
         "held_out/reward_error", "held_out/loss_vector", "held_out/kl", "held_out/loss_reward",
@@ -140,9 +140,9 @@ def test_measuring_leaves_no_trace(mixed_precision: bool) -> None:
 
 
 def test_only_context_and_horizon_count() -> None:
-    learner, batch = make_learner(), make_batch(windows=2, length=CONTEXT + HORIZON + 3)
+    learner, batch = make_learner(), make_batch(windows=2, length=SEEN + HORIZON + 3)
     results = []
-    for window in (batch, batch[:, : CONTEXT + HORIZON]):
+    for window in (batch, batch[:, : SEEN + HORIZON]):
         torch.manual_seed(0)
         results.append(held_out_metrics(learner, window))
     for key, value in results[0].items():
@@ -150,8 +150,8 @@ def test_only_context_and_horizon_count() -> None:
 
 
 def test_short_windows_are_refused() -> None:
-    with pytest.raises(ValueError, match=f"Windows of {CONTEXT + 1} records: {CONTEXT} \\+ horizon {HORIZON}"):
-        held_out_metrics(make_learner(), make_batch(windows=1, length=CONTEXT + 1))
+    with pytest.raises(ValueError, match=f"Windows of {SEEN + 1} records: {SEEN} \\+ horizon {HORIZON}"):
+        held_out_metrics(make_learner(), make_batch(windows=1, length=SEEN + 1))
 
 
 def test_correlation() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -108,8 +108,8 @@ class ActorLoss(LossModule):
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
-        """Make the loss of an agent with a learner's numbers."""
+    def from_config(cls, agent: Agent, config: LearnerConfig, **own: Any) -> Self:
+        """Make the loss of an agent with a learner's numbers, and with arguments of a subclass's own."""
         return cls(
             agent.world_model,
             agent.actor,
@@ -120,6 +120,7 @@ class ActorLoss(LossModule):
             entropy_scale=config.entropy_scale,
             return_decay=config.return_decay,
             continuation=config.continuation,
+            **own,
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -139,7 +140,7 @@ class ActorLoss(LossModule):
         """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.
 
         Returns:
-            Metrics, scalars.
+            Nothing, or metrics of what it did, scalars, with ``gradient_norm/actor`` among them.
         """
         return {}
 

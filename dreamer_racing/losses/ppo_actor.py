@@ -1,8 +1,8 @@
 """PPO on imagined rollouts: an extension, not part of DreamerV3.
 
-REINFORCE takes one step along a gradient that is nearly all noise (docs/experiments.md, entry 14), and the optimiser
-makes it a full step. Here the rollouts of several updates are kept, the actor does not move meanwhile, and then a few
-epochs of minibatches use them up; the clipped ratio bounds how far it moves for so much of the model's data.
+REINFORCE takes one step along the gradient of one batch of rollouts, and an optimiser that normalises gradients makes
+it a full step however noisy it is. Here the rollouts of several updates are kept, the actor does not move meanwhile,
+and then a few epochs of minibatches use them up; the clipped ratio bounds how far it moves for that much imagination.
 
 Shape legend: K updates, H horizon, N starts, M records of a minibatch, F features, A action.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class ImaginedPPOConfig:
-    """Numbers of ``PPOActorLoss`` [choice, by docs/experiments.md, entry 14, unless a source is named].
+    """Numbers of ``PPOActorLoss`` [choice, unless a source is named]; docs/experiments.md, entry 14, compares some.
 
     Attributes:
         updates: K, learner updates whose rollouts are kept before the actor learns from them.
@@ -105,20 +105,9 @@ class PPOActorLoss(ActorLoss):
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
+    def from_config(cls, agent: Agent, config: LearnerConfig, **own: Any) -> Self:
         """Make the loss of an agent with a learner's numbers."""
-        return cls(
-            agent.world_model,
-            agent.actor,
-            agent.critic,
-            ppo=config.ppo,
-            horizon=config.imagination_horizon,
-            discount=config.discount,
-            lambda_=config.lambda_,
-            entropy_scale=config.entropy_scale,
-            return_decay=config.return_decay,
-            continuation=config.continuation,
-        )
+        return super().from_config(agent, config, ppo=config.ppo, **own)
 
     def prepare(self, starts: int) -> None:
         """Make room for K rollouts from so many starts each; what was kept of another shape is forgotten.
@@ -175,7 +164,7 @@ class PPOActorLoss(ActorLoss):
 
         Returns:
             Nothing, or ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
-            ``ppo/gradient_norm`` of what was done; scalars. A step whose gradient is not finite is not made.
+            ``gradient_norm/actor`` of what was done; scalars. A step whose gradient is not finite is not made.
         """
         if updates % self.ppo.updates or int(self.kept) < self.ppo.updates:
             return {}
@@ -209,7 +198,7 @@ class PPOActorLoss(ActorLoss):
         if norm.isfinite():
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        return {"ppo/loss": loss.detach(), **metrics, "ppo/gradient_norm": norm}
+        return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
 
 
 def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:

@@ -87,7 +87,7 @@ def test_the_actor_stands_still_until_the_rollouts_are_there():
         metrics = loss.improve(update)
         moved = any(not torch.equal(value, before[name]) for name, value in learner.agent.actor.state_dict().items())
         assert moved == bool(metrics) == (update == 3)
-    assert set(metrics) == {"ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "ppo/gradient_norm"}
+    assert set(metrics) == {"ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "gradient_norm/actor"}
     assert metrics["ppo/epochs"].item() == PPO.epochs
     others = (*learner.agent.world_model.parameters(), *learner.agent.critic.parameters())
     assert all(parameter.grad is None for parameter in others)
@@ -175,7 +175,7 @@ def test_rollouts_of_another_number_of_starts_begin_anew():
     for update in (5, 6):
         loss(make_starts(9))
         metrics = loss.improve(update)
-    assert metrics["ppo/gradient_norm"].isfinite()
+    assert metrics["gradient_norm/actor"].isfinite()
 
 
 @pytest.mark.parametrize("changes", [{"ppo": replace(PPO, updates=2)}, {"ppo": replace(PPO, updates=7)},
