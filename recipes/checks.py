@@ -72,6 +72,7 @@ RANGES = {
     "loss.ppo.clip_epsilon": POSITIVE,
     "loss.ppo.advantage_clip": POSITIVE,
     "loss.ppo.kl_stop": POSITIVE,
+    "loss.ppo.kl_target": POSITIVE,
     "loss.ppo.learning_rate": POSITIVE,
     "loss.ppo.gradient_clip": POSITIVE,
     "loss.dynamics_scale": NOT_NEGATIVE,

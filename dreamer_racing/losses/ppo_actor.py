@@ -10,6 +10,8 @@ Shape legend: K updates, H horizon, N starts, M records of a minibatch, F featur
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -23,6 +25,9 @@ from dreamer_racing.modules.actor import ActionDistribution
 if TYPE_CHECKING:
     from dreamer_racing.learner import Agent, LearnerConfig
 
+KL_TOLERANCE, PACE_CHANGE, SLOWEST_PACE = 1.5, 1.25, 0.01
+"""Factor that a divergence may be off its target, factor by which the rate then changes, its smallest share [choice]."""
+
 
 @dataclass
 class ImaginedPPOConfig:
@@ -35,7 +40,9 @@ class ImaginedPPOConfig:
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
         advantage_clip: Largest normalised advantage.
         kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
-        learning_rate: Of Adam.
+        kl_target: Divergence of a whole improvement, nats, above which the next one is made at a lower learning rate;
+            None: never. Reference: the adaptive rate of Schulman et al. 2017, Section 4, there of the KL penalty.
+        learning_rate: Of Adam; the largest, where there is a ``kl_target``.
         gradient_clip: Largest norm of the actor's gradient.
     """
 
@@ -45,6 +52,7 @@ class ImaginedPPOConfig:
     clip_epsilon: float = 0.2
     advantage_clip: float = 5.0
     kl_stop: float = 0.03
+    kl_target: float | None = None
     learning_rate: float = 3e-4
     gradient_clip: float = 0.5
 
@@ -94,6 +102,7 @@ class PPOActorLoss(ActorLoss):
     weight: Tensor
     cursor: Tensor
     kept: Tensor
+    pace: Tensor
 
     def __init__(self, *args: Any, ppo: ImaginedPPOConfig | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -102,6 +111,7 @@ class PPOActorLoss(ActorLoss):
             self.register_buffer(name, torch.empty(0))
         self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))  # the place that is written next
         self.register_buffer("kept", torch.zeros(1, dtype=torch.int64))  # places written so far, at most K
+        self.register_buffer("pace", torch.ones(1))  # share of the learning rate
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
@@ -163,12 +173,19 @@ class PPOActorLoss(ActorLoss):
             updates: Updates of the learner so far.
 
         Returns:
-            Nothing, or ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs`` and
-            ``gradient_norm/actor`` of what was done; scalars. A step whose gradient is not finite is not made.
+            Nothing, or ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs``, ``ppo/pace`` (share
+            of the learning rate) and ``gradient_norm/actor`` of what was done; scalars. A step whose gradient is not
+            finite is not made.
         """
         if updates % self.ppo.updates or int(self.kept) < self.ppo.updates:
             return {}
-        records = self._normalised()
+        with self._paced():
+            metrics = self._improve(self._normalised())
+        self._set_pace(metrics["ppo/kl"])
+        return metrics | {"ppo/pace": self.pace.squeeze().clone()}
+
+    def _improve(self, records: Minibatch) -> dict[str, Tensor]:
+        """Make epochs of gradient steps, until one comes upon too large a divergence."""
         number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
         done: list[dict[str, Tensor]] = []
         for _ in range(self.ppo.epochs):
@@ -179,6 +196,29 @@ class PPOActorLoss(ActorLoss):
                 if not metrics["ppo/kl"] <= self.ppo.kl_stop:  # waits for the device, some times an improvement
                     return _summary(done, math.ceil(number / size))
         return _summary(done, math.ceil(number / size))
+
+    @contextmanager
+    def _paced(self) -> Iterator[None]:
+        """Take the present share of the learning rates."""
+        pace, groups = float(self.pace), self.optimizer.param_groups
+        rates = [group["lr"] for group in groups]
+        for group, rate in zip(groups, rates, strict=True):
+            group["lr"] = rate * pace
+        try:
+            yield
+        finally:
+            for group, rate in zip(groups, rates, strict=True):
+                group["lr"] = rate
+
+    def _set_pace(self, kl: Tensor) -> None:
+        """Go slower after a divergence well above the target, and faster, up to the full rate, well below it."""
+        target = self.ppo.kl_target
+        if target is None:
+            return
+        if not kl <= KL_TOLERANCE * target:
+            self.pace.div_(PACE_CHANGE).clamp_(min=SLOWEST_PACE)
+        elif kl < target / KL_TOLERANCE:
+            self.pace.mul_(PACE_CHANGE).clamp_(max=1.0)
 
     def _normalised(self) -> Minibatch:
         """Return all imagined steps, with advantages of mean 0 and deviation 1 under their weights."""

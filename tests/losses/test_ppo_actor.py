@@ -87,7 +87,7 @@ def test_the_actor_stands_still_until_the_rollouts_are_there():
         metrics = loss.improve(update)
         moved = any(not torch.equal(value, before[name]) for name, value in learner.agent.actor.state_dict().items())
         assert moved == bool(metrics) == (update == 3)
-    assert set(metrics) == {"ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "gradient_norm/actor"}
+    assert set(metrics) == {"ppo/loss", "ppo/kl", "ppo/clipped", "ppo/epochs", "ppo/pace", "gradient_norm/actor"}
     assert metrics["ppo/epochs"].item() == PPO.epochs
     others = (*learner.agent.world_model.parameters(), *learner.agent.critic.parameters())
     assert all(parameter.grad is None for parameter in others)
@@ -101,6 +101,32 @@ def test_an_improvement_stops_where_the_policy_has_moved_far():
         metrics = loss.improve(update)
     # The first minibatch still sees the old policy, the second one that has moved.
     assert metrics["ppo/epochs"].item() == pytest.approx(2 / 5)  # of the 5 minibatches that 3 · 4 · 6 steps make
+
+
+@pytest.mark.parametrize(("target", "paces"), [(1e-9, [0.8, 0.64]), (1e9, [1.0, 1.0]), (None, [1.0, 1.0])])
+def test_the_learning_rate_follows_a_target_for_the_divergence(target, paces):
+    learner = make_learner(ppo=replace(PPO, updates=1, kl_target=target, learning_rate=1e-3))
+    loss = learner.losses["actor"]
+    found = []
+    for update in (1, 2):
+        loss(make_starts())
+        found.append(loss.improve(update)["ppo/pace"].item())
+    assert found == pytest.approx(paces)
+    assert loss.optimizer.param_groups[0]["lr"] == 1e-3  # what is scheduled stays as it is
+
+
+def test_the_pace_is_that_of_the_steps():
+    """Adam's first step moves each weight by the learning rate, whatever the gradient."""
+    moved = []
+    for pace in (1.0, 0.25):
+        learner = make_learner(ppo=replace(PPO, updates=1, epochs=1, minibatch=10_000, kl_target=1.0))
+        loss, weights = learner.losses["actor"], learner.agent.actor.mlp.output.weight
+        loss.pace.fill_(pace)
+        before = weights.detach().clone()
+        loss(make_starts())
+        loss.improve(1)
+        moved.append((weights - before).abs().max().item())
+    assert moved[1] / moved[0] == pytest.approx(0.25, rel=0.05)
 
 
 def test_what_is_rewarded_becomes_likelier():
