@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dreamer_racing.learner import Agent, LearnerConfig
 
 KL_TOLERANCE, PACE_CHANGE, SLOWEST_PACE = 1.5, 1.25, 0.01
-"""Factor that a divergence may be off its target, factor by which the rate then changes, its smallest share [choice]."""
+"""Factor that a divergence may be off its target, factor by which the rate then changes, smallest share [choice]."""
 
 
 @dataclass
