@@ -10,12 +10,13 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, DecoderFreeLoss
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, DecoderFreeLoss, ImaginedPPOConfig
 from dreamer_racing.losses.actor import frozen
 from dreamer_racing.modules import RSSM, Interface, WorldModel
 
 PRIVILEGED_DIM = 5
-CONFIG = LearnerConfig(imagination_horizon=3, lr=1e-3, warmup_updates=0, free_nats=0.0)
+PPO = ImaginedPPOConfig(updates=1)
+CONFIG = LearnerConfig(imagination_horizon=3, lr=1e-3, warmup_updates=0, free_nats=0.0, ppo=PPO)
 
 
 def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
