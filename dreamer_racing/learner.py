@@ -164,7 +164,7 @@ class Agent(nn.Module):
         head = (size.actor_critic_layers, size.units, size.norm)
         self.interface = interface
         self.world_model = WorldModel(size, interface, decode)
-        self.actor = Actor(size.features, interface.action_dim, *head, state_std=size.state_std)
+        self.actor = Actor(size.features, interface.action_dim, *head)
         self.critic = Critic(size.features, *head, size.bins)
 
 
@@ -194,8 +194,7 @@ def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
         ValueError: If they differ in anything but the name; the message says in what, and what to do.
     """
     wanted = asdict(size)
-    # Older ones do not say.
-    checkpoint = {"sampled": ModelSize.sampled, "state_std": ModelSize.state_std, **checkpoint}
+    checkpoint = {"sampled": ModelSize.sampled, **checkpoint}  # older ones do not say
     differences = [
         f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
         for field in fields(size)

@@ -169,8 +169,7 @@ def scheduled(config: DreamerConfig, env_steps: int) -> dict[str, float]:
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
-        model = config.model
-        shape = replace(get_size(model.size), sampled=model.sampled, state_std=model.state_std)
+        shape = replace(get_size(config.model.size), sampled=config.model.sampled)
         return DreamerLearner(shape, interface, learner_config(config), device, config.seed)
     assert isinstance(config, (PPORunConfig, SACRunConfig))
     size = NetworkSize(config.network.layers, config.network.units)

@@ -38,7 +38,6 @@ class ModelConfig:
 
     size: str = MISSING
     sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
-    state_std: bool = True  # the deviation of actions depends on the state, as in DreamerV3; false: one for all states
     batch_size: int = MISSING  # windows in a batch
     batch_length: int = MISSING  # records in a window
     replay_ratio: float = MISSING  # records trained on per environment step

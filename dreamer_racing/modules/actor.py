@@ -58,7 +58,6 @@ class Actor(nn.Module):
         norm: ``"rms"`` or ``"layer"``.
         min_std: Smallest standard deviation; a scalar that may change while the actor is trained.
         max_std: Largest standard deviation.
-        state_std: Whether the standard deviation is the network's for each state, or one learned for all of them.
 
     Reference: danijar/dreamerv3, ``heads.bounded_normal``: std = lo + (hi − lo)·sigmoid(raw + 2).
     """
@@ -72,11 +71,9 @@ class Actor(nn.Module):
         norm: str = "rms",
         min_std: float = 0.1,
         max_std: float = 1.0,
-        state_std: bool = True,
     ) -> None:
         super().__init__()
-        self.mlp = MLP(in_features, (1 + state_std) * action_dim, layers, units, norm, output_scale=0.01)
-        self.raw_std = None if state_std else nn.Parameter(torch.zeros(action_dim))
+        self.mlp = MLP(in_features, 2 * action_dim, layers, units, norm, output_scale=0.01)
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = max_std
 
@@ -87,7 +84,6 @@ class Actor(nn.Module):
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
-        output = self.mlp(features).float()
-        mean, raw_std = output.chunk(2, -1) if self.raw_std is None else (output, self.raw_std.expand_as(output))
+        mean, raw_std = self.mlp(features).float().chunk(2, -1)
         std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + 2.0) + self.min_std
         return ActionDistribution(torch.tanh(mean), std)

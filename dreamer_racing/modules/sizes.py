@@ -33,8 +33,6 @@ class ModelSize:
         bins: Bins of the two-hot reward and value distributions.
         sampled: Whether z is a sample of its categoricals, as in DreamerV3, or their probabilities (an extension: the
             latents are then deterministic, and so is imagination but for the actor's noise).
-        state_std: Whether the actor's standard deviation depends on the state, as in DreamerV3, or is learned as one
-            for all states (an extension, usual with PPO: exploration does not die out where the actor is sure first).
     """
 
     name: str
@@ -58,7 +56,6 @@ class ModelSize:
     cnn_patch: int = 1
     bins: int = 255
     sampled: bool = True
-    state_std: bool = True
 
     @property
     def state(self) -> int:

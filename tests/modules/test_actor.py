@@ -44,14 +44,3 @@ def test_samples_have_the_mean_and_std():
     samples = ActionDistribution(torch.full((20000, 1), 0.5), torch.full((20000, 1), 0.2)).sample()
     torch.testing.assert_close(samples.mean(), torch.tensor(0.5), atol=0.01, rtol=0)
     torch.testing.assert_close(samples.std(), torch.tensor(0.2), atol=0.01, rtol=0)
-
-
-def test_one_deviation_for_all_states_can_be_learned():
-    actor = Actor(6, 4, layers=1, units=8, state_std=False)
-    with torch.no_grad():
-        actor.mlp.output.weight.normal_()
-    policy = actor(torch.randn(64, 6))
-    expected = 0.1 + 0.9 / (1 + math.exp(-2))
-    torch.testing.assert_close(policy.std, torch.full((64, 4), expected))
-    policy.entropy().mean().backward()
-    assert (actor.raw_std.grad > 0).all() and actor.mlp.output.weight.grad is None
