@@ -40,7 +40,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 400  # env_steps/s of tuned=race on one core of an Intel Xeon with AMX, docs/experiments.md, entry 14
-LAG_EVERY = 2_000  # env_steps
+LAG_EVERY = 5_000  # env_steps
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -159,7 +159,7 @@ def resolve(config: DictConfig) -> DictConfig:
         config.model.mixed_precision = computes_bfloat16(device)
         state, ability = ("on", "computes") if config.model.mixed_precision else ("off", "does not compute")
         print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
-    if config.tuned in ("race", "explore"):
+    if config.tuned == "race":
         hours = config.total_env_steps / RACE_SPEED / 3600
         print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
     if config.env.num_envs == 1 and config.replay.held_out:

@@ -188,7 +188,7 @@ class DreamerConfig(RunConfig):
     """`recipes/dreamer_v3.py`."""
 
     algorithm: str = "dreamer_v3"
-    tuned: str = "auto"  # none: DreamerV3 as published | race, explore: what races on a CPU | auto chooses, and says so
+    tuned: str = "auto"  # none: DreamerV3 as published | race: what races on a CPU | auto chooses, and says so
     prefill: int = 4_000  # env_steps collected before the first update
     rollout_steps: int = 8
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them

@@ -79,7 +79,7 @@ def assert_same(first: Any, second: Any, where: str) -> None:
 
 
 RACE = [
-    "tuned=explore", "schedule.learning_rates.to=null", "schedule.discount.to=null", "schedule.min_std.to=null",
+    "tuned=race", "schedule.learning_rates.to=null", "schedule.discount.to=null", "schedule.min_std.to=null",
     "evaluation.start_noise=0", "model.imagination_starts=8",
     "evaluation.stochastic=false", "loss.ppo.updates=7", "model.mixed_precision=false",
 ]  # fmt: skip
@@ -88,7 +88,7 @@ RACE = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("tuned", "parts_of_its_own"), [(["tuned=none"], set()), (RACE, {"lag"})], ids=["none", "explore"]
+    ("tuned", "parts_of_its_own"), [(["tuned=none"], set()), (RACE, {"lag"})], ids=["none", "race"]
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
     tuned: list[str], parts_of_its_own: set[str], tmp_path: Path

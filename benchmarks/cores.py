@@ -1,0 +1,101 @@
+"""Training speed of the default recipe on one core and on two, with acting in turns or in a thread.
+
+    python benchmarks/cores.py --json results/cores.json
+
+Every way trains anew for some env_steps, one after the other, as `recipes/dreamer_v3.py track=circle` does on a CPU.
+`env_steps_per_s` is over the second half of the run, when updates are under way; `collect`, `learn` are the shares of
+the wall-clock time that the main thread spends on either. Keep the machine idle meanwhile.
+"""
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from measuring import print_table, write_json
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "dreamer_v3.py"
+COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "times", "updates_per_s", "collect", "learn")
+LEARNING = ("sample", "world_model", "imagine", "optimise", "improve")
+
+
+class Way(NamedTuple):
+    """How a run uses the machine.
+
+    Attributes:
+        cores: Cores it may run on.
+        threads: Threads of torch.
+        collection: As the recipe's setting.
+    """
+
+    cores: int
+    threads: int
+    collection: str
+
+
+WAYS = (Way(1, 1, "sync"), Way(2, 1, "sync"), Way(2, 2, "sync"), Way(2, 1, "overlapped"), Way(2, 2, "overlapped"))
+
+
+def main() -> None:
+    """Measure every way that the machine has the cores for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env-steps", type=int, default=16_000)
+    parser.add_argument("--json")
+    parser.add_argument("overrides", nargs="*", help="further settings of the recipe")
+    arguments = parser.parse_args()
+    available = sorted(os.sched_getaffinity(0))
+    records: list[dict[str, Any]] = []
+    for way in WAYS:
+        if way.cores <= len(available):
+            measured = measure(way, available[: way.cores], arguments.env_steps, arguments.overrides)
+            first = records[0]["env_steps_per_s"] if records else measured["env_steps_per_s"]
+            records.append({**way._asdict(), **measured, "times": measured["env_steps_per_s"] / first})
+    print_table(records, COLUMNS)
+    write_json(records, arguments.json)
+
+
+def measure(way: Way, cores: list[int], env_steps: int, overrides: list[str]) -> dict[str, float]:
+    """Train on these cores and read the speed off the run's metrics."""
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = Path(folder) / "run"
+        command = [
+            sys.executable,
+            str(RECIPE),
+            "track=circle",
+            f"run_dir={run_dir}",
+            f"total_env_steps={env_steps}",
+            f"collection={way.collection}",
+            "evaluation.every=0",
+            "checkpoint.every=0",
+            *overrides,
+        ]
+        environment = {**os.environ, "OMP_NUM_THREADS": str(way.threads)}
+        bind = partial(os.sched_setaffinity, 0, cores)
+        done = subprocess.run(command, env=environment, preexec_fn=bind, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(f"{way} ended with status {done.returncode}:\n{done.stderr[-2000:]}")
+        rows = list(csv.DictReader((run_dir / "metrics.csv").open()))
+    rows = [row for row in rows if int(row["env_steps"]) > env_steps / 2 and row["wall_clock"]]
+    first, last = rows[0], rows[-1]
+    seconds = float(last["wall_clock"]) - float(first["wall_clock"])
+    return {
+        "env_steps_per_s": (int(last["env_steps"]) - int(first["env_steps"])) / seconds,
+        "updates_per_s": mean(rows, "rate/updates"),
+        "collect": mean(rows, "time/collect"),
+        "learn": sum(mean(rows, f"time/{name}") for name in LEARNING),
+    }
+
+
+def mean(rows: list[dict[str, str]], column: str) -> float:
+    """Average a column over the rows that have it."""
+    values = [float(row[column]) for row in rows if row.get(column)]
+    return sum(values) / len(values) if values else 0.0
+
+
+if __name__ == "__main__":
+    main()
