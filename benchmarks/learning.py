@@ -1,0 +1,217 @@
+"""What a learner learns from, on a run's own replay: cold windows, noise of the actor's gradient, drift of the policy.
+
+    python benchmarks/learning.py runs/circle --json learning.json
+
+* Windows: the newest records of every stream, in windows of T = 16 behind which 64 more records lie. By record of the
+  window, `error` of the decoded state (mean square, symlogged), and how far the mean `action` and the `value` are from
+  those of `warm`, which has seen the 64 records: `stored` begins with the context in the replay, `cold` from nothing.
+* Gradient: of the policy-gradient loss at the present actor, from N starts, `cosine` between two drawn independently
+  and `signal` power over noise power; N as one update has it, and as an improvement of `loss.actor=ppo` has it.
+* Drift: two copies of the learner after `--updates` updates on batches of their own, as the run makes them; root mean
+  square over states and dimensions of the mean actions' difference (`apart`) and of the way each went (`moved`), beside
+  the policy's mean deviation `std`.
+
+The trained weights are measured, not the averaged ones. The checkpoint must hold a replay, so no best/.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from measuring import print_table, write_json
+from tensordict import TensorDictBase
+from torch import Tensor
+
+sys.path.append(str(Path(__file__).parents[1] / "recipes"))
+
+from arena import make_env, restore_learner, trained_config
+from building import make_run_replay
+from schema import DreamerConfig
+
+from dreamer_racing.checkpoint import latest_checkpoint, load_components
+from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.losses import ActorLoss, imagine
+from dreamer_racing.modules.heads import symlog
+from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.replay import StreamReplay
+
+BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
+WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from
+GRADIENTS = 12
+COLUMNS = {"windows": ("record", "windows", "error_warm", "error_stored", "error_cold", "action_stored", "action_cold",
+                      "value_stored", "value_cold"),
+          "gradient": ("starts", "cosine", "signal"), "drift": ("updates", "std", "apart", "moved")}  # fmt: skip
+
+
+def main() -> None:
+    """Measure every checkpoint."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
+    parser.add_argument("--updates", type=int, default=32, help="of the drifting copies")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    records = []
+    for path in arguments.checkpoints:
+        found = list(measure(latest_checkpoint(path), arguments.updates))
+        for part, columns in COLUMNS.items():
+            print_table([record for record in found if record["measured"] == part], columns)
+            print()
+        records += found
+    write_json(records, arguments.json)
+
+
+def measure(checkpoint: Path, updates: int) -> Iterator[dict[str, Any]]:
+    """Yield the records of one checkpoint.
+
+    Raises:
+        ValueError: it is of another algorithm.
+    """
+    config = trained_config(checkpoint.parent.parent)
+    if not isinstance(config, DreamerConfig):
+        raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
+    learner, counters = restore(config, checkpoint)
+    where = {"benchmark": "learning", "track": config.track, "actor": config.loss.actor, **counters}
+    long = restore_replay(config, checkpoint, learner, WINDOWS, BEHIND + LENGTH, share=1.0, records=RECENT)
+    torch.manual_seed(0)
+    for record in compare_windows(learner, long.sample()):
+        yield {**where, "measured": "windows", **record}
+    del long
+    replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
+    for starts in sorted({learner.config.imagination_starts or 1024, 8 * (learner.config.imagination_starts or 128)}):
+        yield {**where, "measured": "gradient", **gradient_noise(learner, replay, starts)}
+    yield {**where, "measured": "drift", **drift(config, checkpoint, replay, updates)}
+
+
+def restore(config: DreamerConfig, checkpoint: Path) -> tuple[DreamerLearner, dict[str, int]]:
+    """Bring back the trained weights."""
+    learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
+    return cast(DreamerLearner, learner), counters
+
+
+def restore_replay(
+    config: DreamerConfig,
+    checkpoint: Path,
+    learner: DreamerLearner,
+    windows: int,
+    length: int,
+    share: float | None = None,
+    records: int | None = None,
+) -> StreamReplay:
+    """Bring back the replay, to be sampled in other windows or as the run does."""
+    env = make_env(config)
+    settings = config.replay
+    replay = make_run_replay(
+        config,
+        env,
+        None,
+        windows,
+        length,
+        latents=learner.latent_format if settings.context else None,
+        recent_share=settings.recent_share if share is None else share,
+        recent_records=settings.recent_records if records is None else records,
+        held_out=settings.held_out,
+    )
+    env.close()
+    load_components(checkpoint, {"replay": replay})
+    return replay
+
+
+@torch.no_grad()
+def compare_windows(learner: DreamerLearner, batch: TensorDictBase) -> Iterator[dict[str, float]]:
+    """Yield by record what its place in a window costs; batch ``[B, BEHIND + LENGTH]``."""
+    model, actor, critic = learner.agent.world_model, learner.agent.actor, learner.agent.critic
+    decoder = getattr(learner.losses["world_model"], "privileged_decoder", None)
+    embedded, action, begins = model.encoder(batch), batch["previous_action"], batch["is_init"].squeeze(-1)
+    last = slice(BEHIND, None)
+    inputs = (embedded[:, last], action[:, last], begins[:, last])
+    posteriors = {"warm": model.rssm.observe(embedded, action, begins), "cold": model.rssm.observe(*inputs)}
+    if CONTEXT in batch:
+        stored = model.rssm.latent_format.unpack(batch[CONTEXT][:, BEHIND])
+        posteriors["stored"] = model.rssm.observe(*inputs, initial=stored)
+    judged = {}
+    for name, posterior in posteriors.items():
+        features = join_features(posterior.belief, posterior.state)[:, -LENGTH:]
+        judged[name] = {"action": actor(features).mean, "value": critic.value(features)}
+        if decoder is not None:
+            truth = symlog(batch["privileged", "vector"][:, last])
+            judged[name]["error"] = (decoder.mlp(features) - truth).square()
+    # Only records whose episode began before the window: the others are never cold.
+    old = begins[:, last].cumsum(1) == 0  # (B, LENGTH)
+    for record in RECORDS:
+        chosen = old[:, record]
+        result: dict[str, float] = {"record": record, "windows": int(chosen.sum())}
+        for name, values in judged.items():
+            if "error" in values:
+                result[f"error_{name}"] = values["error"][chosen, record].mean().item()
+            if name != "warm":
+                for quantity in ("action", "value"):
+                    difference = values[quantity] - judged["warm"][quantity]
+                    result[f"{quantity}_{name}"] = difference[chosen, record].abs().mean().item()
+        yield result
+
+
+def starts_of(learner: DreamerLearner, replay: StreamReplay, number: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw starts of imagination as updates do: belief, state, terminated ``(number, ...)``."""
+    parts: list[TensorDictBase] = []
+    while sum(map(len, parts)) < number:
+        batch = replay.sample()
+        with torch.no_grad():
+            context = learner.losses["world_model"](batch).pop("replay_context")
+        parts.append(learner._choose_starts(context, batch))
+    starts = cast(TensorDictBase, torch.cat(cast(Any, parts)))[:number]
+    return starts["belief"], starts["state"], starts["terminated"]
+
+
+def gradient_noise(learner: DreamerLearner, replay: StreamReplay, number: int) -> dict[str, float]:
+    """Compare gradients from independent starts."""
+    loss, actor = cast(ActorLoss, learner.losses["actor"]).eval(), learner.agent.actor
+    parameters = list(actor.parameters())
+    gradients = []
+    for _ in range(GRADIENTS):
+        belief, state, terminated = starts_of(learner, replay, number)
+        with torch.no_grad():
+            features, action = imagine(learner.agent.world_model.rssm, actor, belief, state, loss.horizon)
+            judged = loss._judge(features, terminated)
+        gain = actor(features[:-1]).log_prob(action) * (judged.lambda_return - judged.value)
+        objective = -(judged.weight * gain).mean()
+        gradients.append(torch.cat([part.flatten() for part in torch.autograd.grad(objective, parameters)]))
+    rows = torch.stack(gradients)  # (GRADIENTS, P)
+    mean, count = rows.mean(0), len(rows)
+    noise = (rows - mean).square().sum() / (count - 1)
+    signal = mean.square().sum() - noise / count
+    unit = F.normalize(rows, dim=1)
+    cosine = ((unit @ unit.T).sum() - count) / (count * (count - 1))
+    return {"starts": number, "cosine": cosine.item(), "signal": (signal / noise).item()}
+
+
+def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates: int) -> dict[str, float]:
+    """Train two copies on batches of their own, and see how far apart they are."""
+    base, _ = restore(config, checkpoint)
+    belief, state, _ = starts_of(base, replay, 512)
+    features = join_features(belief, state)
+    means = []
+    for seed in (1, 2):
+        copy, _ = restore(config, checkpoint)
+        torch.manual_seed(seed)
+        for _ in range(updates):
+            copy.update(replay.sample())
+        with torch.no_grad():
+            means.append(copy.agent.actor(features).mean)
+    with torch.no_grad():
+        policy = base.agent.actor(features)
+    moved = torch.stack([mean - policy.mean for mean in means])
+    return {
+        "updates": updates,
+        "std": policy.std.mean().item(),
+        "apart": (means[0] - means[1]).square().mean().sqrt().item(),
+        "moved": moved.square().mean().sqrt().item(),
+    }
+
+
+if __name__ == "__main__":
+    main()
