@@ -15,7 +15,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -150,12 +150,18 @@ class RunCheckpoints:
         self._rotation.prune()
         return final
 
-    def load(self, path: str | Path | None = None, map_location: torch.device | str = "cpu") -> dict[str, Any]:
+    def load(
+        self,
+        path: str | Path | None = None,
+        map_location: torch.device | str = "cpu",
+        may_lack: Collection[str] = (),
+    ) -> dict[str, Any]:
         """Restores all parts.
 
         Args:
             path: run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
             map_location: device that tensors are read to before the parts copy them to their own.
+            may_lack: parts that checkpoints of older versions do not have; they are left as they are.
 
         Returns:
             The metadata of the checkpoint, with ``env_steps``.
@@ -166,7 +172,11 @@ class RunCheckpoints:
         """
         source = latest_checkpoint(self.directory if path is None else path)
         self._last_saved = None
-        return _restore(self._checkpoint, source, map_location)
+        lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
+        if not lacking:
+            return _restore(self._checkpoint, source, map_location)
+        there = {name: part for name, part in self.components.items() if name not in lacking}
+        return _restore(_bind({**there, "random_state": RandomState()}), source, map_location)
 
     def _remove_later(self, newest: Path) -> None:
         for path in self._rotation.checkpoints():

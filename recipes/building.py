@@ -215,11 +215,11 @@ def assemble(
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {"replay": own["replay"]} if "replay" in own else {}
-    parts |= {"lag": own["lag"]} if "lag" in own and own["lag"].limit is not None else {}
+    parts |= {"lag": own["lag"]} if "lag" in own else {}
     checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
     clock = RunClock(counters)
     if config.resume:
-        clock.total = checkpoints.load(config.resume).get("wall_clock", 0.0)
+        clock.total = checkpoints.load(config.resume, may_lack=("lag",)).get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     best = BestCheckpoint(directory, {"learner": learner, "counters": counters})
     for folder in (directory, best.directory):

@@ -19,6 +19,8 @@ from dreamer_racing.envs.gates import GateSweeper
 from dreamer_racing.envs.quadrotor import MIN_CONTROL_RATE, at_control_rate, load_preset
 from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.losses import ImaginedPPOConfig
+from dreamer_racing.losses.ppo_actor import KL_TOLERANCE
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 
@@ -330,11 +332,25 @@ def check_schedule(config: DreamerConfig) -> None:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     if config.schedule.wait_for_model is not None:
         check_wait(config)
+    check_kl(config.loss.ppo)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
     if to is not None and not config.env.start_on_line:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
+
+
+def check_kl(ppo: ImaginedPPOConfig) -> None:
+    """Refuse a target for the divergence that a stop below it would keep from ever being reached.
+
+    Raises:
+        ValueError: the message names both settings.
+    """
+    if ppo.kl_target is not None and ppo.kl_stop < KL_TOLERANCE * ppo.kl_target:
+        raise ValueError(
+            f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before loss.ppo.kl_target={ppo.kl_target} is seen to be "
+            f"exceeded: the stop must be at least {KL_TOLERANCE} times the target."
+        )
 
 
 def check_wait(config: DreamerConfig) -> None:

@@ -109,9 +109,19 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     except FileNotFoundError:
         return [*recipe, f"run_dir={run_dir}", *overrides]
     refuse_other_settings(run_dir, overrides)
+    if tuned := tuned_by_recipe(run_dir, overrides):
+        wanted = cast(RunConfig, hydra.compose(config.algorithm, [*overrides, tuned]))
     if finished_env_steps(run_dir) >= wanted.total_env_steps:
         return None
     return [*recipe, f"resume={run_dir}", f"total_env_steps={wanted.total_env_steps}"]
+
+
+def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
+    """The override that a run's recipe chose for tuned=auto, which brings a length of its own."""
+    if "tuned" in settings_of(overrides):
+        return None
+    saved = settings_of(OmegaConf.load(run_dir / "overrides.yaml"))
+    return f"tuned={saved['tuned']}" if "tuned" in saved else None
 
 
 def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:

@@ -293,6 +293,7 @@ REFUSED = [
         ["model.imagination_starts=null begins from all"],
     ),
     (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),
+    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends improvements before loss.ppo.kl_target=0.03"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for loss.actor=ppo"]),
     (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),

@@ -25,8 +25,10 @@ from dreamer_racing.modules.actor import ActionDistribution
 if TYPE_CHECKING:
     from dreamer_racing.learner import Agent, LearnerConfig
 
-KL_TOLERANCE, PACE_CHANGE, SLOWEST_PACE = 1.5, 1.25, 0.01
-"""Factor that a divergence may be off its target, factor by which the rate then changes, smallest share [choice]."""
+KL_TOLERANCE = 1.5
+"""Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
+PACE_CHANGE, SLOWEST_PACE = 1.25, 0.01
+"""Factor by which the learning rate then changes, and its smallest share [choice]."""
 
 
 @dataclass
@@ -40,8 +42,9 @@ class ImaginedPPOConfig:
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
         advantage_clip: Largest normalised advantage.
         kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
-        kl_target: Divergence of a whole improvement, nats, above which the next one is made at a lower learning rate;
-            None: never. Reference: the adaptive rate of Schulman et al. 2017, Section 4, there of the KL penalty.
+        kl_target: Divergence before an improvement's last gradient step, nats, to which the learning rate is steered:
+            1.5 times more, and the next improvement is made at a lower one, 1.5 times less, and at a higher one; None:
+            it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
         learning_rate: Of Adam; the largest, where there is a ``kl_target``.
         gradient_clip: Largest norm of the actor's gradient.
     """
@@ -179,10 +182,13 @@ class PPOActorLoss(ActorLoss):
         """
         if updates % self.ppo.updates or int(self.kept) < self.ppo.updates:
             return {}
+        if self.ppo.kl_target is None:
+            self.pace.fill_(1.0)
         with self._paced():
             metrics = self._improve(self._normalised())
+        metrics["ppo/pace"] = self.pace.squeeze().clone()
         self._set_pace(metrics["ppo/kl"])
-        return metrics | {"ppo/pace": self.pace.squeeze().clone()}
+        return metrics
 
     def _improve(self, records: Minibatch) -> dict[str, Tensor]:
         """Make epochs of gradient steps, until one comes upon too large a divergence."""

@@ -103,16 +103,35 @@ def test_an_improvement_stops_where_the_policy_has_moved_far():
     assert metrics["ppo/epochs"].item() == pytest.approx(2 / 5)  # of the 5 minibatches that 3 · 4 · 6 steps make
 
 
-@pytest.mark.parametrize(("target", "paces"), [(1e-9, [0.8, 0.64]), (1e9, [1.0, 1.0]), (None, [1.0, 1.0])])
-def test_the_learning_rate_follows_a_target_for_the_divergence(target, paces):
-    learner = make_learner(ppo=replace(PPO, updates=1, kl_target=target, learning_rate=1e-3))
+@pytest.mark.parametrize(
+    ("target", "begin", "paces"),
+    [(1e-9, 1.0, [1.0, 0.8, 0.64]), (1e9, 0.5, [0.5, 0.625, 0.78125]), (1e9, 0.9, [0.9, 1.0, 1.0]),
+     (None, 0.5, [1.0, 1.0, 1.0])],
+    ids=["slower", "faster", "not above the full rate", "no target"],
+)  # fmt: skip
+def test_the_learning_rate_follows_a_target_for_the_divergence(target, begin, paces):
+    learner = make_learner(ppo=replace(PPO, updates=1, kl_stop=1e9, kl_target=target, learning_rate=1e-3))
     loss = learner.losses["actor"]
+    loss.pace.fill_(begin)
     found = []
-    for update in (1, 2):
+    for update in (1, 2, 3):
         loss(make_starts())
         found.append(loss.improve(update)["ppo/pace"].item())
     assert found == pytest.approx(paces)
     assert loss.optimizer.param_groups[0]["lr"] == 1e-3  # what is scheduled stays as it is
+
+
+def test_a_divergence_about_its_target_changes_no_rate():
+    learner = make_learner(ppo=replace(PPO, updates=1, kl_stop=1e9, kl_target=0.01))
+    loss = learner.losses["actor"]
+    loss.pace.fill_(0.5)
+    for kl, pace in ((0.0149, 0.5), (0.0067, 0.5), (0.0151, 0.4), (0.0066, 0.5), (float("nan"), 0.4)):
+        loss._set_pace(torch.tensor(kl))
+        assert loss.pace.item() == pytest.approx(pace)
+    loss.pace.fill_(0.011)
+    for _ in range(2):
+        loss._set_pace(torch.tensor(1.0))
+    assert loss.pace.item() == pytest.approx(0.01)
 
 
 def test_the_pace_is_that_of_the_steps():
@@ -171,10 +190,11 @@ def test_advantages_are_normalised_under_their_weights():
 def test_a_checkpoint_between_two_improvements_loses_nothing():
     from tests.test_learner import make_batch
 
-    learner = make_learner()
+    numbers = replace(PPO, kl_target=1e-9)
+    learner = make_learner(ppo=numbers)
     for _ in range(4):
         learner.update(make_batch())
-    resumed = make_learner()
+    resumed = make_learner(ppo=numbers)
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     for each in (learner, resumed):
         torch.manual_seed(5)
