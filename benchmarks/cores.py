@@ -2,14 +2,16 @@
 
     python benchmarks/cores.py --json results/cores.json
 
-Every way trains anew for some env_steps, one after the other, as `recipes/dreamer_v3.py track=circle` does on a CPU.
-`env_steps_per_s` is over the second half of the run, when updates are under way; `collect`, `learn` are the shares of
-the wall-clock time that the main thread spends on either. Keep the machine idle meanwhile.
+Every way trains anew for some env_steps, in turns, as `recipes/dreamer_v3.py track=circle` does on a CPU.
+`env_steps_per_s` is over the second half of the runs, when updates are under way, the median of `--rounds`; `least` and
+`most` are those of a round. `collect` and `learn` are shares of the main thread's wall-clock time; the rest is the
+refresh of contexts and what is logged. Keep the machine idle meanwhile.
 """
 
 import argparse
 import csv
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -20,7 +22,7 @@ from typing import Any, NamedTuple
 from measuring import print_table, write_json
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "dreamer_v3.py"
-COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "times", "updates_per_s", "collect", "learn")
+COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "least", "most", "times", "collect", "learn")
 LEARNING = ("sample", "world_model", "imagine", "optimise", "improve")
 
 
@@ -45,16 +47,23 @@ def main() -> None:
     """Measure every way that the machine has the cores for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env-steps", type=int, default=16_000)
+    parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--json")
     parser.add_argument("overrides", nargs="*", help="further settings of the recipe")
     arguments = parser.parse_args()
     available = sorted(os.sched_getaffinity(0))
+    ways = [way for way in WAYS if way.cores <= len(available)]
+    rounds: dict[Way, list[dict[str, float]]] = {way: [] for way in ways}
+    for _ in range(arguments.rounds):
+        for way in ways:
+            rounds[way].append(measure(way, available[: way.cores], arguments.env_steps, arguments.overrides))
     records: list[dict[str, Any]] = []
-    for way in WAYS:
-        if way.cores <= len(available):
-            measured = measure(way, available[: way.cores], arguments.env_steps, arguments.overrides)
-            first = records[0]["env_steps_per_s"] if records else measured["env_steps_per_s"]
-            records.append({**way._asdict(), **measured, "times": measured["env_steps_per_s"] / first})
+    for way in ways:
+        speeds = [measured["env_steps_per_s"] for measured in rounds[way]]
+        means = {name: statistics.median(measured[name] for measured in rounds[way]) for name in rounds[way][0]}
+        first = records[0]["env_steps_per_s"] if records else means["env_steps_per_s"]
+        spread = {"least": min(speeds), "most": max(speeds), "times": means["env_steps_per_s"] / first}
+        records.append({"benchmark": "cores", **way._asdict(), **means, **spread})
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
@@ -67,6 +76,7 @@ def measure(way: Way, cores: list[int], env_steps: int, overrides: list[str]) ->
             sys.executable,
             str(RECIPE),
             "track=circle",
+            "device=cpu",
             f"run_dir={run_dir}",
             f"total_env_steps={env_steps}",
             f"collection={way.collection}",
@@ -81,7 +91,10 @@ def measure(way: Way, cores: list[int], env_steps: int, overrides: list[str]) ->
             raise SystemExit(f"{way} ended with status {done.returncode}:\n{done.stderr[-2000:]}")
         rows = list(csv.DictReader((run_dir / "metrics.csv").open()))
     rows = [row for row in rows if int(row["env_steps"]) > env_steps / 2 and row["wall_clock"]]
+    if len(rows) < 3:
+        raise SystemExit(f"--env-steps {env_steps} leaves {len(rows)} rows of metrics in the second half: give more.")
     first, last = rows[0], rows[-1]
+    rows = rows[1:]  # each is of the time before it
     seconds = float(last["wall_clock"]) - float(first["wall_clock"])
     return {
         "env_steps_per_s": (int(last["env_steps"]) - int(first["env_steps"])) / seconds,

@@ -177,6 +177,20 @@ def test_some_components_and_what_does_not_fit(saved):
         load_components(saved, {"replay": make_replay(200, 4, 4, 5)})
 
 
+def test_a_part_that_older_checkpoints_lack_is_left_as_it_is(saved):
+    run = Run(saved)
+    parts = {**run.checkpoints.components, "lag": {"waits": 1}}
+    with pytest.raises(CheckpointError, match="missing.*lag"):
+        RunCheckpoints(saved, parts).load()
+    RunCheckpoints(saved, parts).load(may_lack=("lag",))
+    assert run.assert_consistent() == 30
+    assert parts["lag"] == {"waits": 1}
+    RunCheckpoints(saved, parts).save(40)
+    parts["lag"]["waits"] = 0
+    RunCheckpoints(saved, parts).load(may_lack=("lag",))
+    assert parts["lag"] == {"waits": 1}
+
+
 class Unreadable:
     def state_dict(self) -> dict:
         return {"path": Path("x")}  # loads only with arbitrary code execution allowed

@@ -61,6 +61,19 @@ def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path)
     assert next_command(tmp_path, *CHOSEN, "total_env_steps=900000") is None
 
 
+def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
+    """tuned=auto became tuned=race at the run's beginning, which has a length of its own."""
+    chosen = ["name=first", "algorithm=dreamer_v3", "track=circle", "seed=3", "budget=none", "variant=default"]
+    command = next_command(tmp_path, *chosen)
+    assert command is not None
+    run_dir = leave_run(
+        Path(command[1].removeprefix("run_dir=")), 1_100_000, [*command[2:], "tuned=race"], finished=False
+    )
+    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1400000"]
+    mark_finished(run_dir, 1_400_000)
+    assert next_command(tmp_path, *chosen) is None
+
+
 def test_a_run_that_was_killed_in_its_last_evaluation_is_not_finished(tmp_path: Path) -> None:
     run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES, finished=False)
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]

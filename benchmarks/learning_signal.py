@@ -1,15 +1,16 @@
 """What a learner learns from, on a run's own replay: cold windows, noise of the actor's gradient, drift of the policy.
 
-    python benchmarks/learning.py runs/circle --json learning.json
+    python benchmarks/learning_signal.py runs/circle --json learning_signal.json
 
-* Windows: the newest records of every stream, in windows of T = 16 behind which 64 more records lie. By record of the
-  window, `error` of the decoded state (mean square, symlogged), and how far the mean `action` and the `value` are from
-  those of `warm`, which has seen the 64 records: `stored` begins with the context in the replay, `cold` from nothing.
+* Windows: the newest records of the streams that are trained on, in windows of T = 16 behind which 64 more records lie.
+  By record of the window, `error` of the decoded state (mean square, symlogged), and how far the mean `action` and the
+  `value` are from those of `warm`, which has seen the 64 records: `stored` begins with the context in the replay,
+  `cold` from nothing. Only windows of a single flight are counted: in another, a record would soon be as warm as any.
 * Gradient: of the policy-gradient loss at the present actor, from N starts, `cosine` between two drawn independently
   and `signal` power over noise power; N as one update has it, and as an improvement of `loss.actor=ppo` has it.
-* Drift: two copies of the learner after `--updates` updates on batches of their own, as the run makes them; root mean
-  square over states and dimensions of the mean actions' difference (`apart`) and of the way each went (`moved`), beside
-  the policy's mean deviation `std`.
+* Drift: two copies of the learner after `drift_updates` updates on batches of their own, none of which wait for the
+  model; root mean square over states and dimensions of the mean actions' difference (`apart`) and of the way each went
+  (`moved`), beside the policy's mean deviation `std`. Mean over `--pairs`, and the least and most `apart`.
 
 The trained weights are measured, not the averaged ones. The checkpoint must hold a replay, so no best/.
 """
@@ -17,6 +18,7 @@ The trained weights are measured, not the averaged ones. The checkpoint must hol
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,12 +31,12 @@ from torch import Tensor
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 from arena import make_env, restore_learner, trained_config
-from building import make_run_replay
+from building import make_curriculum, make_run_replay
 from schema import DreamerConfig
 
 from dreamer_racing.checkpoint import latest_checkpoint, load_components
 from dreamer_racing.learner import DreamerLearner
-from dreamer_racing.losses import ActorLoss, imagine
+from dreamer_racing.losses import ActorLoss, PPOActorLoss, imagine
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
@@ -43,9 +45,14 @@ from dreamer_racing.replay import StreamReplay
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from
 GRADIENTS = 12
-COLUMNS = {"windows": ("record", "windows", "error_warm", "error_stored", "error_cold", "action_stored", "action_cold",
-                      "value_stored", "value_cold"),
-          "gradient": ("starts", "cosine", "signal"), "drift": ("updates", "std", "apart", "moved")}  # fmt: skip
+COLUMNS = {
+    "windows": [
+        "record", "windows", "error_warm", "error_stored", "error_cold", "action_stored", "action_cold",
+        "value_stored", "value_cold",
+    ],
+    "gradient": ["starts", "cosine", "signal"],
+    "drift": ["drift_updates", "std", "apart", "least", "most", "moved"],
+}  # fmt: skip
 
 
 def main() -> None:
@@ -53,11 +60,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
     parser.add_argument("--updates", type=int, default=32, help="of the drifting copies")
+    parser.add_argument("--pairs", type=int, default=3, help="of drifting copies")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:
-        found = list(measure(latest_checkpoint(path), arguments.updates))
+        found = list(measure(latest_checkpoint(path), arguments.updates, arguments.pairs))
         for part, columns in COLUMNS.items():
             print_table([record for record in found if record["measured"] == part], columns)
             print()
@@ -65,7 +73,7 @@ def main() -> None:
     write_json(records, arguments.json)
 
 
-def measure(checkpoint: Path, updates: int) -> Iterator[dict[str, Any]]:
+def measure(checkpoint: Path, updates: int, pairs: int) -> Iterator[dict[str, Any]]:
     """Yield the records of one checkpoint.
 
     Raises:
@@ -74,17 +82,19 @@ def measure(checkpoint: Path, updates: int) -> Iterator[dict[str, Any]]:
     config = trained_config(checkpoint.parent.parent)
     if not isinstance(config, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
+    config.device, config.replay.device = "cpu", "auto"  # wherever it was trained
     learner, counters = restore(config, checkpoint)
-    where = {"benchmark": "learning", "track": config.track, "actor": config.loss.actor, **counters}
+    where = {"benchmark": "learning_signal", "track": config.track, "actor": config.loss.actor, **counters}
     long = restore_replay(config, checkpoint, learner, WINDOWS, BEHIND + LENGTH, share=1.0, records=RECENT)
     torch.manual_seed(0)
     for record in compare_windows(learner, long.sample()):
         yield {**where, "measured": "windows", **record}
     del long
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
-    for starts in sorted({learner.config.imagination_starts or 1024, 8 * (learner.config.imagination_starts or 128)}):
-        yield {**where, "measured": "gradient", **gradient_noise(learner, replay, starts)}
-    yield {**where, "measured": "drift", **drift(config, checkpoint, replay, updates)}
+    starts = config.model.imagination_starts or config.model.batch_size * config.model.batch_length
+    for number in (starts, starts * config.loss.ppo.updates):
+        yield {**where, "measured": "gradient", **gradient_noise(learner, replay, number)}
+    yield {**where, "measured": "drift", **drift(config, checkpoint, replay, updates, pairs)}
 
 
 def restore(config: DreamerConfig, checkpoint: Path) -> tuple[DreamerLearner, dict[str, int]]:
@@ -103,12 +113,12 @@ def restore_replay(
     records: int | None = None,
 ) -> StreamReplay:
     """Bring back the replay, to be sampled in other windows or as the run does."""
-    env = make_env(config)
-    settings = config.replay
+    env = make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # for what it shows
+    settings, curriculum = config.replay, make_curriculum(config)
     replay = make_run_replay(
         config,
         env,
-        None,
+        curriculum,
         windows,
         length,
         latents=learner.latent_format if settings.context else None,
@@ -117,7 +127,7 @@ def restore_replay(
         held_out=settings.held_out,
     )
     env.close()
-    load_components(checkpoint, {"replay": replay})
+    load_components(checkpoint, {"replay": replay} | ({"curriculum": curriculum} if curriculum else {}))
     return replay
 
 
@@ -140,10 +150,8 @@ def compare_windows(learner: DreamerLearner, batch: TensorDictBase) -> Iterator[
         if decoder is not None:
             truth = symlog(batch["privileged", "vector"][:, last])
             judged[name]["error"] = (decoder.mlp(features) - truth).square()
-    # Only records whose episode began before the window: the others are never cold.
-    old = begins[:, last].cumsum(1) == 0  # (B, LENGTH)
+    chosen = ~begins[:, last][:, : max(RECORDS) + 1].any(1)  # (B,)
     for record in RECORDS:
-        chosen = old[:, record]
         result: dict[str, float] = {"record": record, "windows": int(chosen.sum())}
         for name, values in judged.items():
             if "error" in values:
@@ -189,14 +197,16 @@ def gradient_noise(learner: DreamerLearner, replay: StreamReplay, number: int) -
     return {"starts": number, "cosine": cosine.item(), "signal": (signal / noise).item()}
 
 
-def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates: int) -> dict[str, float]:
-    """Train two copies on batches of their own, and see how far apart they are."""
+def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates: int, pairs: int) -> dict[str, float]:
+    """Train pairs of copies on batches of their own, and see how far apart they are."""
     base, _ = restore(config, checkpoint)
     belief, state, _ = starts_of(base, replay, 512)
     features = join_features(belief, state)
     means = []
-    for seed in (1, 2):
+    for seed in range(2 * pairs):
         copy, _ = restore(config, checkpoint)
+        if isinstance(loss := copy.losses["actor"], PPOActorLoss):
+            loss.kept.zero_()  # rollouts that the copies would have in common
         torch.manual_seed(seed)
         for _ in range(updates):
             copy.update(replay.sample())
@@ -204,12 +214,15 @@ def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates
             means.append(copy.agent.actor(features).mean)
     with torch.no_grad():
         policy = base.agent.actor(features)
-    moved = torch.stack([mean - policy.mean for mean in means])
+    after = torch.stack(means).unflatten(0, (pairs, 2))  # (pairs, 2, N, A)
+    apart = (after[:, 0] - after[:, 1]).square().mean((1, 2)).sqrt()
     return {
-        "updates": updates,
+        "drift_updates": updates,
         "std": policy.std.mean().item(),
-        "apart": (means[0] - means[1]).square().mean().sqrt().item(),
-        "moved": moved.square().mean().sqrt().item(),
+        "apart": apart.mean().item(),
+        "least": apart.min().item(),
+        "most": apart.max().item(),
+        "moved": (after - policy.mean).square().mean().sqrt().item(),
     }
 
 
