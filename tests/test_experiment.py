@@ -69,8 +69,8 @@ def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
     run_dir = leave_run(
         Path(command[1].removeprefix("run_dir=")), 1_100_000, [*command[2:], "tuned=race"], finished=False
     )
-    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1400000"]
-    mark_finished(run_dir, 1_400_000)
+    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1200000"]
+    mark_finished(run_dir, 1_200_000)
     assert next_command(tmp_path, *chosen) is None
 
 
