@@ -68,6 +68,7 @@ RANGES = {
     "loss.lambda_": SHARE,
     "loss.entropy_scale": NOT_NEGATIVE,
     "loss.min_std": Range(0, 1, open_below=True),
+    "schedule.wait_every": Range(1),
     "loss.ppo.updates": Range(1),
     "loss.ppo.epochs": Range(1),
     "loss.ppo.minibatch": Range(1),

@@ -40,7 +40,6 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 400  # env_steps/s of tuned=race on one core of an Intel Xeon with AMX, docs/experiments.md, entry 14
-LAG_EVERY = 5_000  # env_steps
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -74,7 +73,7 @@ class DreamerRun(ReplayRun):
 
     def look_at_lag(self) -> None:
         """Every so many env_steps, whatever is logged: see whether the model still knows where its policy flies."""
-        periods = self.counters["env_steps"] // LAG_EVERY
+        periods = self.counters["env_steps"] // self.config.schedule.wait_every
         if self.lag.limit is None or periods == self.lag.periods:
             return
         self.lag.periods, measured = periods, self.held_out()

@@ -152,6 +152,7 @@ class ScheduleConfig:
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None
+    wait_every: int = 5_000  # env_steps between two looks at those errors
 
 
 class Collection(Enum):

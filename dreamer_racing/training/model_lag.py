@@ -44,7 +44,8 @@ class ModelLag:
         self.periods = 0
         self._sum: Tensor | float = 0.0  # of the errors of updates since the last measurement
         self._count = 0
-        self._trained = self._held_out = math.nan
+        self._trained: float | None = None  # running means
+        self._held_out: float | None = None
 
     def trained(self, error: Tensor) -> None:
         """Take note of an update's error, a scalar; nothing waits for its device."""
@@ -57,7 +58,7 @@ class ModelLag:
             self._trained = _moved(self._trained, float(self._sum) / self._count)
             self._sum, self._count = 0.0, 0
         self._held_out = _moved(self._held_out, float(held_out))
-        ratio = self._held_out / self._trained if self._trained > 0 else math.nan
+        ratio = self._held_out / self._trained if self._trained else math.nan
         if self.limit is not None and not math.isnan(ratio):
             self.waits = ratio > self.limit
         return ratio
@@ -80,6 +81,6 @@ class ModelLag:
         self._trained, self._held_out = state_dict["trained"], state_dict["held_out"]
 
 
-def _moved(mean: float, value: float) -> float:
+def _moved(mean: float | None, value: float) -> float:
     """Return a running mean after one more value."""
-    return value if math.isnan(mean) else MEMORY * mean + (1.0 - MEMORY) * value
+    return value if mean is None else MEMORY * mean + (1.0 - MEMORY) * value
