@@ -366,7 +366,7 @@ def check_wait(config: DreamerConfig) -> None:
     if config.loss.actor != "ppo":
         raise ValueError(
             f"schedule.wait_for_model={limit} is for loss.actor=ppo, whose actor has an optimiser of its own; with "
-            f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null (tuned=race sets it)."
+            f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
         )
     if not config.replay.held_out:
         raise ValueError(f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0.")

@@ -161,10 +161,6 @@ def resolve(config: DictConfig) -> DictConfig:
     if config.tuned == "race":
         hours = config.total_env_steps / RACE_SPEED / 3600
         print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
-    if config.tuned == "race" and (config.loss.actor != "ppo" or not config.replay.held_out):
-        why = f"loss.actor={config.loss.actor}" if config.loss.actor != "ppo" else "replay.held_out=0"
-        print(f"schedule.wait_for_model=null, because of {why}")
-        config.schedule.wait_for_model = None
     if config.env.num_envs == 1 and config.replay.held_out:
         print("held out: nothing, because there is a single world (replay.held_out=0, schedule.wait_for_model=null)")
         config.replay.held_out, config.schedule.wait_for_model = 0, None

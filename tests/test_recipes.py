@@ -352,15 +352,10 @@ def test_a_single_world_holds_nothing_out(capsys: pytest.CaptureFixture[str]) ->
         assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 1)
 
 
-@pytest.mark.parametrize(
-    ("override", "why"),
-    [("loss.actor=dynamics", "loss.actor=dynamics"), ("replay.held_out=0", "replay.held_out=0"), ("seed=1", None)],
-)
-def test_what_races_goes_with_other_actors(override: str, why: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("override", ["loss.actor=dynamics", "loss.actor=reinforce", "replay.held_out=0"])
+def test_what_races_goes_with_other_actors(override: str) -> None:
     config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
     recipe_module("checks").check_dreamer(OmegaConf.to_object(config))
-    printed = f"schedule.wait_for_model=null, because of {why}" in capsys.readouterr().out
-    assert printed == (why is not None) == (config.schedule.wait_for_model is None)
 
 
 @pytest.mark.slow
