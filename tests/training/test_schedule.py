@@ -20,6 +20,17 @@ def test_a_ramp_without_length_is_a_step():
     assert [Ramp(to=1.0, begin=0.5, end=0.5).at(0.0, progress) for progress in (0.49, 0.5, 0.51)] == [0.0, 1.0, 1.0]
 
 
+def test_a_ramp_may_turn_back():
+    ramp = Ramp(to=1.0, begin=0.2, end=0.4, until=0.6)
+    assert [ramp.at(0.0, progress) for progress in (0.2, 0.4, 0.59, 0.6, 1.0)] == [0.0, 1.0, 1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("until", [0.3, 1.1])
+def test_a_ramp_that_turns_back_before_its_end_or_never_is_refused(until):
+    with pytest.raises(ValueError, match=f"schedule.discount: until={until} must be at least end=0.4"):
+        Ramp(to=0.5, begin=0.2, end=0.4, until=until).check("schedule.discount")
+
+
 @pytest.mark.parametrize(("begin", "end"), [(0.6, 0.5), (-0.1, 0.5), (0.5, 1.1)])
 def test_a_ramp_that_ends_before_it_begins_or_outside_the_run_is_refused(begin, end):
     with pytest.raises(ValueError, match=f"schedule.discount: begin={begin} and end={end} are shares"):
