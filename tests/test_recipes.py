@@ -485,7 +485,10 @@ def test_dreamer_as_published_is_one_word_away() -> None:
         OmegaConf.structured(schema.EnvConfig(num_envs=1))
     ) | {"num_envs": None}
     assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
-    assert all(ramp is None or ramp.to is None for ramp in faithful.schedule.values())
+    schedule = OmegaConf.to_container(faithful.schedule)
+    assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.ScheduleConfig))
+    assert schedule.pop("wait_for_model") is None and schedule.pop("wait_every")
+    assert all(ramp["to"] is None for ramp in schedule.values())
 
 
 @pytest.mark.parametrize(
