@@ -99,8 +99,7 @@ class DreamerRun(ReplayRun):
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
         """Take note of the model's error; let later windows go on from what the model makes of these records now."""
-        error = lag_error(metrics)
-        if error is not None:
+        if self.lag.limit is not None and (error := lag_error(metrics)) is not None:
             self.lag.trained(error)
         if self.config.replay.context:
             latents = self.learner.latents
