@@ -25,11 +25,11 @@ sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 import ppo
 import sac
-from command_line import CONFIG_DIR
+from composing.command_line import CONFIG_DIR
 
-from dreamer_racing.baselines.networks import ObservationNetwork
-from dreamer_racing.checkpoint import GracefulExit
 from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.learners.networks import ObservationNetwork
+from dreamer_racing.training.checkpoint import GracefulExit
 
 RECIPES = {"ppo": ppo, "sac": sac}
 CASES = (

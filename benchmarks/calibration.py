@@ -27,18 +27,18 @@ from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from arena import make_env, restore_learner, trained_config
-from schema import DreamerConfig
+from composing.arena import make_env, restore_learner, trained_config
+from composing.schema import DreamerConfig
 
-from dreamer_racing.checkpoint import latest_checkpoint
-from dreamer_racing.diagnostics import correlation
-from dreamer_racing.envs.privileged import DISTANCE
+from dreamer_racing.envs.race.race_vector import DISTANCE
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.evaluation.held_out import correlation
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import imagine
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.training.checkpoint import latest_checkpoint
 
 NEAR, HALF_VIEW = 3.0, math.radians(40.0)  # m and rad to either side: where a gate counts as seen
 WRONG_GATE = 2.0  # m: an error that means another gate

@@ -9,7 +9,7 @@ differences of 255 from the image of `physics.render`, `worst` is the mean of th
 
 * `physics.render`: dm_control's own, with a camera and a scene made for each frame;
 * `kept camera`: one `Camera` for all frames, with a buffer of the image's size;
-* `ControlSuiteEnv`: the same with the detail of `dreamer_racing.envs.dmc.DETAIL`;
+* `ControlSuiteEnv`: the same with the detail of `dreamer_racing.envs.control_suite.DETAIL`;
 * in the tasks of `--parts`: `kept camera` with one thing changed, for what that thing costs.
 """
 
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from measuring import print_table, write_json
 
-from dreamer_racing.envs import dmc
+from dreamer_racing.envs import control_suite as dmc
 
 TASKS = ("cartpole_swingup", "walker_walk", "reacher_easy", "cheetah_run", "ball_in_cup_catch", "finger_spin",
          "hopper_hop", "quadruped_walk", "humanoid_walk")  # fmt: skip

@@ -26,11 +26,11 @@ from measuring import print_table, write_json
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.flight import Flight
-from dreamer_racing.envs.pilot import ScriptedPilot
-from dreamer_racing.envs.quadrotor import PRESETS, Quadrotor
-from dreamer_racing.envs.rotation import turn
-from dreamer_racing.envs.scene import build_drone
+from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
+from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rotation import turn
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.simulator.scene import build_drone
 from dreamer_racing.envs.worlds import RaceWorlds
 
 TRACKS = ("circle", "kidney", "figure8", "split_s")

@@ -31,10 +31,10 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.memory import keep_freed_memory
+from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import SIZES, Interface, get_size
-from dreamer_racing.replay import make_replay
 
 PRIVILEGED_DIM = 21
 PEERS = ("torchrl_small", "torchrl_large")

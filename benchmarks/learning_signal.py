@@ -30,17 +30,17 @@ from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from arena import make_env, restore_learner, trained_config
-from building import make_curriculum, make_run_replay
-from schema import DreamerConfig
+from composing.arena import make_env, restore_learner, trained_config
+from composing.building import make_curriculum, make_run_replay
+from composing.schema import DreamerConfig
 
-from dreamer_racing.checkpoint import latest_checkpoint, load_components
-from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import ActorLoss, PPOActorLoss, imagine
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
-from dreamer_racing.replay import StreamReplay
+from dreamer_racing.training.checkpoint import latest_checkpoint, load_components
 
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from

@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
-from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.pilot import FlownLaps, ScriptedPilot, fly_laps
-from dreamer_racing.envs.racing_line import LineLimits
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.pilot import FlownLaps, ScriptedPilot, fly_laps
+from dreamer_racing.envs.race.racing_line import LineLimits
 
 TRACKS = ("circle", "kidney", "figure8", "split_s")
 COLUMNS = ("clean", "line", "lap_first", "lap_mean", "lap_best", "speed_mean", "speed_max", "offset", "view")

@@ -44,12 +44,12 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
-from dreamer_racing.envs.partial_reset import TransformedPixelEnv
-from dreamer_racing.envs.scene import Camera
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
-from dreamer_racing.memory import keep_freed_memory
+from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
 
 PARTS = ("physics", "race", "render")
@@ -314,7 +314,7 @@ def peer_record(name: str, num_envs: int, steps_per_s: float) -> dict[str, Any]:
 
 def dm_control(name: str, track: str, preset: str, seconds: float) -> dict[str, Any]:
     """The same race as one dm_control task, stepped in Python."""
-    from dreamer_racing.envs.task import load
+    from dreamer_racing.envs.dm_control_env import load
 
     env = load(track, preset, random=0, from_pixels=name.endswith("EGL"))
     action = env.action_spec().generate_value() * 0.0

@@ -13,22 +13,30 @@ from pathlib import Path
 from typing import ClassVar, cast
 
 import hydra
-from arena import make_env, make_learner, scheduled
-from building import assemble, claim, make_collector, make_curriculum, make_run_replay, resolve_common, seed_generators
-from checks import check_dreamer
-from command_line import CONFIG_DIR, choose_device, computes_bfloat16
+from composing.arena import make_env, make_learner, scheduled
+from composing.building import (
+    assemble,
+    claim,
+    make_collector,
+    make_curriculum,
+    make_run_replay,
+    resolve_common,
+    seed_generators,
+)
+from composing.checks import check_dreamer
+from composing.command_line import CONFIG_DIR, choose_device, computes_bfloat16
+from composing.launching import ReplayRun, launch
+from composing.schema import Collection, DreamerConfig, register
 from omegaconf import DictConfig, OmegaConf
-from schema import Collection, DreamerConfig, register
 from tensordict import TensorDictBase
 from torch import Tensor
-from training import ReplayRun, launch
 
-from dreamer_racing.checkpoint import GracefulExit
-from dreamer_racing.collection import OverlappedRollouts, acting_copy
-from dreamer_racing.diagnostics import SEEN, held_out_metrics
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.learner import DreamerLearner
+from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
+from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.checkpoint import GracefulExit
 from dreamer_racing.training.model_lag import ModelLag
 
 NUM_ENVS = 32

@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-from arena import make_report, worlds_of
-from command_line import plain_errors, start_logging
+from composing.arena import make_report, worlds_of
+from composing.command_line import plain_errors, start_logging
+from composing.restoring import Restored, fresh_directory, heading, restore
+from composing.schema import EvaluateConfig, register
 from omegaconf import DictConfig, OmegaConf
-from restoring import Restored, fresh_directory, heading, restore
-from schema import EvaluateConfig, register
 
-from dreamer_racing.envs.starts import StartSampler
+from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.plotting import plot_top_down
-from dreamer_racing.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
-from dreamer_racing.recording import onboard_beside_map, write_video
-from dreamer_racing.report_plots import plot_conditions, plot_crashes
-from dreamer_racing.reporting import EvaluationReport
+from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
+from dreamer_racing.figures.drawing import plot_top_down
+from dreamer_racing.figures.film import onboard_beside_map, write_video
+from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
+from dreamer_racing.figures.report import EvaluationReport
 
 PROTOCOLS = ("nominal", "full")
 RESULT = "evaluation.json"

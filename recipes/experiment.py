@@ -20,16 +20,16 @@ from typing import Any, cast
 
 import hydra
 import yaml
-from checks import check_variant
-from command_line import merge_overrides, override_key
+from composing.checks import check_variant
+from composing.command_line import merge_overrides, override_key
+from composing.report import FAILURES
+from composing.schema import ExperimentConfig, RunConfig, register
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from report import FAILURES
-from schema import ExperimentConfig, RunConfig, register
 
-from dreamer_racing.checkpoint import CHECKPOINTS, finished_env_steps, latest_checkpoint
-from dreamer_racing.run_lock import RunLock
+from dreamer_racing.training.checkpoint import CHECKPOINTS, finished_env_steps, latest_checkpoint
+from dreamer_racing.training.lock import RunLock
 
 RECIPES = Path(__file__).resolve().parent
 LOG = "log.txt"

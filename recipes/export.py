@@ -4,7 +4,7 @@
     python recipes/export.py checkpoint=runs/dreamer_v3_kidney_20260101-120000 agent=agents/kidney
 
 Flies the policy on the track that it was trained on, replays that flight through every copy, and writes them only if
-they do the same; then measures how long a step takes. What flies them is dreamer_racing/onnx_actor.py.
+they do the same; then measures how long a step takes. What flies them is dreamer_racing/export/onnx_actor.py.
 
 With agent= the folder gets everything that other recipes need to fly the agent too, see docs/agents.md: an evaluation
 of just these weights must have been made before.
@@ -20,14 +20,15 @@ from typing import Any, cast
 
 import hydra
 import torch
-from arena import camera_of, is_race, trained_config
-from command_line import override_key, plain_errors, start_logging
+from composing.arena import camera_of, is_race, trained_config
+from composing.command_line import override_key, plain_errors, start_logging
+from composing.restoring import config_folder, find_trained, results_of
+from composing.schema import DreamerConfig, ExportConfig, register
 from omegaconf import DictConfig, OmegaConf
-from restoring import config_folder, find_trained, results_of
-from schema import DreamerConfig, ExportConfig, register
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.export import (
+from dreamer_racing.evaluation.protocol import MODES
+from dreamer_racing.export.actor_step import (
     LATENTS,
     ActorStep,
     MissingPackagesError,
@@ -35,12 +36,10 @@ from dreamer_racing.export import (
     export_actor,
     make_step,
 )
-from dreamer_racing.export_contract import hash_weights, make_contract
-from dreamer_racing.export_parity import Flight, ParityError, TorchActor, episode_steps, record_flight
-from dreamer_racing.modules import Interface
-from dreamer_racing.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
-from dreamer_racing.protocol import MODES
-from dreamer_racing.trained_agent import (
+from dreamer_racing.export.contract import hash_weights, make_contract
+from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
+from dreamer_racing.export.parity import Flight, ParityError, TorchActor, episode_steps, record_flight
+from dreamer_racing.export.shipped_agent import (
     ACTOR,
     AGENT,
     CONFIG,
@@ -50,6 +49,7 @@ from dreamer_racing.trained_agent import (
     is_agent,
     load_agent,
 )
+from dreamer_racing.modules import Interface
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
 OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that say nothing of what was learned

@@ -17,23 +17,23 @@ from typing import Any
 import hydra
 import numpy as np
 import torch
-from arena import worlds_of
-from command_line import CONFIG_DIR, plain_errors, start_logging
+from composing.arena import worlds_of
+from composing.command_line import CONFIG_DIR, plain_errors, start_logging
+from composing.restoring import restore
+from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
-from restoring import restore
-from schema import EvaluateConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from dreamer_racing.envs.pilot import PilotPolicy, ScriptedPilot
-from dreamer_racing.envs.quadrotor import QuadrotorParameters, load_preset
-from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, load_preset
+from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.evaluation import Evaluation, Trajectory, evaluate
-from dreamer_racing.plotting import plot_top_down
-from dreamer_racing.protocol import fly as fly_races
-from dreamer_racing.recording import onboard_beside_map, write_gif, write_video
+from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
+from dreamer_racing.evaluation.protocol import fly as fly_races
+from dreamer_racing.figures.drawing import plot_top_down
+from dreamer_racing.figures.film import onboard_beside_map, write_gif, write_video
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second

@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-from arena import worlds_of
-from command_line import plain_errors, start_logging
+from composing.arena import worlds_of
+from composing.command_line import plain_errors, start_logging
+from composing.restoring import Restored, fresh_directory, heading, restore
+from composing.schema import PerceptionConfig, RunConfig, register
 from omegaconf import DictConfig, OmegaConf
-from restoring import Restored, fresh_directory, heading, restore
-from schema import PerceptionConfig, RunConfig, register
 
-from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
-from dreamer_racing.evaluation import Trajectory
-from dreamer_racing.lesions import LESIONS, LesionedPolicy
-from dreamer_racing.perception import Sight, measure_sight, sight_table
-from dreamer_racing.protocol import MODES, Result, fly, results_table
-from dreamer_racing.report_plots import plot_sight
+from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
+from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
+from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
+from dreamer_racing.figures.protocol import plot_sight
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"

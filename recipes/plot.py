@@ -14,20 +14,19 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 import hydra
-from command_line import plain_errors, start_logging
+from composing.command_line import plain_errors, start_logging
+from composing.schema import PlotConfig, register
 from omegaconf import DictConfig, OmegaConf
-from schema import PlotConfig, register
 
-from dreamer_racing.checkpoint import ensure_writable
-from dreamer_racing.comparison import COLUMNS, compare_variants, comparison_table
-from dreamer_racing.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
-from dreamer_racing.dreams import Dream, dream_video
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.figures import PROFILE_AXES, Flight, plot_dreams, plot_flights
-from dreamer_racing.flights import read_trajectory
-from dreamer_racing.learning_figures import plot_comparison, plot_learning_curves
-from dreamer_racing.recording import write_gif, write_video
-from dreamer_racing.runs import (
+from dreamer_racing.evaluation.dreams import Dream, dream_video
+from dreamer_racing.evaluation.flights import read_trajectory
+from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
+from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
+from dreamer_racing.figures.film import write_gif, write_video
+from dreamer_racing.figures.flights import PROFILE_AXES, Flight, plot_dreams, plot_flights
+from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
+from dreamer_racing.figures.runs import (
     RunData,
     evaluation_files,
     evaluation_score,
@@ -36,6 +35,7 @@ from dreamer_racing.runs import (
     first_readable,
     read_runs,
 )
+from dreamer_racing.training.checkpoint import ensure_writable
 
 register()
 

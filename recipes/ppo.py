@@ -11,17 +11,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import hydra
-from arena import make_env, make_learner
-from building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
-from checks import check
+from composing.arena import make_env, make_learner
+from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
+from composing.checks import check
+from composing.launching import Run, launch
+from composing.schema import PPORunConfig, register
 from omegaconf import DictConfig
-from schema import PPORunConfig, register
 from tensordict import TensorDictBase
-from training import Run, launch
 
-from dreamer_racing.baselines import PPOLearner
-from dreamer_racing.checkpoint import GracefulExit
+from dreamer_racing.learners import PPOLearner
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.checkpoint import GracefulExit
 
 NUM_ENVS = {"pixels": 64, "state": 1024}
 

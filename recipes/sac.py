@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import hydra
-from arena import make_env, make_learner
-from building import (
+from composing.arena import make_env, make_learner
+from composing.building import (
     assemble,
     claim,
     make_collector,
@@ -21,12 +21,12 @@ from building import (
     resolve_baseline,
     seed_generators,
 )
-from checks import check, check_replay
+from composing.checks import check, check_replay
+from composing.launching import ReplayRun, launch
+from composing.schema import SACRunConfig, register
 from omegaconf import DictConfig
-from schema import SACRunConfig, register
-from training import ReplayRun, launch
 
-from dreamer_racing.baselines import SACLearner
+from dreamer_racing.learners import SACLearner
 from dreamer_racing.modules import Interface
 
 NUM_ENVS = {"pixels": 64, "state": 256}

@@ -42,6 +42,6 @@ def recipe_module(name: str) -> ModuleType:
 
 
 def compose(recipe_name: str, *overrides: str) -> OmegaConf:
-    recipe_module("schema").register()
+    recipe_module("composing.schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         return hydra.compose(recipe_name, overrides=list(overrides))

@@ -44,7 +44,7 @@ def change(folder: Path, **fields) -> None:
 
 def test_page_in_the_repository_is_up_to_date(results):
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    assert page == results.make_page(ROOT / "results"), "run python recipes/results.py"
+    assert page == results.make_page(ROOT / "results"), "run python docs/results.py"
 
 
 def test_links_of_the_page_lead_somewhere():

@@ -7,17 +7,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dreamer_racing.envs.dmc import ControlSuiteEnv as ControlSuiteEnv
-    from dreamer_racing.envs.task import load as load
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv as ControlSuiteEnv
+    from dreamer_racing.envs.dm_control_env import load as load
     from dreamer_racing.envs.torchrl_env import DroneRacingEnv as DroneRacingEnv
     from dreamer_racing.envs.tracks import load_track as load_track
     from dreamer_racing.envs.worlds import RaceWorlds as RaceWorlds
 
 _HOMES = {
-    "ControlSuiteEnv": "dmc",
+    "ControlSuiteEnv": "control_suite",
     "DroneRacingEnv": "torchrl_env",
     "RaceWorlds": "worlds",
-    "load": "task",
+    "load": "dm_control_env",
     "load_track": "tracks",
 }
 

@@ -29,12 +29,12 @@ from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dreamer_racing.envs.gates import CrashCause
-from dreamer_racing.envs.privileged import RACE_VECTOR_SIZE
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.race import RaceStep
-from dreamer_racing.envs.scene import build_scene
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.race import RaceStep
+from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
+from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 

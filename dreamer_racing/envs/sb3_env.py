@@ -13,8 +13,8 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track
 
 _ONE_OBJECT = (

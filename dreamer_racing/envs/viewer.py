@@ -35,7 +35,7 @@ def view(
         ViewerUnavailableError: no window can be opened here.
     """
     check_viewer()
-    from dreamer_racing.envs.task import load
+    from dreamer_racing.envs.dm_control_env import load
 
     launch_viewer(load(track, preset, **arguments), policy)
 
@@ -58,7 +58,7 @@ def launch_viewer(env: Any, policy: Callable[[Any], np.ndarray] | None = None) -
 
 def hover(time_step: Any) -> np.ndarray:
     """The action (4,) that holds altitude when level, whatever the observation."""
-    from dreamer_racing.envs.quadrotor import QuadrotorParameters
+    from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 
     return np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
 

@@ -10,16 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.privileged import RaceVector
-from dreamer_racing.envs.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
-from dreamer_racing.envs.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
-from dreamer_racing.envs.racing_line import LineLimits, plan_racing_line
-from dreamer_racing.envs.rewards import RewardWeights
-from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
+from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
+from dreamer_racing.envs.race.race_vector import RaceVector
+from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
+from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator import Simulator, check_device, make_simulator
+from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
-from dreamer_racing.envs.starts import StartSampler
 from dreamer_racing.envs.tracks import Track, load_track
 
 ACTION_SIZE = 4

@@ -26,7 +26,7 @@ from dreamer_racing.losses.representation import (
 from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
 
 if TYPE_CHECKING:
-    from dreamer_racing.learner import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
 
 
 T = TypeVar("T")

@@ -22,7 +22,7 @@ from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import WorldModel
 
 if TYPE_CHECKING:
-    from dreamer_racing.learner import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
 
 
 class Judgement(NamedTuple):

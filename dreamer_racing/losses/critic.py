@@ -18,7 +18,7 @@ from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import join_features
 
 if TYPE_CHECKING:
-    from dreamer_racing.learner import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
 
 
 @torch.no_grad()

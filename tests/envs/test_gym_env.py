@@ -12,9 +12,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import dreamer_racing
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.gym_env import DroneRaceGymEnv, DroneRaceVectorEnv
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.rewards import RewardWeights
+from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
 

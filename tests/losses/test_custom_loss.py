@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, find_loss, kl_losses
 from dreamer_racing.modules import Interface
 

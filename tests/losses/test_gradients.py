@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, DecoderFreeLoss, ImaginedPPOConfig
 from dreamer_racing.losses.actor import frozen
 from dreamer_racing.modules import RSSM, Interface, WorldModel

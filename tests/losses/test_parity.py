@@ -22,7 +22,7 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Model
 from torchrl.objectives.dreamer_v3 import categorical_kl_balanced
 from torchrl.objectives.utils import ValueEstimators
 
-from dreamer_racing.learner import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
 from dreamer_racing.losses import CriticLoss, DynamicsActorLoss, ReconstructionLoss, ReinforceLoss, kl_losses
 from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
 

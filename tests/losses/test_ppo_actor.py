@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal, kl_divergence
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ImaginedPPOConfig, imagine
 from dreamer_racing.losses.ppo_actor import Minibatch, clipped_objective, normal_divergence
 from dreamer_racing.modules.actor import ActionDistribution
@@ -240,8 +240,9 @@ def test_a_checkpoint_of_other_rollouts_is_continued_without_them(changes):
 
 
 def test_a_gradient_that_is_not_finite_leaves_the_actor_as_it_was():
-    from dreamer_racing.finite_guard import NonFiniteLossError
     from tests.test_learner import make_batch
+
+    from dreamer_racing.learners.finite_guard import NonFiniteLossError
 
     learner = make_learner()
     for _ in range(2):

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.objectives import LossModule
 
-from dreamer_racing.learner import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
 from dreamer_racing.losses import (
     WORLD_MODEL_LOSSES,
     DecoderFreeLoss,

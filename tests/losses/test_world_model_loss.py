@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.learner import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ReconstructionLoss, kl_losses
 from dreamer_racing.modules import Interface, WorldModel
 
@@ -118,8 +118,9 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
 
 
 def test_a_window_begins_with_the_first_records_context():
-    from dreamer_racing.modules.stored_latents import CONTEXT
     from tests.test_learner import make_batch
+
+    from dreamer_racing.modules.stored_latents import CONTEXT
 
     learner = DreamerLearner("debug", seed=0)
     loss, batch = learner.losses["world_model"], make_batch()
@@ -143,9 +144,10 @@ def test_a_window_begins_with_the_first_records_context():
 
 def test_a_refreshed_context_is_what_the_next_window_begins_with():
     """From the learner's update through the replay into the next sample."""
-    from dreamer_racing.modules.stored_latents import CONTEXT
-    from dreamer_racing.replay import make_replay
     from tests.test_replay import CountingEnv, collect
+
+    from dreamer_racing.experience.replay import make_replay
+    from dreamer_racing.modules.stored_latents import CONTEXT
 
     config = LearnerConfig(imagination_horizon=2, imagination_starts=4, lr=1e-3, warmup_updates=0)
     learner = DreamerLearner("debug", config=config, seed=0)

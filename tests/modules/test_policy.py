@@ -7,12 +7,12 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from dreamer_racing.learner import Agent
+from dreamer_racing.experience.replay import records_from_rollout
+from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.sizes import SIZES
 from dreamer_racing.modules.stored_latents import CONTEXT
-from dreamer_racing.replay import records_from_rollout
 
 
 class NoiseEnv(EnvBase):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learner import Agent
+from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import (
     SIZES,
     DreamerPolicy,

@@ -5,12 +5,12 @@
 
 import torch
 
-from dreamer_racing.envs.looks import LooksRandomisation
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.scene import Camera
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.simulator.base import DroneState, Simulator
+from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
 
 __all__ = ["DroneState", "MujocoSimulator", "Simulator", "WarpSimulator", "check_device", "make_simulator"]

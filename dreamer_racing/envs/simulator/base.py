@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import Looks, LooksSampler
-from dreamer_racing.envs.quadrotor import Quadrotor, QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import Quadrotor, QuadrotorParameters
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.envs.simulator.looks import Looks, LooksSampler
 
 
 @dataclass(frozen=True)

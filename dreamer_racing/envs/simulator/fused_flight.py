@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.quadrotor import ROTOR_SPINS, Quadrotor
+from dreamer_racing.envs.drone.quadrotor import ROTOR_SPINS, Quadrotor
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 

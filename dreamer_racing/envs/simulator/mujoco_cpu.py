@@ -7,11 +7,11 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import LooksRandomisation, LooksSampler
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.scene import Camera, build_drone, build_scene
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.simulator.base import Simulator, no_images
+from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
+from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.tracks import Track
 
 

@@ -8,15 +8,15 @@ import mujoco
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import LooksRandomisation, LooksSampler
-from dreamer_racing.envs.quadrotor import QuadrotorParameters
-from dreamer_racing.envs.scene import Camera, build_drone, build_scene
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.simulator.base import Simulator, no_images
+from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.rendering import NoseMount
+from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.memory import GB, available_memory
+from dreamer_racing.machine import GB, available_memory
 
 
 class WarpSimulator(Simulator):

@@ -6,8 +6,8 @@ import mujoco
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import Looks
-from dreamer_racing.envs.scene import HALL_GROUP, Camera
+from dreamer_racing.envs.simulator.looks import Looks
+from dreamer_racing.envs.simulator.scene import HALL_GROUP, Camera
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 

@@ -31,10 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.looks import Looks
-from dreamer_racing.envs.rotation import rotate
-from dreamer_racing.envs.scene import CAMERA_NAME, HALL_GROUP, Camera
+from dreamer_racing.envs.drone.rotation import rotate
+from dreamer_racing.envs.simulator.looks import Looks
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
+from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
 
 logger = logging.getLogger(__name__)
 

@@ -1,0 +1,371 @@
+"""`ControlSuiteEnv`: tasks of the DeepMind Control Suite, to compare an agent with published curves away from the race.
+
+Keys, as those of `DroneRacingEnv` where both have them:
+
+| key | shape | meaning |
+|---|---|---|
+| `pixels` | (N, height, width, 3) uint8 | the task's camera, 64 × 64 by default, only with `from_pixels=True` |
+| `vector` | (N, V) float32 | all observations of the task in a row, only with `from_pixels=False` |
+| `action` | (N, A) float32 | in [-1, 1], scaled to the range of each actuator |
+| `reward` | (N, 1) float32 | summed over the action repeat |
+| `terminated` | (N, 1) bool | the task ended with discount 0; of the suite's tasks only those of `lqr` do |
+| `truncated` | (N, 1) bool | the suite's time limit, 1000 simulator steps, where the discount stays 1; not in `lqr` |
+| `done` | (N, 1) bool | either |
+
+Camera, default image size, action repeat and time limit are those of DreamerV3's `dmc_vision`.
+
+Images are dm_control's, with the same shadows, reflections, sky and four samples a pixel, but of a shadow map and of
+round shapes no finer than so small an image shows: drawn in software they are what takes most of the time.
+`benchmarks/control_suite.py` measures what that saves and what it changes: in 64 × 64 less than 0.5 of 255 on average
+in 19 of 20 tasks, and 1.9 in `quadruped_escape`, whose shadows lie on a whole terrain. In 32 × 32 it is 1.6
+in `reacher_easy`.
+
+Shapes: N worlds, V observation, A action.
+
+Reference: danijar/dreamerv3, embodied/envs/dmc.py and dreamerv3/configs.yaml of 2024 (`repeat: 2`; later versions have
+`repeat: 1`), for camera, image size and action repeat; Tassa et al., dm_control, arXiv 2006.12983, for the tasks.
+"""
+
+import difflib
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from dreamer_racing.envs.dm_control_env import _choose_gl_backend
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+
+_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
+
+import mujoco as mujoco_bindings  # noqa: E402
+from dm_control import _render, mujoco, suite  # noqa: E402
+from dm_control.rl import control  # noqa: E402
+
+TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
+"""Domain and task of the suite by the name `domain_task`."""
+CAMERAS = {"quadruped": 2}  # by domain; 0 for all others
+DETAIL = {"shadowsize": 4.0, "numslices": 0.25, "numstacks": 0.125}
+"""MuJoCo's `visual/quality` for each pixel of an image's width: texels of the shadow map along a side, facets around
+and along a capsule, a cylinder or a sphere. Never more than the task's own, nor less than for 64 pixels."""
+PHYSICS_STATE = mujoco_bindings.mjtState.mjSTATE_INTEGRATION  # all that MuJoCo's next step depends on
+
+
+class ControlSuiteEnv(EnvBase):
+    """N worlds of one task, stepped one after the other in one process.
+
+    A world whose episode has ended stands still, without reward, until it is reset. Actions beyond [-1, 1] are clipped;
+    one that is not finite is an error, as in the reference, because no task of the suite has a rule for it. OpenGL
+    binds images to the thread that made the environment: step and close it there.
+
+    Args:
+        task: `domain_task` of `dm_control.suite`, for example `cartpole_swingup` or `ball_in_cup_catch`; see `TASKS`.
+        num_envs: N; the batch size is [N].
+        device: where tensors live; the simulation itself runs on CPU.
+        from_pixels: whether there are `pixels`; if not there is a `vector` instead.
+        action_repeat: simulator steps that an action lasts; an episode is 1000 simulator steps.
+        camera: number or name of the task's camera; if None that of the reference.
+        image_size: width and height of `pixels`.
+        seed: of the worlds; None draws one from the operating system.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        RendererUnavailableError: dm_control has no OpenGL that works here.
+
+    Example:
+        >>> env = ControlSuiteEnv("cartpole_swingup", num_envs=4, from_pixels=False, seed=0)
+        >>> env.rollout(10)["next", "reward"].shape
+        torch.Size([4, 10, 1])
+    """
+
+    def __init__(
+        self,
+        task: str = "walker_walk",
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        from_pixels: bool = True,
+        action_repeat: int = 2,
+        camera: int | str | None = None,
+        image_size: int = 64,
+        seed: int | None = None,
+    ) -> None:
+        _check_arguments(task, num_envs, action_repeat)
+        super().__init__(device=device, batch_size=[num_envs])
+        self.task = task
+        self.from_pixels = from_pixels
+        self.action_repeat = action_repeat
+        self.image_size = image_size
+        self.camera = CAMERAS.get(TASKS[task][0], 0) if camera is None else camera
+        self.worlds: list[SuiteWorld] = []
+        self._set_seed(seed)
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        n, world = self.batch_size, self.worlds[0]
+
+        def flag() -> Bounded:
+            return Bounded(0, 1, (*n, 1), dtype=torch.bool, device=self.device)
+
+        self.action_spec = Bounded(-1.0, 1.0, (*n, world.action_size), dtype=torch.float32, device=self.device)
+        self.reward_spec = Unbounded((*n, 1), dtype=torch.float32, device=self.device)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=n, device=self.device)
+        if self.from_pixels:
+            shape, dtype = (*n, self.image_size, self.image_size, 3), torch.uint8
+            observation = {"pixels": Bounded(0, 255, shape, dtype=dtype, device=self.device)}
+        else:
+            shape, dtype = (*n, world.vector_size), torch.float32
+            observation = {"vector": Unbounded(shape, dtype=dtype, device=self.device)}
+        self.observation_spec = Composite(observation, shape=n, device=self.device)
+        self._observations = torch.zeros(shape, dtype=dtype)  # (N, ...), the latest of each world
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+        mask = tensordict.get("_reset", None) if tensordict is not None else None
+        rows = range(len(self.worlds)) if mask is None else mask.view(-1).nonzero().view(-1).tolist()
+        for row in rows:
+            self.worlds[row].reset()
+            self._observations[row] = torch.from_numpy(self.worlds[row].observe())
+        return self._data()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict["action"].cpu().double().numpy()
+        self._check_actions(actions)
+        rewards = torch.zeros(self.batch_size, dtype=torch.float64)
+        for row, (world, action) in enumerate(zip(self.worlds, actions, strict=True)):
+            if world.ended:
+                continue
+            rewards[row] = world.step(action, self.action_repeat)
+            self._observations[row] = torch.from_numpy(world.observe())
+        return self._data().set("reward", rewards.float().unsqueeze(-1).to(self.device))
+
+    def _check_actions(self, actions: np.ndarray) -> None:
+        expected = (len(self.worlds), self.worlds[0].action_size)
+        if actions.shape != expected:
+            raise ValueError(
+                f"Action of shape {actions.shape}: {expected[0]} world(s) of {self.task} take one of shape {expected}."
+            )
+        bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
+        if len(bad):
+            raise ValueError(
+                f"Action of world {bad[0]} of {self.task} is {actions[bad[0]].tolist()}: every number must be finite."
+            )
+
+    def _data(self) -> TensorDict:
+        """What there is after a reset as after a step."""
+        terminated = torch.tensor([[world.terminated] for world in self.worlds], device=self.device)
+        truncated = torch.tensor([[world.truncated] for world in self.worlds], device=self.device)
+        return TensorDict(
+            {
+                "pixels" if self.from_pixels else "vector": self._observations.to(self.device, copy=True),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Make all worlds anew: some tasks draw from their seed when they are made, not only when they are reset."""
+        seeds = np.random.SeedSequence(seed).generate_state(self.batch_size.numel())
+        self._free_worlds()
+        for number in seeds:
+            self.worlds.append(self._make_world(int(number)))
+
+    def _make_world(self, seed: int) -> "SuiteWorld":
+        return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None, self.image_size)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What an environment with the same arguments needs to go on exactly as this one would, bit for bit.
+
+        Tensors and plain Python values, as `torch.save` and `torch.load(weights_only=True)` take them.
+        """
+        return {"task": self.task, "worlds": [world.state_dict() for world in self.worlds]}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` returned; takes as long as making and resetting every world.
+
+        Raises:
+            ValueError: the state is of another task or of another number of worlds.
+        """
+        states = state_dict["worlds"]
+        if (state_dict["task"], len(states)) != (self.task, len(self.worlds)):
+            raise ValueError(
+                f"The saved state is of {len(states)} world(s) of {state_dict['task']}, this environment has "
+                f"{len(self.worlds)} of {self.task}: make it with the same task and num_envs."
+            )
+        self._free_worlds()
+        for row, state in enumerate(states):
+            world = self._make_world(state["seed"])
+            world.load_state_dict(state)
+            self.worlds.append(world)
+            self._observations[row] = torch.from_numpy(world.observe())
+
+    def _free_worlds(self) -> None:
+        for world in self.worlds:
+            world.close()
+        self.worlds = []
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free rendering contexts."""
+        if not self.is_closed:
+            self._free_worlds()
+        super().close(raise_if_closed=raise_if_closed)
+
+
+class SuiteWorld:
+    """One task of the suite with its camera, and what it takes to bring it back to where it is.
+
+    Args:
+        task: a name of `TASKS`.
+        seed: of the task's model and episodes.
+        camera: number or name of the camera; None for no images.
+        image_size: width and height of the images.
+
+    Attributes:
+        action_size: A.
+        vector_size: V.
+        terminated: whether the last step ended the episode with discount 0.
+        truncated: whether it ended the episode at the time limit.
+
+    Raises:
+        ValueError: unknown camera.
+        RendererUnavailableError: dm_control has no OpenGL that works here.
+    """
+
+    def __init__(self, task: str, seed: int, camera: int | str | None, image_size: int) -> None:
+        self.seed = seed
+        self.env: control.Environment = suite.load(*TASKS[task], task_kwargs={"random": seed})
+        self.terminated = self.truncated = False
+        self._episode_start = self._random_state()
+        self._begun = False
+        action = self.env.action_spec()
+        self.action_size = action.shape[0]
+        self.vector_size = sum(math.prod(spec.shape) for spec in self.env.observation_spec().values())
+        limited = np.maximum(abs(action.minimum), abs(action.maximum)) < mujoco_bindings.mjMAXVAL
+        # an actuator without limits takes the action as it is
+        self._low, self._high = np.where(limited, action.minimum, -1.0), np.where(limited, action.maximum, 1.0)
+        self._camera = None if camera is None else self._make_camera(task, camera, image_size)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.terminated or self.truncated
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._episode_start = self._random_state()
+        self.env.reset()
+        self._begun, self.terminated, self.truncated = True, False, False
+
+    def step(self, action: np.ndarray, repeat: int) -> float:
+        """Take an action (A,) for some simulator steps, fewer if the episode ends; return the sum of their rewards.
+
+        Raises:
+            RuntimeError: no episode has begun.
+            PhysicsError: the simulation diverged.
+        """
+        if not self._begun:
+            raise RuntimeError("Step before the first reset: call reset() to begin an episode.")
+        control_input = self._low + (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
+        reward = 0.0
+        for _ in range(repeat):
+            time_step = self.env.step(control_input)
+            reward += time_step.reward
+            if time_step.last():
+                self.terminated = time_step.discount == 0.0
+                self.truncated = not self.terminated
+                break
+        return reward
+
+    def observe(self) -> np.ndarray:
+        """The image uint8 (height, width, 3), or without a camera all observations in a row, float32 (V,)."""
+        if self._camera is not None:
+            return np.ascontiguousarray(self._camera.render())
+        values = self.env.task.get_observation(self.env.physics).values()
+        return np.concatenate([np.ravel(value) for value in values]).astype(np.float32)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Seed, random states at the episode's start and now, physics state, step count, ends."""
+        physics = self.env.physics
+        return {
+            "seed": self.seed,
+            "begun": self._begun,
+            "terminated": self.terminated,
+            "truncated": self.truncated,
+            "episode_start": self._episode_start,
+            "random": self._random_state(),
+            "step_count": self.env._step_count,
+            "physics": torch.from_numpy(physics.get_state(PHYSICS_STATE)),
+            "sensors": torch.from_numpy(physics.data.sensordata.copy()),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Bring a new world of the same seed to a saved state.
+
+        Tasks write into the model when an episode begins (targets, terrain): the episode is begun again from the same
+        random numbers, then moved to where it was.
+        """
+        if not state["begun"]:
+            return
+        self._set_random_state(state["episode_start"])
+        self.reset()
+        physics = self.env.physics
+        physics.set_state(state["physics"].numpy(), PHYSICS_STATE)
+        mujoco_bindings.mj_step1(physics.model.ptr, physics.data.ptr)  # what follows from positions and velocities
+        physics.data.sensordata[:] = state["sensors"].numpy()  # those of forces follow from the step before
+        self._set_random_state(state["random"])
+        self.terminated, self.truncated = state["terminated"], state["truncated"]
+        self.env._step_count, self.env._reset_next_step = state["step_count"], self.ended
+
+    def close(self) -> None:
+        """Free the rendering context."""
+        if self._camera is not None:
+            self._camera.scene.free()
+            self._camera = None
+        self.env.physics.free()
+
+    def _make_camera(self, task: str, camera: int | str, image_size: int) -> mujoco.Camera:
+        model = self.env.physics.model
+        names = [model.id2name(number, "camera") for number in range(model.ncam)]
+        if camera not in names and camera not in range(model.ncam):
+            raise ValueError(f"camera={camera!r}: {task} has the cameras 0 to {model.ncam - 1}, {', '.join(names)}.")
+        view = model.vis.global_
+        view.offwidth = view.offheight = image_size  # the same image as from a larger buffer, sooner
+        for name, per_pixel in DETAIL.items():
+            enough = int(per_pixel * max(image_size, 64))
+            setattr(model.vis.quality, name, min(enough, getattr(model.vis.quality, name)))
+        try:
+            return mujoco.Camera(self.env.physics, image_size, image_size, camera)
+        except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
+            raise RendererUnavailableError(
+                f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
+                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "
+                "libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before "
+                "dreamer_racing, MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. Without images: "
+                "from_pixels=False."
+            ) from error
+
+    def _random_state(self) -> dict[str, Any]:
+        state = self.env.task.random.get_state(legacy=False)
+        twister = state["state"]
+        return {**state, "state": {**twister, "key": torch.from_numpy(twister["key"].astype(np.int64))}}
+
+    def _set_random_state(self, state: Mapping[str, Any]) -> None:
+        twister = state["state"]
+        key = twister["key"].numpy().astype(np.uint32)
+        self.env.task.random.set_state({**state, "state": {**twister, "key": key}})
+
+
+def _check_arguments(task: str, num_envs: int, action_repeat: int) -> None:
+    if task not in TASKS:
+        close = difflib.get_close_matches(task, TASKS, n=3)
+        hint = f"did you mean {' or '.join(close)}? " if close else ""
+        raise ValueError(f"Unknown task {task!r}: {hint}The tasks are {', '.join(TASKS)}.")
+    if num_envs < 1:
+        raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
+    if not isinstance(action_repeat, int) or action_repeat < 1:
+        raise ValueError(f"action_repeat={action_repeat!r}: a whole number of simulator steps, 1 or more.")

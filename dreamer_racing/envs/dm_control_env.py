@@ -1,0 +1,367 @@
+"""The race as a dm_control task: `load("kidney")` is a `control.Environment` like those of the Control Suite.
+
+Physics, rules, rewards and start poses are those of the batched environments, for one drone. Observations:
+
+| name | shape | meaning |
+|---|---|---|
+| `position` | (3,) | m, world |
+| `attitude` | (4,) | quaternion wxyz, body → world |
+| `linear_velocity` | (3,) | m/s, world |
+| `body_rates` | (3,) | rad/s, body frame |
+| `target_gate` | (1,) int64 | the gate to pass next |
+| `pixels` | (height, width, 3) uint8 | nose camera, 64 × 64 by default, only with `from_pixels=True` |
+
+A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A broken
+physics state or an action that is not finite is a crash too, never an exception.
+
+Shapes: P physics steps per control step. SI units.
+"""
+
+import collections
+import ctypes
+import os
+import sys
+from typing import Any
+
+import mujoco as mujoco_bindings
+import numpy as np
+import torch
+from dm_env import specs
+from torch import Tensor
+
+from dreamer_racing.envs.drone.quadrotor import Quadrotor, QuadrotorParameters, at_control_rate, load_preset
+from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
+from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.envs.simulator.rendering import GL_LIBRARIES, RendererUnavailableError
+from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.worlds import ACTION_SIZE
+
+
+def _choose_gl_backend() -> None:
+    """Without a display, point dm_control to a headless OpenGL library before it settles for a windowing one.
+
+    dm_control decides when it is imported, and takes GLFW even where GLFW cannot open a window. A `MUJOCO_GL` that
+    is set already is left alone.
+    """
+    if "MUJOCO_GL" in os.environ or not sys.platform.startswith("linux"):
+        return
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    usable = (name for name, libraries in GL_LIBRARIES.items() if any(_loads(library) for library in libraries))
+    os.environ["MUJOCO_GL"] = next(usable, "disable")
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
+
+from dm_control import _render, mujoco  # noqa: E402
+from dm_control.mujoco import wrapper  # noqa: E402
+from dm_control.rl import control  # noqa: E402
+from dm_control.suite import base  # noqa: E402
+
+FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
+
+
+def load(
+    track: str | Track = "kidney",
+    preset: str | QuadrotorParameters = "easy",
+    *,
+    random: int | np.random.RandomState | None = None,
+    time_limit: float | None = None,
+    evaluation: bool = False,
+    from_pixels: bool = False,
+    camera: Camera | None = None,
+    weights: RewardWeights | None = None,
+    control_rate: float | None = None,
+    environment_kwargs: dict[str, Any] | None = None,
+) -> control.Environment:
+    """Make the race of one drone as a dm_control environment.
+
+    Args:
+        track: name of a built-in track, path to a YAML file, or a `Track`.
+        preset: physics preset (`easy`, `faithful`) or parameters.
+        random: seed or state of start poses and physics randomisation; None for a random seed.
+        time_limit: duration after which an episode is truncated, s; if None 20, in evaluation 30.
+        evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.
+        from_pixels: whether there is an observation `pixels`; needs OpenGL (EGL, OSMesa or a display).
+        camera: the nose camera.
+        weights: of the reward, paper Eq. 1.
+        control_rate: actions a second, Hz; if None the preset's, 50.
+        environment_kwargs: further arguments of `control.Environment`, e.g. `flat_observation`.
+
+    Raises:
+        ValueError: bad argument; the message says which and what is allowed.
+        TrackError: unknown or broken track.
+
+    Example:
+        >>> env = load("circle", random=0)
+        >>> time_step = env.reset()
+        >>> env.step(env.action_spec().generate_value()).discount
+        1.0
+    """
+    track, parameters = load_track(track), load_preset(preset)
+    if control_rate is not None:
+        parameters = at_control_rate(parameters, control_rate)
+    if time_limit is None:
+        time_limit = EVALUATION_TIME if evaluation else EPISODE_TIME
+    episode_steps = round(time_limit / parameters.control_dt)
+    if episode_steps < 1:
+        raise ValueError(
+            f"time_limit={time_limit} s: at least one control step of {parameters.control_dt} s is needed."
+        )
+    camera = camera or Camera()
+    generator = torch.Generator()
+    physics = make_physics(track, parameters, camera, generator)
+    task = DroneRace(
+        track,
+        parameters,
+        generator,
+        random=random,
+        episode_steps=episode_steps,
+        evaluation=evaluation,
+        camera=camera if from_pixels else None,
+        weights=weights,
+    )
+    # no time_limit here: control.Environment would give a crash in the last step the discount of a truncation
+    return control.Environment(physics, task, control_timestep=parameters.control_dt, **(environment_kwargs or {}))
+
+
+def make_physics(
+    track: Track,
+    parameters: QuadrotorParameters,
+    camera: Camera | None = None,
+    generator: torch.Generator | None = None,
+) -> "Physics":
+    """Compile the scene of a track for one drone, whose physics randomisation is drawn from the generator.
+
+    A second camera, `spectator`, stands in a corner of the hall and follows the drone with its gaze.
+    """
+    spec = build_scene(track, parameters, camera)
+    spec.worldbody.add_camera(
+        name="spectator",
+        pos=(track.bounds_low[0] + 0.3, track.bounds_low[1] + 0.3, track.bounds_high[2] - 0.3),
+        mode=mujoco_bindings.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM,
+        targetbody="drone",
+        fovy=45.0,
+    )
+    view = spec.visual.global_
+    view.offwidth, view.offheight = max(FRAMEBUFFER[0], view.offwidth), max(FRAMEBUFFER[1], view.offheight)
+    model = spec.compile()
+    # a broken state must be seen and ended by the race, not hidden by an automatic reset
+    model.opt.disableflags |= mujoco_bindings.mjtDisableBit.mjDSBL_AUTORESET
+    quadrotor = Quadrotor(parameters, num_drones=1, generator=generator)
+    return Physics(wrapper.MjData(wrapper.MjModel(model)), quadrotor)
+
+
+class Physics(mujoco.Physics):
+    """One drone in its hall.
+
+    Its flight controller and motors run in every physics step. What they remember (rotor speeds, commands under way)
+    lives in `quadrotor`, outside MuJoCo's own state: `get_state`, `copy` and pickling do not carry it.
+
+    Args:
+        data: the simulation of a scene of `build_scene`.
+        quadrotor: the drone's flight controller and motors, N = 1.
+    """
+
+    def __init__(self, data: wrapper.MjData, quadrotor: Quadrotor) -> None:
+        super().__init__(data)
+        self.quadrotor = quadrotor
+        arrays = (data.qpos, data.qvel, data.qfrc_applied)
+        qpos, qvel, force = (torch.from_numpy(array).unsqueeze(0) for array in arrays)
+        self._flight = FusedFlight(quadrotor, qpos, qvel, force, self._integrate)
+        self._start_path()
+
+    def position(self) -> np.ndarray:
+        """Position (3,) in the world, m."""
+        return self.data.qpos[:3].copy()
+
+    def attitude(self) -> np.ndarray:
+        """Attitude (4,), quaternion wxyz, body → world."""
+        return self.data.qpos[3:7].copy()
+
+    def linear_velocity(self) -> np.ndarray:
+        """Velocity (3,) in the world, m/s."""
+        return self.data.qvel[:3].copy()
+
+    def body_rates(self) -> np.ndarray:
+        """Angular velocity (3,) in the body frame, rad/s."""
+        return self.data.qvel[3:6].copy()
+
+    def path(self) -> Tensor:
+        """Positions (P + 1, 1, 3) at the start of the control step and after each of its physics steps, m."""
+        return torch.from_numpy(np.stack(self._path)).unsqueeze(1)
+
+    def place(self, position: np.ndarray, attitude: np.ndarray, linear_velocity: np.ndarray) -> None:
+        """Put the drone there, (3,), (4,) and (3,), not rotating, with its rotors at hover and new parameters."""
+        self.data.qpos[:3], self.data.qpos[3:7] = position, attitude
+        self.data.qvel[:3], self.data.qvel[3:6] = linear_velocity, 0.0
+        self.quadrotor.reset(torch.ones(1, dtype=torch.bool))
+        self._start_path()
+
+    def command(self, action: np.ndarray) -> None:
+        """Take the finite action (4,) in [-1, 1] of the coming control step: collective thrust and body rates."""
+        self.quadrotor.command(torch.from_numpy(action).unsqueeze(0))
+        self._start_path()
+
+    def step(self, nstep: int = 1) -> None:
+        """Fly this many physics steps of the present command; a state that breaks is for the race to see."""
+        for _ in range(nstep):
+            self._flight.step(self._physics_step)
+            self._physics_step += 1
+            self._path.append(self.position())
+        # cameras and sensors of the new state: mj_step leaves those of the old one
+        mujoco_bindings.mj_step1(self.model.ptr, self.data.ptr)
+
+    def _integrate(self) -> None:
+        mujoco_bindings.mj_step(self.model.ptr, self.data.ptr)
+
+    def _start_path(self) -> None:
+        self._physics_step = 0  # within the control step
+        steps = self.quadrotor.parameters.physics_steps
+        self._path = collections.deque((self.position(),), maxlen=steps + 1)
+
+
+class NoseCamera:
+    """The drone's own view, drawn by dm_control's renderer, the drone itself hidden.
+
+    Args:
+        physics: the drone and its hall.
+        camera: the nose camera with which the hall was built.
+
+    Raises:
+        RendererUnavailableError: dm_control has no OpenGL that works here.
+    """
+
+    def __init__(self, physics: Physics, camera: Camera) -> None:
+        try:
+            self._camera = mujoco.Camera(physics, camera.height, camera.width, CAMERA_NAME)
+        except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
+            raise RendererUnavailableError(
+                f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
+                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "
+                "libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before "
+                "dreamer_racing, MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. DroneRacingEnv and the "
+                "Gymnasium environments can draw without OpenGL."
+            ) from error
+        self._camera.option.geomgroup[:] = 0
+        self._camera.option.geomgroup[HALL_GROUP] = 1
+        self._camera.option.sitegroup[:] = 0
+
+    def image(self) -> np.ndarray:
+        """What the drone sees now, uint8 (height, width, 3)."""
+        return np.array(self._camera.render())
+
+
+class DroneRace(base.Task):
+    """One drone racing: the rules of `Race` and the reward of Eq. 1, suite style.
+
+    Every episode's draws come from a torch generator that is seeded with one number from `task.random`.
+
+    Args:
+        track: the track.
+        parameters: the drone.
+        generator: the source of physics randomisation that `Physics` draws from; its own if None.
+        random: seed or `numpy.random.RandomState`.
+        episode_steps: control steps after which an episode is truncated; None for those of 20 s.
+        evaluation: start at the start pose, at rest, and finish after the track's laps.
+        camera: the nose camera; None for no `pixels`.
+        weights: of the reward, paper Eq. 1.
+
+    Attributes:
+        body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on.
+        outcome: what the last control step did, None before the first.
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        parameters: QuadrotorParameters,
+        generator: torch.Generator | None = None,
+        *,
+        random: int | np.random.RandomState | None = None,
+        episode_steps: int | None = None,
+        evaluation: bool = False,
+        camera: Camera | None = None,
+        weights: RewardWeights | None = None,
+    ) -> None:
+        super().__init__(random=random)
+        self.track = track
+        self.evaluation = evaluation
+        laps = track.laps if evaluation else None
+        self.race = Race(track, 1, weights, episode_steps, laps, parameters.control_dt)
+        self.body_rate_weight = self.race.weights.body_rate
+        self.outcome: RaceStep | None = None
+        self._generator = generator or torch.Generator()
+        self._starts = StartSampler(track, self._generator, dtype=torch.float64)
+        self._invalid_action = False
+        self._camera = camera
+        self._view: NoseCamera | None = None
+
+    def action_spec(self, physics: Physics) -> specs.BoundedArray:
+        """Collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
+        return specs.BoundedArray((ACTION_SIZE,), np.float32, -1.0, 1.0, name="action")
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Begin an episode; base.Task's method would only paint the reward, which is not for an episode's start."""
+        self._generator.manual_seed(int(self.random.randint(2**31)))
+        start = self._starts.sample(1, self.evaluation)
+        physics.place(start.position[0].numpy(), start.attitude[0].numpy(), start.linear_velocity[0].numpy())
+        self.race.begin(torch.ones(1, dtype=torch.bool), start.position, start.target_gate)
+        self.outcome = None
+
+    def before_step(self, action: np.ndarray, physics: Physics) -> None:
+        """Give the action (4,) to the flight controller; what lies beyond [-1, 1] is clipped.
+
+        Raises:
+            ValueError: wrong shape.
+        """
+        action = np.asarray(action, np.float64)
+        if action.shape != (ACTION_SIZE,):
+            raise ValueError(
+                f"Action of shape {action.shape}: this environment takes one of shape ({ACTION_SIZE},): collective "
+                "thrust and body rates x, y, z, each in [-1, 1]."
+            )
+        self._invalid_action = not np.isfinite(action).all()
+        physics.command(np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0))
+
+    def after_step(self, physics: Physics) -> None:
+        """Judge the control step."""
+        body_rates = torch.from_numpy(physics.body_rates()).unsqueeze(0)
+        self.outcome = self.race.step(physics.path(), body_rates, torch.tensor([self._invalid_action]))
+
+    def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
+        """Return the observations of the module's table."""
+        observation = collections.OrderedDict(
+            position=physics.position(),
+            attitude=physics.attitude(),
+            linear_velocity=physics.linear_velocity(),
+            body_rates=physics.body_rates(),
+            target_gate=self.race.target_gate.numpy().copy(),
+        )
+        if self._camera is not None:
+            self._view = self._view or NoseCamera(physics, self._camera)
+            observation["pixels"] = self._view.image()
+        return observation
+
+    def get_reward(self, physics: Physics) -> float:
+        """Eq. 1 with today's b₂."""
+        assert self.outcome is not None, "there is no reward before the first step"
+        return (self.outcome.reward_base - self.body_rate_weight * self.outcome.body_rate_norm).item()
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """Discount of the episode's end: 0 after a crash, 1 out of time or finished; None while it goes on."""
+        assert self.outcome is not None, "there is no end before the first step"
+        if self.outcome.terminated.item():
+            return 0.0
+        return 1.0 if self.outcome.truncated.item() else None

@@ -1,0 +1,1 @@
+"""The vehicle: its parameters, rotations, and one step of its motion."""

@@ -1,0 +1,367 @@
+"""The quadrotor: from collective thrust and body rates (CTBR) to the wrench on the body, for N drones at once.
+
+A `Quadrotor` holds what the flight controller and the motors remember between physics steps (rotor speeds, delayed
+commands) and each drone's randomised parameters, in tensors that stay in place, so that a CUDA graph can advance them.
+The rigid body itself is integrated by MuJoCo: once per physics step the simulator asks `Quadrotor.wrench` for the
+body-frame force and torque and applies it.
+
+Shapes: N drones. SI units, body frame FLU. Sources of numbers: [paper] Romero et al., "Dream to Fly"; [rpg] public code
+of the same laboratory; [choice] this project's, because nobody published it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.rotation import rotate_inverse
+
+GRAVITY = 9.81  # m/s²
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Half-widths of the uniform, per-episode randomisation of each drone, relative unless a unit is given [rpg]."""
+
+    mass: float = 0.05
+    inertia: float = 0.10  # each axis on its own
+    drag: float = 0.10
+    thrust: float = 0.10  # all four rotors together: battery voltage
+    torque: float = 0.01
+    delay_max: float = 0.040  # s; the command delay is uniform in [0, delay_max]
+
+
+@dataclass(frozen=True)
+class QuadrotorParameters:
+    """Physical and control parameters of the drone, in SI units.
+
+    Example:
+        >>> QuadrotorParameters().hover_action
+        -0.26407
+    """
+
+    mass: float = 0.6  # kg [paper]
+    inertia: tuple[float, float, float] = (0.002410, 0.001800, 0.003759)  # kg m², principal axes = body axes [paper]
+    arm_length: float = 0.14  # m, centre to rotor [paper]; X layout [choice]
+    torque_constant: float = 0.022  # m: N m of yaw torque per N of rotor thrust [paper]
+    rotor_thrust_max: float = 4.0  # N, thrust-to-weight ratio 2.72 [paper]
+    motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/(m/s), linear rotor drag in the body frame
+    body_rate_max: tuple[float, float, float] = (10.0, 10.0, 4.0)  # rad/s at action ±1 [rpg]
+    collective_thrust_scale: float = 13.33  # m/s²: c = scale · (1 + a) [rpg]
+    rate_gain: float = 15.0  # 1/s, proportional body-rate loop [choice]
+    command_delay: float = 0.0  # s
+    physics_dt: float = 0.002  # s [rpg]
+    control_dt: float = 0.02  # s, 50 Hz [rpg]
+    integrator: str = "Euler"  # MuJoCo's name of it
+    randomisation: Randomisation | None = None
+
+    def __post_init__(self) -> None:
+        steps = self.control_dt / self.physics_dt
+        if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+            raise ValueError(
+                f"QuadrotorParameters: control_dt={self.control_dt} s must be a whole multiple of "
+                f"physics_dt={self.physics_dt} s (e.g. 0.02 and 0.002)."
+            )
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.control_dt / self.physics_dt)
+
+    @property
+    def hover_action(self) -> float:
+        """Collective-thrust action that holds altitude when level."""
+        return round(GRAVITY / self.collective_thrust_scale - 1.0, 5)
+
+    @property
+    def rotor_positions(self) -> tuple[tuple[float, float], ...]:
+        """(x, y) of the rotors in m: rear right, front right, rear left, front left (Betaflight's order)."""
+        d = self.arm_length / math.sqrt(2.0)
+        return ((-d, -d), (d, -d), (-d, d), (d, d))
+
+
+ROTOR_SPINS = (1.0, -1.0, -1.0, 1.0)  # sign of the yaw torque on the body of each rotor (Betaflight's "props in")
+
+PRESETS: dict[str, QuadrotorParameters] = {
+    "easy": QuadrotorParameters(),
+    "faithful": QuadrotorParameters(
+        drag=(0.26, 0.28, 0.42),  # [rpg]
+        command_delay=0.020,  # [rpg]
+        physics_dt=0.001,  # [rpg]
+        integrator="RK4",  # [rpg]
+        randomisation=Randomisation(),
+    ),
+}
+
+
+def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
+    """Return the parameters of a named preset (`easy`, `faithful`), or the given parameters themselves.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if isinstance(preset, QuadrotorParameters):
+        return preset
+    if preset not in PRESETS:
+        raise ValueError(f"Unknown physics preset {preset!r}: the presets are {', '.join(sorted(PRESETS))}.")
+    return PRESETS[preset]
+
+
+MIN_CONTROL_RATE = 10.0
+"""Hz: the lowest rate of actions; at 18 m/s a drone flies 1.8 m in a step then [choice]."""
+
+
+def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
+    """The same drone with so many actions a second.
+
+    Args:
+        parameters: of the drone.
+        rate: Hz, at least ``MIN_CONTROL_RATE``; a control step must be a whole number of physics steps.
+
+    Raises:
+        ValueError: it is not, or the rate is lower.
+    """
+    if not rate >= MIN_CONTROL_RATE:
+        raise ValueError(
+            f"control_rate={rate} Hz: at least {MIN_CONTROL_RATE:g}, because a control step can pass one gate only."
+        )
+    steps = round(1.0 / (rate * parameters.physics_dt))
+    if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:
+        raise ValueError(
+            f"control_rate={rate} Hz: a control step must be a whole number of physics steps of "
+            f"{parameters.physics_dt * 1e3:g} ms, for example 50 or 25 Hz."
+        )
+    return replace(parameters, control_dt=steps * parameters.physics_dt)
+
+
+def without_randomisation(parameters: QuadrotorParameters) -> QuadrotorParameters:
+    """The same drone with nominal parameters in every episode (drag and delay stay)."""
+    return replace(parameters, randomisation=None)
+
+
+RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # what is randomised as a factor of the nominal value
+
+
+@dataclass
+class _Drones:
+    """Per-drone parameters relative to nominal (N, ·); only kept when they are randomised."""
+
+    mass: Tensor  # (N, 1)
+    inertia: Tensor  # (N, 3)
+    drag: Tensor  # (N, 1)
+    thrust: Tensor  # (N, 1)
+    torque: Tensor  # (N, 1)
+    delay_steps: Tensor  # (N,) int64, physics steps
+
+
+class Quadrotor:
+    """N drones' flight controllers and motors.
+
+    Args:
+        parameters: the drone.
+        num_drones: N.
+        device: where the tensors live.
+        dtype: floating-point type; MuJoCo's own (float64) on CPU.
+        generator: source of the per-episode randomisation, on `device`; needed only if parameters are randomised.
+
+    Example:
+        >>> quadrotor = Quadrotor(QuadrotorParameters(), num_drones=2)
+        >>> quadrotor.command(torch.zeros(2, 4))
+        >>> attitude = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2, dtype=torch.float64)
+        >>> still = torch.zeros(2, 3, dtype=torch.float64)
+        >>> quadrotor.wrench(0, attitude, still, still).shape
+        torch.Size([2, 6])
+    """
+
+    def __init__(
+        self,
+        parameters: QuadrotorParameters,
+        num_drones: int,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float64,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.parameters = p = parameters
+        self.num_drones = num_drones
+        self._generator = generator
+        self._device, self._dtype = torch.device(device), dtype
+
+        def tensor(values: object) -> Tensor:
+            return torch.tensor(values, device=device, dtype=dtype)
+
+        self._inertia = tensor(p.inertia)  # (3,)
+        self._rate_gain = self._inertia * p.rate_gain  # (3,)
+        self._drag = tensor(p.drag)  # (3,)
+        self._has_drag = any(p.drag)
+        # a = -1 … 1 → (total thrust N, body rates rad/s), affine
+        thrust_scale = p.collective_thrust_scale * p.mass
+        self._setpoint_scale = tensor((thrust_scale, *p.body_rate_max))  # (4,)
+        self._setpoint_offset = tensor((thrust_scale, 0.0, 0.0, 0.0))  # (4,)
+        # rotor thrusts (N, 4) @ effectiveness (4, 6) = wrench (fx fy fz tx ty tz)
+        rows = zip(p.rotor_positions, ROTOR_SPINS, strict=True)
+        self._effectiveness = tensor([[0, 0, 1, y, -x, s * p.torque_constant] for (x, y), s in rows])  # (4, 6)
+        # (thrust tx ty tz) (N, 4) @ (4, 4) = rotor thrusts; the first row is a quarter each
+        self.allocation = torch.linalg.inv(self._effectiveness[:, 2:])[1:]  # (3, 4): rotor thrusts of torque x, y, z
+        self._roll_pitch_to_rotors, self._yaw_to_rotors = self.allocation[:2], self.allocation[2:]
+        self._torque_effectiveness = self._effectiveness[:, 3:].contiguous()  # (4, 3)
+        self.motor_decay = math.exp(-p.physics_dt / p.motor_time_constant)
+        self._motor_decay_half = math.sqrt(self.motor_decay)
+        self._half_step_per_inertia = 0.5 * p.physics_dt / self._inertia  # (3,)
+
+        hover_speed = math.sqrt(p.mass * GRAVITY / 4.0)
+        self._hover_speed = hover_speed
+        self.rotor_speed = torch.full((num_drones, 4), hover_speed, device=device, dtype=dtype)  # √N: thrust = speed²
+        delay_max = p.randomisation.delay_max if p.randomisation else p.command_delay
+        self._nominal_delay_steps = round(p.command_delay / p.physics_dt)
+        history = math.ceil(round(delay_max / p.physics_dt) / p.physics_steps)
+        self._hover_setpoint = tensor((p.mass * GRAVITY, 0.0, 0.0, 0.0))
+        self.setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
+        self._drones = self._nominal_drones() if p.randomisation or history else None
+        self._everyone = torch.arange(num_drones, device=device)
+
+    def _nominal_drones(self) -> _Drones:
+        one = torch.ones(self.num_drones, 1, device=self._device, dtype=self._dtype)
+        delay = torch.full((self.num_drones,), self._nominal_delay_steps, device=self._device)
+        return _Drones(one, one.repeat(1, 3), one.clone(), one.clone(), one.clone(), delay)
+
+    def own_parameters(self) -> tuple[Tensor, ...]:
+        """Each drone's own parameters, in tensors that stay in place.
+
+        Returns:
+            Mass (N, 1), inertia (N, 3), drag, thrust and torque (N, 1) relative to nominal, and the command's delay
+            (N,), int64 physics steps.
+        """
+        drones = self._drones or self._nominal_drones()
+        return tuple(getattr(drones, field.name) for field in fields(_Drones))
+
+    def reset(self, mask: Tensor) -> None:
+        """Spin the rotors of the masked drones (N,) bool at hover, forget their commands, draw their parameters."""
+        rows = mask.unsqueeze(-1)  # (N, 1)
+        self.rotor_speed.masked_fill_(rows, self._hover_speed)
+        self.setpoints.copy_(torch.where(rows, self._hover_setpoint, self.setpoints))
+        if self.parameters.randomisation is not None:
+            self._randomise(rows, self.parameters.randomisation)
+
+    def _randomise(self, rows: Tensor, widths: Randomisation) -> None:
+        drones = self._drones
+        assert drones is not None
+        for name in RELATIVE:
+            current = getattr(drones, name)
+            noise = 2.0 * self._uniform(*current.shape) - 1.0
+            current.copy_(torch.where(rows, 1.0 + getattr(widths, name) * noise, current))
+        delay = (self._uniform(self.num_drones) * widths.delay_max / self.parameters.physics_dt).round().long()
+        drones.delay_steps.copy_(torch.where(rows[:, 0], delay, drones.delay_steps))
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what controllers and motors remember, and each drone's parameters."""
+        drones = (
+            None
+            if self._drones is None
+            else {field.name: getattr(self._drones, field.name).clone() for field in fields(_Drones)}
+        )
+        return {"rotor_speed": self.rotor_speed.clone(), "setpoints": self.setpoints.clone(), "drones": drones}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.rotor_speed.copy_(state_dict["rotor_speed"])
+        self.setpoints.copy_(state_dict["setpoints"])
+        if self._drones is not None:
+            for name, value in state_dict["drones"].items():
+                getattr(self._drones, name).copy_(value)
+
+    def command(self, action: Tensor) -> None:
+        """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
+        action = action.to(self._device, self._dtype).clamp(-1.0, 1.0)
+        setpoint = torch.addcmul(self._setpoint_offset, action, self._setpoint_scale)
+        self.setpoints.copy_(torch.cat((setpoint.unsqueeze(0), self.setpoints[:-1])))
+
+    def _setpoint(self, physics_step: int) -> Tensor:
+        """The setpoint (N, 4) that has arrived by this physics step of the control step."""
+        if self._drones is None:
+            return self.setpoints[0]
+        late = self._drones.delay_steps - physics_step  # (N,) physics steps still to wait for the newest command
+        age = torch.div(late + self.parameters.physics_steps - 1, self.parameters.physics_steps, rounding_mode="floor")
+        return self.setpoints[age.clamp(0, len(self.setpoints) - 1), self._everyone]
+
+    def wrench(self, physics_step: int, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor) -> Tensor:
+        """Advance controller and motors by one physics step and return the wrench on the body in its middle.
+
+        The controller acts on the body rates half a step ahead, and the motors' speed is that of the middle of the
+        step: like this the step's length has an effect of second order only.
+
+        Args:
+            physics_step: index within the control step, 0 … physics_steps − 1.
+            attitude: (N, 4) wxyz.
+            linear_velocity: (N, 3) m/s, world frame.
+            body_rates: (N, 3) rad/s, body frame.
+
+        Returns:
+            (N, 6) force in N and torque in N m, body frame, that give a body of *nominal* mass and inertia the
+            acceleration of this drone's own, so that all worlds can share one MuJoCo model.
+        """
+        setpoint = self._setpoint(physics_step)
+        gyroscopic = self.gyroscopic_torque(body_rates)
+        present_torque = _product(self.rotor_speed.square(), self._torque_effectiveness)
+        rates = self.rates_half_a_step_later(body_rates, present_torque, gyroscopic)
+        torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
+        target_speed = self.mix(setpoint[:, :1], torque).sqrt()
+        middle_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay_half)
+        self.rotor_speed.copy_(torch.lerp(target_speed, self.rotor_speed, self.motor_decay))
+        wrench = _product(middle_speed.square(), self._effectiveness)
+        if self._has_drag or self._drones is not None:
+            wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
+        return wrench
+
+    def gyroscopic_torque(self, body_rates: Tensor) -> Tensor:
+        """ω × Jω of the nominal body (N, 3), N m, at body rates (N, 3), rad/s."""
+        return torch.linalg.cross(body_rates, self._inertia * body_rates)
+
+    def rates_half_a_step_later(self, body_rates: Tensor, torque: Tensor, gyroscopic: Tensor) -> Tensor:
+        """Body rates (N, 3) in rad/s after half a physics step under a torque (N, 3), given ω × Jω (N, 3), N m."""
+        return torch.addcmul(body_rates, torque - gyroscopic, self._half_step_per_inertia)
+
+    def mix(self, thrust: Tensor, torque: Tensor) -> Tensor:
+        """Distribute total thrust (N, 1) in N and torque (N, 3) in N m to rotor thrusts (N, 4) within their limits.
+
+        Where the four limits cannot give all, yaw torque is given up first, then total thrust, roll and pitch last
+        (and those together, keeping their direction) [choice].
+        """
+        limit = self.parameters.rotor_thrust_max
+        roll_pitch = _product(torque[:, :2], self._roll_pitch_to_rotors)  # (N, 4), zero mean
+        low, high = roll_pitch.aminmax(dim=1, keepdim=True)
+        scale = (limit / (high - low)).clamp(max=1.0)  # x / 0 = inf → 1
+        each = torch.minimum(torch.maximum(0.25 * thrust, -scale * low), limit - scale * high)
+        base = torch.addcmul(each, scale, roll_pitch)
+        yaw = torque[:, 2:] * self._yaw_to_rotors
+        room = torch.where(yaw > 0.0, limit - base, base).clamp(min=0.0)
+        share = (room / yaw.abs().clamp(min=1e-12)).amin(dim=1, keepdim=True).clamp(max=1.0)
+        return torch.addcmul(base, share, yaw).clamp(0.0, limit)
+
+    def _perturb(
+        self, wrench: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, gyroscopic: Tensor
+    ) -> Tensor:
+        """Add drag, and map the wrench of drones with their own parameters to the nominal body's."""
+        force, torque = wrench[:, :3], wrench[:, 3:]
+        drag = self._drag * rotate_inverse(attitude, linear_velocity)
+        drones = self._drones
+        if drones is None or self.parameters.randomisation is None:
+            return torch.cat((force - drag, torque), dim=1)
+        force = (drones.thrust * force - drones.drag * drag) / drones.mass
+        torque = drones.thrust * torque
+        torque = torch.cat((torque[:, :2], drones.torque * torque[:, 2:]), dim=1)
+        own_gyroscopic = torch.linalg.cross(body_rates, drones.inertia * self._inertia * body_rates)
+        # J₀ J⁻¹ (τ − ω × Jω) + ω × J₀ω: Euler's equation of the own body, written for the nominal one
+        torque = (torque - own_gyroscopic) / drones.inertia + gyroscopic
+        return torch.cat((force, torque), dim=1)
+
+
+def _product(values: Tensor, matrix: Tensor) -> Tensor:
+    """Multiply (N, K) by (K, M) in full precision, which a matrix product on CUDA may lack (TF32)."""
+    return (values.unsqueeze(-1) * matrix).sum(1) if values.is_cuda else values @ matrix

@@ -1,0 +1,406 @@
+"""A scripted, state-based pilot that flies N drones along a planned racing line.
+
+`ScriptedPilot` finds where on the line (`envs.racing_line`) a drone is, and steers it with position and velocity
+feedback, acceleration and rate feedforward, and a prediction over the command delay. It is the reference for lap times,
+and a demonstrator: it also flies from the poses in which training episodes start.
+
+Shapes: N drones, K samples of the line. SI units, world z up, attitude wxyz, body frame FLU. All numbers are this
+project's choice.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse, turn
+from dreamer_racing.envs.race.race import EVALUATION_TIME, RaceStep
+from dreamer_racing.envs.race.racing_line import Dynamics, LineLimits, Reference, plan_racing_line
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.worlds import RaceWorlds
+
+
+@dataclass(frozen=True)
+class PilotGains:
+    """How the pilot corrects errors.
+
+    Args:
+        position: 1/s², acceleration per metre beside the line.
+        velocity: 1/s, acceleration per m/s across the line.
+        progress: 1/s, how fast the speed along the line returns to the line's own.
+        attitude: 1/s², angular acceleration per radian of thrust axis error.
+        body_rate: 1/s, angular acceleration per rad/s.
+        yaw: 1/s, yaw rate per radian.
+        correction_max: m/s², greatest acceleration in answer to errors beside the line.
+        progress_max: m/s², greatest acceleration in answer to errors of speed along the line.
+        look_ahead: s, the nose points to where the line is this much later.
+        adaptation: 1/s, how fast the estimate of the thrust's scale follows the measurement.
+    """
+
+    position: float = 14.0
+    velocity: float = 6.0
+    progress: float = 3.0
+    attitude: float = 120.0
+    body_rate: float = 17.0
+    yaw: float = 5.0
+    correction_max: float = 10.0
+    progress_max: float = 8.0
+    look_ahead: float = 0.5
+    adaptation: float = 1.0
+
+
+class ScriptedPilot:
+    """Flies N drones around a track from their states.
+
+    It keeps each drone's last command and an estimate of its thrust's scale. A drone that is suddenly somewhere else
+    has started a new episode, so that nobody needs to tell; `reset` tells it anyway.
+
+    Args:
+        track: name, path or `Track`.
+        parameters: preset or parameters of the drone; the pilot knows the nominal ones only.
+        limits: what the line may ask for; its `speed` is the knob of aggressiveness. None for the defaults.
+        gains: how errors are corrected.
+        device: where the states will be.
+        dtype: floating-point type of the states and actions.
+
+    Example:
+        >>> pilot = ScriptedPilot("circle")
+        >>> level, still = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.zeros(1, 3)
+        >>> pilot.act(torch.tensor([[4.0, -2.5, 1.35]]), level, still, still, torch.tensor([0])).shape
+        torch.Size([1, 4])
+    """
+
+    WINDOW = 0.25  # s: the line is searched from this much before the last gate to this much after the target gate
+    SEARCH_DT = 0.02  # s between the points of the search
+    JUMP = 0.3  # m beyond its own motion: the drone has been put elsewhere
+
+    def __init__(
+        self,
+        track: str | Track,
+        parameters: str | QuadrotorParameters = "easy",
+        limits: LineLimits | None = None,
+        gains: PilotGains | None = None,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.track, self.parameters = load_track(track), load_preset(parameters)
+        self.limits = limits or LineLimits()
+        self.gains = gains or PilotGains()
+        self._device, self._dtype = torch.device(device), dtype
+        nominal = without_randomisation(self.parameters)
+        self.line = plan_racing_line(self.track, nominal, self.limits).to(device, dtype)
+        self._dynamics = Dynamics(nominal)
+        self._rate_max = torch.tensor(nominal.body_rate_max, device=device, dtype=dtype)
+        self._latency = nominal.command_delay + nominal.control_dt / 2.0  # s, to the middle of the action's effect
+        self._make_search()
+        self._last_position: Tensor | None = None  # (N, 3)
+        self._last_velocity: Tensor  # (N, 3)
+        self._last_command: Tensor  # (N, 4) m/s² and rad/s
+        self._last_thrust: Tensor  # (N, 1) m/s², what the motors were asked for, with their lag
+        self._thrust_scale: Tensor  # (N, 1) real thrust over nominal
+
+    def _make_search(self) -> None:
+        """Tabulate where on the line the drones of each target gate may be: times and positions (G, W, ·)."""
+        line = self.line
+        end = line.gate_times + self.WINDOW
+        start = line.gate_times.roll(1) - self.WINDOW
+        start[0] -= line.lap_time
+        count = math.ceil(float((end - start).max()) / self.SEARCH_DT)
+        share = torch.linspace(0.0, 1.0, count, device=self._device, dtype=self._dtype)
+        self._search_times = torch.lerp(start.unsqueeze(-1), end.unsqueeze(-1), share)  # (G, W)
+        points = [line.at(times).position for times in self._search_times]
+        self._search_positions = torch.stack(points)  # (G, W, 3)
+
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Forget the masked drones (N,) bool; all if None."""
+        if mask is None:
+            self._last_position = None
+        elif self._last_position is not None:
+            self._last_position = torch.where(mask.unsqueeze(-1), math.nan, self._last_position)
+
+    @torch.no_grad()
+    def act(
+        self, position: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, target_gate: Tensor
+    ) -> Tensor:
+        """Choose the actions of the coming control step.
+
+        Args:
+            position: (N, 3) m.
+            attitude: (N, 4) wxyz.
+            linear_velocity: (N, 3) m/s, world frame.
+            body_rates: (N, 3) rad/s, body frame.
+            target_gate: (N,) int64.
+
+        Returns:
+            (N, 4) in [-1, 1]: collective thrust, body rates x, y, z.
+        """
+        inputs = (position, attitude, linear_velocity, body_rates)
+        state = [value.to(self._device, self._dtype) for value in inputs]
+        self._remember(*state)
+        position, attitude, velocity, body_rates = self._predict(*state)
+        time = self._find(position, target_gate.to(self._device))
+        reference = self.line.at(time)
+        force, progress = self._desired_force(position, velocity, reference)
+        thrust = self._thrust(force, attitude, velocity, time)
+        roll_pitch = self._roll_pitch_rates(force, attitude, body_rates, reference, progress)
+        rates = torch.cat((roll_pitch, self._yaw_rate(position, attitude, time)), dim=1)
+        self._last_command = torch.cat((thrust, rates), dim=1)
+        thrust = thrust / self._thrust_scale / self.parameters.collective_thrust_scale - 1.0
+        return torch.cat((thrust, rates / self._rate_max), dim=1).clamp(-1.0, 1.0)
+
+    def _remember(self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor) -> None:
+        """Forget the drones that are suddenly elsewhere; learn how strong the thrust of the others is."""
+        dt, dynamics = self.parameters.control_dt, self._dynamics
+        if self._last_position is None or len(self._last_position) != len(position):
+            self._last_position, self._last_velocity = torch.full_like(position, math.nan), velocity
+            self._last_command = torch.zeros_like(attitude)
+            self._last_thrust, self._thrust_scale = torch.zeros_like(position[:, :1]), torch.ones_like(position[:, :1])
+        velocity_mean = (velocity + self._last_velocity) / 2.0
+        surprise = (position - self._last_position - dt * velocity_mean).norm(dim=-1, keepdim=True)
+        new = ~(surprise < self.JUMP)  # NaN is new too
+        hover = torch.nn.functional.pad(torch.full_like(surprise, GRAVITY), (0, 3))
+        self._last_command = torch.where(new, hover, self._last_command)
+        lag = self.parameters.motor_time_constant + self.parameters.command_delay
+        thrust = torch.lerp(self._last_thrust, self._last_command[:, :1], min(1.0, dt / lag))
+        self._last_thrust = torch.where(new, GRAVITY, thrust)
+        force = dynamics.force(velocity_mean, (velocity - self._last_velocity) / dt)
+        measured = dynamics.collective_thrust(force, rotate(attitude, _unit_z(position)), velocity).unsqueeze(-1)
+        surplus = (measured / self._last_thrust.clamp(min=5.0)).clamp(0.7, 1.3) - 1.0
+        # near the limit the mixer may give up thrust for roll and pitch, which is no property of the drone
+        known = (self._last_thrust > 8.0) & (self._last_thrust < 0.85 * dynamics.thrust_max)
+        scale = (self._thrust_scale * (1.0 + self.gains.adaptation * dt * known * surplus)).clamp(0.8, 1.2)
+        self._thrust_scale = torch.where(new, 1.0, scale)
+        self._last_position, self._last_velocity = position.clone(), velocity.clone()
+
+    def _predict(
+        self, position: Tensor, attitude: Tensor, velocity: Tensor, body_rates: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state when the coming action takes effect, from the command before it."""
+        lag = self._latency
+        settled = 1.0 - math.exp(-lag * self.parameters.rate_gain)
+        later = torch.lerp(body_rates, self._last_command[:, 1:], settled * 0.5)
+        attitude = turn(attitude, (body_rates + later) * (lag / 2.0))
+        axis = rotate(attitude, _unit_z(position))
+        force = axis * self._last_thrust - self._dynamics.drag_sideways * velocity
+        acceleration = force - GRAVITY * _unit_z(position)
+        return position + lag * velocity, attitude, velocity + lag * acceleration, later
+
+    def _find(self, position: Tensor, target_gate: Tensor) -> Tensor:
+        """The time on the line (N,) of its nearest point between the last gate and the target gate."""
+        gap = self._search_positions[target_gate] - position.unsqueeze(1)  # (N, W, 3)
+        nearest = gap.square().sum(-1).argmin(1, keepdim=True)
+        time = self._search_times[target_gate].gather(1, nearest).squeeze(1)
+        reference = self.line.at(time)
+        along = ((position - reference.position) * reference.velocity).sum(-1)
+        step = along / reference.velocity.square().sum(-1).clamp(min=0.1)
+        return time + step.clamp(-self.SEARCH_DT, self.SEARCH_DT)
+
+    def _desired_force(self, position: Tensor, velocity: Tensor, reference: Reference) -> tuple[Tensor, Tensor]:
+        """Specific force (N, 3) in m/s², and the speed along the line relative to the line's own (N, 1).
+
+        At a fraction λ of the line's speed the line asks for λ² of its acceleration, so that the drone can start from
+        rest and fall behind without being pushed off the line.
+        """
+        gains = self.gains
+        speed = reference.velocity.norm(dim=-1, keepdim=True).clamp(min=0.5)
+        tangent = reference.velocity / speed
+        progress = (velocity * tangent).sum(-1, keepdim=True) / speed
+        beside = reference.position - position
+        wanted = (1.2 - 0.4 * beside.norm(dim=-1, keepdim=True)).clamp(0.3, 1.0)
+        limit = gains.progress_max / speed
+        push = torch.minimum(torch.maximum(gains.progress * (wanted - progress), -limit), limit)
+        progress = progress.clamp(0.0, 1.3)
+        drift = velocity - (velocity * tangent).sum(-1, keepdim=True) * tangent
+        correction = gains.position * beside - gains.velocity * drift
+        size = correction.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        correction = correction * (gains.correction_max / size).clamp(max=1.0)
+        acceleration = progress.square() * reference.acceleration + push * reference.velocity + correction
+        return self._dynamics.force(velocity, acceleration), progress
+
+    def _thrust(self, force: Tensor, attitude: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
+        """Collective thrust (N, 1) in m/s²: the force along the present axis, and what the motors' lag would lose."""
+        axis = rotate(attitude, _unit_z(velocity))
+        thrust = self._dynamics.collective_thrust(force, axis, velocity).unsqueeze(-1)
+        now, soon = self.line.at(time), self.line.at(time + self.parameters.motor_time_constant)
+        size_now = self._dynamics.force(now.velocity, now.acceleration).norm(dim=-1, keepdim=True)
+        size_soon = self._dynamics.force(soon.velocity, soon.acceleration).norm(dim=-1, keepdim=True)
+        return (thrust + size_soon - size_now).clamp(1.0, self._dynamics.thrust_max)
+
+    def _roll_pitch_rates(
+        self, force: Tensor, attitude: Tensor, body_rates: Tensor, reference: Reference, progress: Tensor
+    ) -> Tensor:
+        """Roll and pitch rates (N, 2) in rad/s that turn the thrust axis to the force."""
+        gains, loop = self.gains, self.parameters.rate_gain
+        wanted = torch.nn.functional.normalize(rotate_inverse(attitude, force), dim=-1)
+        x, y, z = wanted.unbind(-1)
+        sideways = torch.stack((-y, x, torch.zeros_like(x)), dim=-1)  # body z × wanted
+        sine = sideways.norm(dim=-1, keepdim=True)
+        error = sideways * (torch.atan2(sine, z.unsqueeze(-1)) / sine.clamp(min=1e-6))
+        feedforward = rotate_inverse(attitude, progress * reference.body_rate)
+        change = rotate_inverse(attitude, progress.square() * reference.angular_acceleration)
+        damping = (gains.body_rate / loop - 1.0) * (feedforward - body_rates)
+        rates = feedforward + damping + (change + gains.attitude * error) / loop
+        excess = (rates[:, :2].abs() / self._rate_max[:2]).amax(dim=-1, keepdim=True).clamp(min=1.0)
+        return rates[:, :2] / excess
+
+    def _yaw_rate(self, position: Tensor, attitude: Tensor, time: Tensor) -> Tensor:
+        """Yaw rate (N, 1) in rad/s that points the nose to where the line goes."""
+        view = self.line.at(time + self.gains.look_ahead).position - position
+        x, y, _ = rotate_inverse(attitude, torch.nn.functional.normalize(view, dim=-1)).unbind(-1)
+        level = (x.square() + y.square()).sqrt()  # the less the target is beside the yaw axis, the less it says
+        rate = self.gains.yaw * level * torch.atan2(y, x)
+        return rate.clamp(-self._rate_max[2], self._rate_max[2]).unsqueeze(-1)
+
+
+def _unit_z(like: Tensor) -> Tensor:
+    """World or body z for each row of a (N, 3) tensor."""
+    return like.new_tensor((0.0, 0.0, 1.0)).expand_as(like)
+
+
+class PilotPolicy(TensorDictModuleBase):
+    """The pilot as a policy of `DroneRacingEnv`: reads `("privileged", ...)`, writes `action`.
+
+    It needs no `is_init`: the pilot notices by itself that a drone has been put elsewhere.
+
+    Args:
+        pilot: who flies.
+
+    Example:
+        >>> env = DroneRacingEnv("circle", num_envs=2, from_pixels=False)
+        >>> env.rollout(100, PilotPolicy(ScriptedPilot(env.track)))["next", "race", "gates_passed"].max() > 0
+        tensor(True)
+    """
+
+    def __init__(self, pilot: ScriptedPilot) -> None:
+        super().__init__()
+        names = ("position", "attitude", "linear_velocity", "body_rates", "target_gate")
+        self.in_keys = [("privileged", name) for name in names]
+        self.out_keys = ["action"]
+        self.pilot = pilot
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the actions of the coming control step."""
+        position, attitude, velocity, rates, gate = (tensordict.get(key) for key in self.in_keys)
+        action = self.pilot.act(position, attitude, velocity, rates, gate.squeeze(-1))
+        return tensordict.set("action", action.to(position))
+
+
+@dataclass(frozen=True)
+class FlownLaps:
+    """What N episodes came to."""
+
+    gates: Tensor  # (N,) int64, passed
+    finished: Tensor  # (N,) bool: all laps, no crash
+    crash: Tensor  # (N,) int64 `CrashCause`
+    lap_times: Tensor  # (N, L) s; NaN where not flown; the first lap begins at rest
+    speed_mean: Tensor  # (N,) m/s
+    speed_max: Tensor  # (N,) m/s
+    gate_offset_max: Tensor  # (N,) m
+    gate_in_view: Tensor  # (N,) fraction of the time in which the nose camera sees the target gate's centre
+
+
+def fly_laps(
+    track: str | Track,
+    preset: str | QuadrotorParameters = "easy",
+    num_envs: int = 1,
+    *,
+    laps: int = 3,
+    pilot: ScriptedPilot | None = None,
+    randomise: bool = True,
+    random_starts: bool = False,
+    seed: int = 0,
+    episode_steps: int | None = None,
+) -> FlownLaps:
+    """Fly N episodes to their ends.
+
+    Args:
+        track: name, path or `Track`.
+        preset: physics preset or parameters.
+        num_envs: N.
+        laps: L.
+        pilot: who flies; a `ScriptedPilot` with default limits if None.
+        randomise: whether a preset's randomisation is on.
+        random_starts: start as training does, instead of at the start pose.
+        seed: of randomisation and starts.
+        episode_steps: control steps until an episode is given up; None for those of 30 s.
+    """
+    parameters = load_preset(preset)
+    worlds = RaceWorlds(
+        track,
+        num_envs,
+        parameters if randomise else without_randomisation(parameters),
+        evaluation=not random_starts,
+        from_pixels=False,
+        episode_steps=episode_steps or round(EVALUATION_TIME / parameters.control_dt),
+        seed=seed,
+    )
+    worlds.race.laps = laps
+    pilot = pilot or ScriptedPilot(worlds.track, parameters, dtype=worlds.dtype)
+    steps = _fly(worlds, pilot)
+    worlds.close()
+    return _summarise(steps, worlds.track.num_gates, laps)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One control step of a flight; tensors (N,)."""
+
+    outcome: RaceStep
+    speed: Tensor  # m/s
+    seen: Tensor  # bool: the target gate
+    flew: Tensor  # bool: the episode was not over
+
+
+def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
+    """Fly one episode in every world to its end."""
+    pilot.reset()
+    worlds.reset()
+    flying = torch.ones(worlds.num_envs, dtype=torch.bool, device=worlds.device)
+    steps = []
+    while flying.any():
+        state, gate = worlds.simulator.state, worlds.race.target_gate
+        seen = _in_view(worlds, state.position, state.attitude)
+        outcome = worlds.step(pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, gate))
+        steps.append(_Step(outcome, worlds.simulator.state.linear_velocity.norm(dim=-1), seen, flying))
+        flying = flying & ~(outcome.terminated | outcome.truncated)
+    return steps
+
+
+def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
+    """Whether the centre of the target gate (N,) is inside the nose camera's image; gates in front are not minded."""
+    camera = worlds.camera
+    gates = worlds.track.gate_positions(position.device, position.dtype)
+    view = rotate_inverse(attitude, gates[worlds.race.target_gate] - position) - position.new_tensor(camera.position)
+    tilt = math.radians(camera.tilt)
+    depth = view[:, 0] * math.cos(tilt) + view[:, 2] * math.sin(tilt)
+    up = view[:, 2] * math.cos(tilt) - view[:, 0] * math.sin(tilt)
+    reach = depth * math.tan(math.radians(camera.field_of_view) / 2.0)
+    return (up.abs() < reach) & (view[:, 1].abs() < reach * camera.width / camera.height)
+
+
+def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
+    """Add up the control steps of a flight."""
+    flew = torch.stack([step.flew for step in steps])  # (T, N)
+    time = flew.sum(0)
+
+    def outcomes(name: str) -> Tensor:
+        return torch.stack([getattr(step.outcome, name) for step in steps]) * flew
+
+    speed = torch.stack([step.speed for step in steps]) * flew
+    gates, lap_time = outcomes("gates_passed"), outcomes("lap_time")
+    at_lap = (gates // num_gates).unsqueeze(-1)  # (T, N, 1)
+    lap_times = (lap_time.unsqueeze(-1) * (at_lap == torch.arange(1, laps + 1, device=speed.device))).amax(0)  # (N, L)
+    return FlownLaps(
+        gates=gates.amax(0),
+        finished=outcomes("finished").any(0),
+        crash=outcomes("crash").amax(0),
+        lap_times=torch.where(lap_times > 0.0, lap_times, math.nan),
+        speed_mean=speed.sum(0) / time,
+        speed_max=speed.amax(0),
+        gate_offset_max=outcomes("gate_offset").amax(0),
+        gate_in_view=(torch.stack([step.seen for step in steps]) & flew).sum(0) / time,
+    )

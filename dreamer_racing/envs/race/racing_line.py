@@ -1,0 +1,297 @@
+"""A fast periodic line through a track's gates, for the scripted pilot to fly.
+
+The line is a chain of polynomials of degree 7 through the gate openings. Its nodes and durations are chosen by gradient
+descent on the lap time, with penalties where it would ask for more thrust or body rate than the drone has.
+
+Shapes: N queries, G race gates, M nodes of the line, S samples per segment, K samples of the finished line. SI units,
+world z up. All numbers are this project's choice.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.tracks import Track
+
+DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous
+LINE_DT = 0.005  # s between samples of the finished line
+SAMPLES = 12  # S, at which a segment must keep the limits
+ADAM_STEPS, LBFGS_STEPS = 200, 800
+
+
+@dataclass(frozen=True)
+class LineLimits:
+    """What the line may ask for.
+
+    Args:
+        speed: the fraction of the greatest collective thrust that the line may use; the one knob of aggressiveness.
+            0.9 leaves room for corrections and for a drone of the randomisation with 14 % less thrust; above 0.95 the
+            laps get no faster.
+        gate_offset: greatest distance from a gate's centre to the left and up, m; never above 40 % of the opening's.
+        body_rate_max: greatest roll and pitch rate, rad/s.
+        angular_acceleration_max: greatest roll and pitch acceleration, rad/s².
+        thrust_min: least collective thrust, m/s²; below it the drone's attitude has no direction.
+        gate_cosine: least cosine of the angle between the flight and a gate's normal.
+        clearance: distance from the bounding box, m.
+        height_min: least height, m.
+    """
+
+    speed: float = 0.9
+    gate_offset: float = 0.25
+    body_rate_max: float = 6.0
+    angular_acceleration_max: float = 40.0
+    thrust_min: float = 4.0
+    gate_cosine: float = 0.75
+    clearance: float = 0.5
+    height_min: float = 0.6
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The line at one time per drone; every tensor is (N, 3)."""
+
+    position: Tensor  # m
+    velocity: Tensor  # m/s
+    acceleration: Tensor  # m/s²
+    thrust_rate: Tensor  # m/s³, rate of change of the specific thrust vector
+    body_rate: Tensor  # rad/s, world frame, without the part about the thrust axis
+    angular_acceleration: Tensor  # rad/s², world frame
+
+
+class RacingLine:
+    """A closed line around a track as a function of time.
+
+    Args:
+        samples: (K, 18) the columns of `Reference`, `LINE_DT`-spaced over one lap.
+        gate_times: (G,) s, when the line passes each gate.
+        lap_time: s.
+        dynamics: of the drone that it was planned for.
+    """
+
+    def __init__(self, samples: Tensor, gate_times: Tensor, lap_time: float, dynamics: "Dynamics") -> None:
+        self.samples, self.gate_times, self.lap_time, self.dynamics = samples, gate_times, lap_time, dynamics
+        self.dt = lap_time / len(samples)  # s
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> "RacingLine":
+        """The same line elsewhere."""
+        samples, gate_times = (values.to(device, dtype) for values in (self.samples, self.gate_times))
+        return RacingLine(samples, gate_times, self.lap_time, self.dynamics)
+
+    def at(self, time: Tensor) -> Reference:
+        """Interpolate the line at times (N,) in s; it repeats every lap."""
+        place = time / self.dt
+        index = place.floor()
+        fraction = (place - index).unsqueeze(-1)
+        index = index.long() % len(self.samples)
+        rows = torch.lerp(self.samples[index], self.samples[(index + 1) % len(self.samples)], fraction)
+        return Reference(*rows.split(3, dim=-1))
+
+
+def _basis_rows(time: Tensor, order: int) -> Tensor:
+    """The `order`-th derivatives of 1, t, …, t⁷ at times (S,), as (S, 8)."""
+    powers = [
+        math.perm(n, order) * time ** (n - order) if n >= order else torch.zeros_like(time) for n in range(DEGREE + 1)
+    ]
+    return torch.stack(powers, dim=-1)
+
+
+def _hermite_basis(time: Tensor) -> Tensor:
+    """Derivatives 0–3 at times (S,) in [0, 1] of the polynomial with given derivatives 0–3 at 0 and 1: (4, S, 8)."""
+    ends = torch.tensor([0.0, 1.0], dtype=time.dtype)
+    conditions = torch.cat([_basis_rows(ends[i : i + 1], order) for i in range(2) for order in range(4)])
+    inverse = torch.linalg.inv(conditions)
+    return torch.stack([_basis_rows(time, order) @ inverse for order in range(4)])
+
+
+class _LineNodes:
+    """The free numbers of a line: nodes at the gates and between them, and the durations from each to the next.
+
+    The search starts from a slow line of cubic arcs that leave and enter gates along their normals.
+    """
+
+    SPACING = 4.0  # m between nodes, about
+    START_SPEED = 5.0  # m/s
+    SCALES = (0.5, 2.0, 10.0, 100.0)  # of a node's position, velocity, acceleration and jerk in the search
+
+    def __init__(self, track: Track, gate_offset: float) -> None:
+        dtype = torch.float64
+        self.gates, self.normals = track.gate_positions(dtype=dtype), track.gate_normals(dtype=dtype)
+        self.left = track.gate_rotations(dtype=dtype)[:, :, 1]
+        self.gate_offset = min(gate_offset, 0.4 * track.shape.pass_half_width)
+        gaps = self.gates.roll(-1, 0) - self.gates
+        turns = 1.0 - (self.normals * self.normals.roll(-1, 0)).sum(-1)  # 0 straight on, 2 for a reversal
+        lengths = 1.1 * gaps.norm(dim=-1) + 0.5 + 2.0 * turns  # of a generous arc, m
+        self._counts = (gaps.norm(dim=-1) / self.SPACING).round().long().clamp(min=2)  # (G,) nodes from gate to gate
+        self.gate_nodes = self._counts.cumsum(0) - self._counts  # (G,)
+        arcs = [self._arc(gate, float(lengths[gate]), int(self._counts[gate])) for gate in range(len(self.gates))]
+        self._start = torch.nn.functional.pad(torch.cat(arcs), (0, 0, 0, 2))  # (M, 4, 3)
+        self._start_duration = lengths / self.START_SPEED / self._counts  # (G,) of each of the equal segments
+        self._scales = torch.tensor(self.SCALES, dtype=dtype).view(4, 1)
+        self.change = torch.zeros_like(self._start, requires_grad=True)  # (M, 4, 3)
+        self.log_duration = torch.zeros_like(self._start_duration, requires_grad=True)  # (G,)
+
+    def _arc(self, gate: int, length: float, count: int) -> Tensor:
+        """Positions and velocities (count, 2, 3) on the cubic arc from a gate to the next."""
+        here, there = gate, (gate + 1) % len(self.gates)
+        gap, out, into = self.gates[there] - self.gates[here], length * self.normals[here], length * self.normals[there]
+        t = (torch.arange(count, dtype=gap.dtype) / count).unsqueeze(-1)
+        position = self.gates[here] + (3 * t**2 - 2 * t**3) * gap + (t**3 - 2 * t**2 + t) * out + (t**3 - t**2) * into
+        slope = 6 * (t - t**2) * gap + (3 * t**2 - 4 * t + 1) * out + (3 * t**2 - 2 * t) * into
+        return torch.stack((position, self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1)), dim=1)
+
+    def durations(self) -> Tensor:
+        """Seconds from each node to the next (M,); between two gates they are equal."""
+        return (self._start_duration * self.log_duration.exp()).repeat_interleave(self._counts)
+
+    def nodes(self) -> Tensor:
+        """Position, velocity, acceleration and jerk of each node (M, 4, 3)."""
+        nodes = self._start + self._scales * self.change
+        left, up = (self.gate_offset * self.change[self.gate_nodes, 0, :2].tanh()).unsqueeze(-1).unbind(1)
+        at_gates = self.gates + left * self.left + torch.nn.functional.pad(up, (2, 0))
+        rows = torch.cat((at_gates.unsqueeze(1), nodes[self.gate_nodes, 1:]), dim=1)
+        return nodes.index_copy(0, self.gate_nodes, rows)
+
+    def segments(self) -> tuple[Tensor, Tensor]:
+        """Durations of the segments (M,), and the nodes at both of their ends per segment time (M, 8, 3)."""
+        durations, nodes = self.durations(), self.nodes()
+        powers = (durations.unsqueeze(-1) ** torch.arange(4)).unsqueeze(-1)  # (M, 4, 1)
+        return durations, torch.cat((powers * nodes, powers * nodes.roll(-1, 0)), dim=1)
+
+
+class Dynamics:
+    """What a line asks of the drone."""
+
+    def __init__(self, parameters: QuadrotorParameters) -> None:
+        x, y, z = parameters.drag
+        self.drag_sideways = (x + y) / 2 / parameters.mass  # 1/s
+        self.drag_along = z / parameters.mass - self.drag_sideways  # 1/s, more along the thrust axis
+        self.thrust_max = 2.0 * parameters.collective_thrust_scale  # m/s²
+
+    def force(self, velocity: Tensor, acceleration: Tensor) -> Tensor:
+        """Specific force (..., 3) in m/s² whose direction the thrust axis must have.
+
+        Sideways drag is taken to be equal in x and y; the rest of the drag is along the thrust axis, and is made up by
+        thrust alone. Reference: Faessler et al., Differential Flatness of Quadrotor Dynamics Subject to Rotor Drag.
+        """
+        force = acceleration + self.drag_sideways * velocity
+        return torch.cat((force[..., :2], force[..., 2:] + GRAVITY), dim=-1)
+
+    def collective_thrust(self, force: Tensor, axis: Tensor, velocity: Tensor) -> Tensor:
+        """Collective thrust (...) in m/s² that gives the force (..., 3) along the thrust axis (..., 3)."""
+        return (axis * (force + self.drag_along * velocity)).sum(-1)
+
+
+def _axis_rate(force: Tensor, force_rate: Tensor) -> tuple[Tensor, Tensor]:
+    """The thrust axis of a force and its angular velocity (..., 3) in rad/s, without the part about the axis."""
+    size = force.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    axis = force / size
+    return axis, torch.linalg.cross(axis, force_rate) / size
+
+
+def _excess(value: Tensor, limit: float) -> Tensor:
+    """Relative excess of values over a limit: squared where it is small, linear where it is large."""
+    excess = (value / limit - 1.0).clamp(min=0.0)
+    return torch.nn.functional.huber_loss(excess, torch.zeros_like(excess), reduction="none", delta=0.5) * 2.0
+
+
+def _steps(values: Tensor) -> Tensor:
+    """Differences from each sample of a closed line (M, S, 3) to the next."""
+    flat = values.flatten(0, 1)
+    return (flat.roll(-1, 0) - flat).view_as(values)
+
+
+def _lap_cost(
+    nodes: _LineNodes, basis: Tensor, dynamics: Dynamics, limits: LineLimits, low: Tensor, high: Tensor
+) -> Tensor:
+    """Lap time in s plus penalties where the line breaks the limits or leaves the box (low, high), both (3,)."""
+    durations, ends = nodes.segments()
+    per_second = 1.0 / durations.view(-1, 1, 1)
+    derivatives = torch.einsum("ksc,mcd->kmsd", basis, ends)  # (4, M, S, 3)
+    position, velocity, acceleration, jerk = (values * per_second**order for order, values in enumerate(derivatives))
+    force = dynamics.force(velocity, acceleration)
+    axis, body_rate = _axis_rate(force, jerk + dynamics.drag_sideways * acceleration)
+    thrust = dynamics.collective_thrust(force, axis, velocity)  # (M, S)
+    outside = (low - position).clamp(min=0.0).square() + (position - high).clamp(min=0.0).square()
+    penalty = 300.0 * (_excess(thrust, limits.speed * dynamics.thrust_max) + outside.sum(-1))
+    penalty = penalty + 300.0 * _excess(2.0 * limits.thrust_min - thrust, limits.thrust_min)
+    # between samples, so that the thrust axis cannot flip unseen where the force passes through zero
+    per_second = basis.shape[1] / durations.unsqueeze(-1)
+    axis_speed, rate_change = _steps(axis).norm(dim=-1) * per_second, _steps(body_rate).norm(dim=-1) * per_second
+    penalty = penalty + 50.0 * _excess(axis_speed, limits.body_rate_max)
+    penalty = penalty + 10.0 * _excess(rate_change, limits.angular_acceleration_max)
+    at_gates = torch.nn.functional.normalize(velocity[nodes.gate_nodes, 0], dim=-1)
+    slant = (limits.gate_cosine - (at_gates * nodes.normals).sum(-1)).clamp(min=0.0)
+    return durations.sum() + (durations * penalty.mean(-1)).sum() + 10.0 * slant.square().sum()
+
+
+@lru_cache(maxsize=32)
+def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> RacingLine:
+    """Plan a fast closed line through all gates of a track (a few seconds of CPU time, then cached).
+
+    Args:
+        track: the track.
+        parameters: the drone; only its mass, thrust and drag matter.
+        limits: what the line may ask for.
+
+    Returns:
+        The line, float64 on CPU.
+    """
+    with torch.inference_mode(False):
+        dynamics, nodes = Dynamics(parameters), _LineNodes(track, limits.gate_offset)
+        basis = _hermite_basis(torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES)
+        low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
+        high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
+        low[2] = low[2].clamp(min=limits.height_min)
+        _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
+        with torch.no_grad():
+            return _finish_line(nodes, dynamics)
+
+
+def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
+    """Minimise the cost: Adam brings the line near the limits, L-BFGS makes it fast."""
+    variables = [nodes.change, nodes.log_duration]
+
+    def evaluate() -> Tensor:
+        with torch.enable_grad():
+            value = cost()
+            for variable, gradient in zip(variables, torch.autograd.grad(value, variables), strict=True):
+                variable.grad = gradient
+        return value
+
+    adam = torch.optim.Adam(variables, lr=0.06)
+    for _ in range(ADAM_STEPS):
+        evaluate()
+        adam.step()
+    torch.optim.LBFGS(
+        variables,
+        max_iter=LBFGS_STEPS,
+        history_size=60,
+        tolerance_grad=1e-9,
+        tolerance_change=1e-7,
+        line_search_fn="strong_wolfe",
+    ).step(evaluate)
+
+
+def _finish_line(nodes: _LineNodes, dynamics: Dynamics) -> RacingLine:
+    """Sample the line evenly in time."""
+    durations, ends = nodes.segments()
+    end_times = durations.cumsum(0)
+    start_times = end_times - durations
+    lap_time = float(end_times[-1])
+    count = round(lap_time / LINE_DT)
+    time = torch.arange(count, dtype=durations.dtype) * (lap_time / count)
+    segment = torch.searchsorted(end_times, time, right=True).clamp(max=len(durations) - 1)
+    basis = _hermite_basis((time - start_times[segment]) / durations[segment])  # (4, K, 8)
+    derivatives = torch.einsum("okc,kcd->okd", basis, ends[segment])
+    per_second = 1.0 / durations[segment].unsqueeze(-1)
+    position, velocity, acceleration, jerk = (values * per_second**order for order, values in enumerate(derivatives))
+    force_rate = jerk + dynamics.drag_sideways * acceleration
+    _, body_rate = _axis_rate(dynamics.force(velocity, acceleration), force_rate)
+    angular_acceleration = (body_rate.roll(-1, 0) - body_rate.roll(1, 0)) / (2 * lap_time / count)
+    columns = (position, velocity, acceleration, force_rate, body_rate, angular_acceleration)
+    return RacingLine(torch.cat(columns, dim=-1), start_times[nodes.gate_nodes], lap_time, dynamics)

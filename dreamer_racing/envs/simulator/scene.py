@@ -1,0 +1,269 @@
+"""The one scene that every backend compiles: the hall, the gates, the drone and its nose camera, as an `MjSpec`.
+
+`build_drone` is the part that moves: simulators step it alone, in a third less time than with the hall around it. The
+scene is drawn in flat colours without shadows, reflections or fine textures: at 64×64 pixels those alias, and
+MuJoCo's OpenGL renderer and `mujoco_warp`'s ray caster must agree. Contacts are off: `envs.gates` decides crashes.
+Dimensions of the hall, colours and the camera's mount are this project's choice.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.tracks import Gate, Track
+
+HALL_GROUP = 0  # geom group of hall and gates
+DRONE_GROUP = 2  # geom group of the drone, hidden from its own camera
+CAMERA_NAME = "nose"
+
+FLOOR = (0.16, 0.17, 0.19)
+LINE = (1.00, 0.82, 0.05)
+CEILING = (0.93, 0.94, 0.95)
+WALLS = {"x+": (0.20, 0.38, 0.80), "x-": (0.45, 0.28, 0.60), "y+": (0.15, 0.55, 0.40), "y-": (0.55, 0.72, 0.88)}
+RACE_GATE = (1.00, 0.25, 0.00)
+DECOY_GATE = (0.85, 0.00, 0.45)
+WALL_THICKNESS = 0.1  # m
+LINE_SPACING, LINE_WIDTH, LINE_HEIGHT = 3.0, 0.20, 0.02  # m
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The nose camera.
+
+    Args:
+        width: pixels.
+        height: pixels.
+        field_of_view: vertical, degrees.
+        tilt: upwards, degrees; a racing drone pitches forward when it accelerates.
+        position: mount in the body frame, m.
+    """
+
+    width: int = 64
+    height: int = 64
+    field_of_view: float = 90.0
+    tilt: float = 25.0
+    position: tuple[float, float, float] = (0.10, 0.0, 0.02)
+    near: float = 0.01  # m
+    far: float = 100.0  # m
+
+
+def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
+    """Build the drone in an empty world: all that physics needs.
+
+    Args:
+        parameters: mass, inertia, physics step and integrator.
+
+    Returns:
+        The specification: one free body `drone`, moved by gravity and by `qfrc_applied`, whose six numbers are a force
+        at its centre of mass in the world frame, N, and a torque in the body frame, N m.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "drone"
+    spec.option.timestep = parameters.physics_dt
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{parameters.integrator.upper()}")
+    spec.option.gravity = (0.0, 0.0, -GRAVITY)
+    disable = mujoco.mjtDisableBit  # what there is none of: contacts, constraints, damped joints
+    spec.option.disableflags = disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EULERDAMP
+    drone = spec.worldbody.add_body(name="drone", pos=(0, 0, 1))
+    drone.add_freejoint(name="drone")
+    drone.mass, drone.inertia, drone.explicitinertial = parameters.mass, parameters.inertia, True
+    drone.ipos = (0.0, 0.0, 0.0)  # centre of mass; left alone, MjSpec takes the body's place in the world for it
+    return spec
+
+
+def build_scene(track: Track, parameters: QuadrotorParameters, camera: Camera | None = None) -> mujoco.MjSpec:
+    """Build the scene of a track: `build_drone` in its hall.
+
+    Args:
+        track: gates, decoys and the bounding box, whose sides are the walls of the hall.
+        parameters: the drone's; see `build_drone`.
+        camera: the nose camera; the default one if None.
+
+    Returns:
+        The specification, with the camera `nose` on the body `drone`.
+    """
+    camera = camera or Camera()
+    spec = build_drone(parameters)
+    spec.modelname = f"drone_race_{track.name}"
+    spec.stat.extent = 1.0  # so that the clipping planes below are in metres
+    spec.stat.center = (0.0, 0.0, 1.0)
+    spec.visual.map.znear, spec.visual.map.zfar = camera.near, camera.far
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
+    spec.visual.quality.numquads = 1  # flat colours need no finer sides, which take a third of a frame's time
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
+    _add_light(spec)
+    _add_hall(spec, track)
+    _add_gates(spec, track)
+    drone = spec.body("drone")
+    _add_airframe(spec, drone, parameters)
+    drone.add_camera(
+        name=CAMERA_NAME, pos=camera.position, quat=_camera_attitude(camera.tilt), fovy=camera.field_of_view
+    )
+    return spec
+
+
+def _add_light(spec: mujoco.MjSpec) -> None:
+    """Mostly ambient light, and one slanted lamp that tells the faces of a gate apart."""
+    headlight = spec.visual.headlight
+    headlight.ambient, headlight.diffuse, headlight.specular = (0.78,) * 3, (0.0,) * 3, (0.0,) * 3
+    spec.worldbody.add_light(
+        name="lamp",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0, 0, 5),
+        dir=(0.35, 0.2, -1.0),
+        ambient=(0, 0, 0),
+        diffuse=(0.32, 0.32, 0.32),
+        specular=(0, 0, 0),
+        castshadow=False,
+    )
+
+
+def _add_box(spec: mujoco.MjSpec, name: str, low: Sequence[float], high: Sequence[float], rgb: Sequence[float]) -> None:
+    corners = np.array((low, high))
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=corners.mean(axis=0),
+        size=(corners[1] - corners[0]) / 2,
+        material=_material(spec, rgb),
+        contype=0,
+        conaffinity=0,
+        group=HALL_GROUP,
+    )
+
+
+def _material(spec: mujoco.MjSpec, rgb: Sequence[float]) -> str:
+    """Name of the matte material of a colour, added on first use."""
+    name = "matte_" + "_".join(f"{round(255 * channel):03d}" for channel in rgb)
+    if spec.material(name) is None:
+        spec.add_material(name=name, rgba=(*rgb, 1.0), specular=0.0, shininess=0.0, reflectance=0.0)
+    return name
+
+
+def _add_hall(spec: mujoco.MjSpec, track: Track) -> None:
+    """Floor at z = 0, ceiling and walls at the bounding box, yellow lines on the floor."""
+    (x0, y0, _), (x1, y1, z1) = track.bounds_low, track.bounds_high
+    t = WALL_THICKNESS
+    _add_box(spec, "floor", (x0 - t, y0 - t, -t), (x1 + t, y1 + t, 0.0), FLOOR)
+    _add_box(spec, "ceiling", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING)
+    _add_box(spec, "wall_x+", (x1, y0 - t, 0.0), (x1 + t, y1 + t, z1), WALLS["x+"])
+    _add_box(spec, "wall_x-", (x0 - t, y0 - t, 0.0), (x0, y1 + t, z1), WALLS["x-"])
+    _add_box(spec, "wall_y+", (x0, y1, 0.0), (x1, y1 + t, z1), WALLS["y+"])
+    _add_box(spec, "wall_y-", (x0, y0 - t, 0.0), (x1, y0, z1), WALLS["y-"])
+    half = LINE_WIDTH / 2
+    # without the sides against the floor and the walls, which take a tenth of a frame's time and are never seen
+    lines = [((x - half, y0, 0.0), (x + half, y1, LINE_HEIGHT), "x-x+z+") for x in _spaced(x0, x1)]
+    lines += [((x0, y - half, 0.0), (x1, y + half, LINE_HEIGHT), "y-y+z+") for y in _spaced(y0, y1)]
+    _add_box_mesh(spec, "floor_lines", lines)
+    spec.worldbody.add_geom(
+        name="floor_lines",
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="floor_lines",
+        material=_material(spec, LINE),
+        contype=0,
+        conaffinity=0,
+        group=HALL_GROUP,
+    )
+
+
+def _spaced(low: float, high: float) -> np.ndarray:
+    """Centred positions between two walls, `LINE_SPACING` apart."""
+    count = max(1, int((high - low) // LINE_SPACING))
+    return (low + high) / 2 + (np.arange(count) - (count - 1) / 2) * LINE_SPACING
+
+
+Box = tuple[Sequence[float], Sequence[float], str]
+"""Low corner, high corner, and which sides there are: `x-x+y-y+z-z+` are all."""
+
+# corners, outward; corner 4 i + 2 j + k is at (low, high)[i] in x, [j] in y and [k] in z
+SIDES = {
+    "x-": (0, 1, 3, 2), "x+": (4, 6, 7, 5), "y-": (0, 4, 5, 1),
+    "y+": (2, 3, 7, 6), "z-": (0, 2, 6, 4), "z+": (1, 5, 7, 3),
+}  # fmt: skip
+
+
+def _add_box_mesh(spec: mujoco.MjSpec, name: str, boxes: Sequence[Box]) -> None:
+    """Add axis-aligned boxes as one mesh: one draw call, however many boxes."""
+    corners = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+    vertices: list[np.ndarray] = []
+    faces: list[tuple[int, int, int]] = []
+    for low, high, sides in boxes:
+        corner = np.where(corners, high, low)
+        for side, quad in SIDES.items():
+            if side not in sides:
+                continue
+            start = len(vertices)
+            vertices.extend(corner[list(quad)])  # four vertices of its own per side, so that shading stays flat
+            faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
+    spec.add_mesh(
+        name=name,
+        uservert=np.array(vertices).ravel(),
+        userface=np.array(faces).ravel(),
+        smoothnormal=False,
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
+
+
+def _add_gates(spec: mujoco.MjSpec, track: Track) -> None:
+    inner, outer, depth = track.shape.opening / 2, track.shape.outer / 2, track.shape.depth / 2
+    bars = [
+        ((-depth, -outer, inner), (depth, outer, outer), "x-x+y-y+z-z+"),  # top
+        ((-depth, -outer, -outer), (depth, outer, -inner), "x-x+y-y+z-z+"),  # bottom
+        ((-depth, -outer, -inner), (depth, -inner, inner), "x-x+y-y+"),  # between them
+        ((-depth, inner, -inner), (depth, outer, inner), "x-x+y-y+"),
+    ]
+    _add_box_mesh(spec, "gate", bars)
+    for index, gate in enumerate(track.gates):
+        _add_gate(spec, f"gate_{index}", gate, gate.color or RACE_GATE)
+    for index, gate in enumerate(track.decoys):
+        _add_gate(spec, f"decoy_{index}", gate, gate.color or DECOY_GATE)
+
+
+def _add_gate(spec: mujoco.MjSpec, name: str, gate: Gate, rgb: Sequence[float]) -> None:
+    half_yaw = math.radians(gate.yaw_degrees) / 2
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="gate",
+        pos=gate.position,
+        quat=(math.cos(half_yaw), 0.0, 0.0, math.sin(half_yaw)),
+        material=_material(spec, rgb),
+        contype=0,
+        conaffinity=0,
+        group=HALL_GROUP,
+    )
+
+
+def gate_materials(model: mujoco.MjModel) -> list[int]:
+    """Return the materials of gates and decoys in a compiled scene."""
+    names = (model.geom(index).name for index in range(model.ngeom))
+    return sorted({int(model.geom(name).matid[0]) for name in names if name.startswith(("gate_", "decoy_"))})
+
+
+def _camera_attitude(tilt: float) -> np.ndarray:
+    """Quaternion wxyz of a camera (right x, up y, backwards z) that looks along body x, tilted up by degrees."""
+    cosine, sine = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))
+    right, up, backwards = (0.0, -1.0, 0.0), (-sine, 0.0, cosine), (-cosine, 0.0, -sine)
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.stack((right, up, backwards), axis=1).ravel())
+    return quaternion
+
+
+def _add_airframe(spec: mujoco.MjSpec, body: mujoco.MjsBody, parameters: QuadrotorParameters) -> None:
+    """What a spectator sees of the drone; massless, and hidden from its own camera."""
+    look = {"contype": 0, "conaffinity": 0, "group": DRONE_GROUP, "mass": 0.0}
+    dark, front, rear = (0.12, 0.12, 0.13), (0.95, 0.95, 0.95), (0.15, 0.75, 0.25)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.06, 0.03, 0.02), material=_material(spec, dark), **look)
+    for x, y in parameters.rotor_positions:
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(0, 0, 0, x, y, 0.01), size=(0.01, 0, 0),
+            material=_material(spec, dark), **look,
+        )  # fmt: skip
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=(x, y, 0.02), size=(0.06, 0.004, 0),
+            material=_material(spec, front if x > 0 else rear), **look,
+        )  # fmt: skip

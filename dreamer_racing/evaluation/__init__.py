@@ -1,0 +1,1 @@
+"""Flying a policy and measuring it, and its world model."""

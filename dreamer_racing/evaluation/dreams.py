@@ -1,0 +1,174 @@
+"""What a world model sees, reconstructs and imagines, stored small beside an evaluation to be shown later.
+
+Shapes: W windows of T stored frames, H × W pixels, RGB, uint8; C frames of context; K control steps of an episode.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from tensordict import TensorDict
+
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, add_border, enlarge, side_by_side
+
+if TYPE_CHECKING:
+    from dreamer_racing.evaluation.evaluate import Trajectory
+    from dreamer_racing.learners.dreamer import DreamerLearner
+
+CONTEXT, PREDICTED = 3, 10  # stored frames: those that the model has seen, then those that it predicts on its own
+STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
+WHITE = (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Dream:
+    """Windows of a flight: what the camera saw, what the model made of it, and what it imagined."""
+
+    real: np.ndarray
+    """(W, T, H, W, 3)."""
+    reconstructed: np.ndarray
+    """(W, T, H, W, 3): decoded from latents that saw every image up to and including this one."""
+    imagined: np.ndarray
+    """(W, T, H, W, 3): likewise in the context, then predicted from the actions alone."""
+    context: int
+    """C: frames of each window that the model saw before it imagined."""
+    frame_dt: float
+    """From one frame to the next, s."""
+
+    def save(self, path: str | Path) -> None:
+        """Write a compressed `.npz`; a kill leaves none or a whole one."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(path).with_name(f".{Path(path).name}.partial.npz")
+        predicted = self.imagined[:, self.context :]  # before that, it is the reconstruction
+        np.savez_compressed(
+            partial,
+            real=self.real,
+            reconstructed=self.reconstructed,
+            imagined=predicted,
+            context=np.array(self.context),
+            frame_dt=np.array(self.frame_dt),
+        )
+        os.replace(partial, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Dream:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: this is no such file.
+            OSError: it cannot be read.
+        """
+        try:
+            with np.load(path) as file:
+                real, reconstructed, predicted = (file[name] for name in ("real", "reconstructed", "imagined"))
+                context, frame_dt = int(file["context"]), float(file["frame_dt"])
+        except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"{path} holds no dream, or half of one.") from error
+        imagined = np.concatenate((reconstructed[:, :context], predicted), axis=1)
+        return cls(real, reconstructed, imagined, context, frame_dt)
+
+
+@torch.no_grad()
+def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int = 1) -> Dream | None:
+    """Let a world model reconstruct and imagine stretches of a flight.
+
+    Args:
+        learner: whose world model.
+        trajectory: a recorded episode with images.
+        windows: W at most; they begin at even distances.
+
+    Returns:
+        The dream; None if there is no image decoder or the flight is too short.
+    """
+    pixels = trajectory.pixels
+    if learner.agent.world_model.decoder is None or pixels is None or len(pixels) <= CONTEXT * STRIDE:
+        return None
+    length = STRIDE * min(CONTEXT + PREDICTED - 1, (len(pixels) - 1) // STRIDE) + 1  # ends with a stored frame
+    starts = sorted({int(start) for start in np.linspace(0, len(pixels) - length, windows + 1)[:-1]})
+    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
+    parts = [slice(start, start + length) for start in starts]
+    real = torch.stack([pixels[part] for part in parts])
+    is_init = torch.zeros(*real.shape[:2], 1, dtype=torch.bool)
+    is_init[:, 0] = True
+    batch = TensorDict(
+        {"pixels": real, "previous_action": torch.stack([action[part] for part in parts]), "is_init": is_init},
+        batch_size=real.shape[:2],
+    )
+    reconstructed = learner.open_loop(batch, length).cpu()
+    seen = STRIDE * (CONTEXT - 1) + 1
+    imagined = learner.open_loop(batch, seen).cpu()
+    imagined[:, :seen] = reconstructed[:, :seen]  # rather than another sample of the same latents
+    return Dream(
+        real=real[:, ::STRIDE].numpy(),
+        reconstructed=reconstructed[:, ::STRIDE].numpy(),
+        imagined=imagined[:, ::STRIDE].numpy(),
+        context=CONTEXT,
+        frame_dt=STRIDE * trajectory.control_dt,
+    )
+
+
+def shown_frames(dream: Dream, columns: int) -> list[int]:
+    """Choose frames to print: the last two of the context, then evenly to the end."""
+    last = dream.real.shape[1] - 1
+    context = list(range(max(0, dream.context - 2), dream.context))
+    rest = np.linspace(dream.context, last, max(1, columns - len(context))).round().astype(int)
+    return [*context, *sorted(set(rest.tolist()))]
+
+
+def film_strip(dream: Dream, frames: Sequence[int], scale: int = 2, border: int = 3) -> np.ndarray:
+    """Put frames of the first window side by side: real above reconstructed above imagined.
+
+    Borders of the lower two are green where the model has seen the image and orange where it imagines.
+
+    Args:
+        dream: T frames.
+        frames: F indices of them.
+        scale: whole factor by which pixels are enlarged, without blurring.
+        border: its width, pixels.
+
+    Returns:
+        (3 (scale H + 2 border), F (scale W + 2 border), 3) uint8.
+    """
+    chosen = np.array(frames)
+    seen = np.where((chosen < dream.context)[:, None], CONTEXT_COLOR, OPEN_LOOP_COLOR)  # (F, 3)
+    colors = (np.broadcast_to(WHITE, seen.shape), np.broadcast_to(CONTEXT_COLOR, seen.shape), seen)
+    rows = [
+        np.concatenate(list(add_border(enlarge(images[0, chosen], scale), color, border)), axis=1)
+        for images, color in zip((dream.real, dream.reconstructed, dream.imagined), colors, strict=True)
+    ]
+    return np.concatenate(rows)
+
+
+def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarray:
+    """Compose the stages of training under each other, each real | imagined under its name, as long as the longest.
+
+    Args:
+        dreams: the stages, each with its name; their windows follow one another.
+        scale: whole factor by which pixels are enlarged, without blurring.
+
+    Returns:
+        (frames, height, width, 3) uint8.
+    """
+    films = [_film(name, dream, scale) for name, dream in dreams]
+    length = max(map(len, films))
+    held = [np.concatenate((film, film[-1:].repeat(length - len(film), axis=0))) for film in films]
+    return np.concatenate(held, axis=1)
+
+
+def _film(name: str, dream: Dream, scale: int) -> np.ndarray:
+    pairs = zip(dream.real, dream.imagined, strict=True)
+    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=scale) for pair in pairs])
+    banner = Image.new("RGB", (frames.shape[2], 10 * scale), "white")
+    font = ImageFont.load_default(size=7 * scale)
+    ImageDraw.Draw(banner).text((4, scale), name, fill="black", font=font)
+    head = np.broadcast_to(np.asarray(banner), (len(frames), *np.asarray(banner).shape))
+    return np.concatenate((head, frames), axis=1)

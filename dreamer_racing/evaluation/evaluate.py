@@ -1,0 +1,369 @@
+"""Fly a policy for a number of whole episodes and measure how well it races.
+
+Shapes: N environments, K steps of an episode, A action (4).
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.evaluation.trajectory import CRASHES, FINISHED, TIMEOUT, Trajectory, TrajectoryRecorder
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What one whole episode came to.
+
+    Args:
+        reward_sum: undiscounted return, at the environment's present b₂.
+        length: control steps.
+        duration: s.
+        gates_passed: number of gates.
+        outcome: ``finished``, ``timeout`` or one of ``CRASHES``.
+        lap_times: of each complete lap, s; the first one starts at rest.
+        gate_offsets: at each pass, distance from the gate's centre, m.
+        speed_max: m/s.
+        speed_mean: m/s.
+        action_change_mean: mean norm of the change of the action from one control step to the next, in units of the
+            action, whose four numbers lie in [−1, 1]; 0 of an episode of one step.
+        crash_gate: index of the gate that was next when the drone crashed, from 0; None if it did not.
+    """
+
+    reward_sum: float
+    length: int
+    duration: float
+    gates_passed: int
+    outcome: str
+    lap_times: list[float]
+    gate_offsets: list[float]
+    speed_max: float
+    speed_mean: float
+    action_change_mean: float
+    crash_gate: int | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The episodes of an evaluation, and statistics of them.
+
+    Args:
+        episodes: every episode, in the order in which they were dealt to the environments.
+        num_gates: race gates of the track.
+        trajectories: the recorded ones.
+    """
+
+    episodes: list[Episode]
+    num_gates: int
+    trajectories: list[Trajectory] = field(default_factory=list)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of episodes in which all laps were finished without a crash."""
+        return _mean([episode.outcome == FINISHED for episode in self.episodes])
+
+    @property
+    def timeout_rate(self) -> float:
+        """Share of episodes that ran out of time."""
+        return _mean([episode.outcome == TIMEOUT for episode in self.episodes])
+
+    @property
+    def crashes(self) -> dict[str, int]:
+        """Number of episodes that ended by each cause of a crash, zeros included."""
+        return {cause: sum(episode.outcome == cause for episode in self.episodes) for cause in CRASHES}
+
+    @property
+    def crashes_by_gate(self) -> dict[str, list[int]]:
+        """For each cause of a crash, the number of episodes that ended by it on the way to each of the gates."""
+        return {
+            cause: [
+                sum(episode.outcome == cause and episode.crash_gate == gate for episode in self.episodes)
+                for gate in range(self.num_gates)
+            ]
+            for cause in CRASHES
+        }
+
+    @property
+    def gates_per_episode(self) -> float:
+        """Mean number of gates passed in an episode."""
+        return _mean([episode.gates_passed for episode in self.episodes])
+
+    @property
+    def return_mean(self) -> float:
+        """Mean undiscounted return."""
+        return _mean([episode.reward_sum for episode in self.episodes])
+
+    @property
+    def return_std(self) -> float:
+        """Standard deviation of the return over these episodes (0 of a single one)."""
+        mean = self.return_mean
+        return _mean([(episode.reward_sum - mean) ** 2 for episode in self.episodes]) ** 0.5
+
+    @property
+    def episode_length(self) -> float:
+        """Mean number of control steps of an episode."""
+        return _mean([episode.length for episode in self.episodes])
+
+    @property
+    def lap_times(self) -> list[float]:
+        """Times of all complete laps, also of episodes that ended in a crash later, s."""
+        return [time for episode in self.episodes for time in episode.lap_times]
+
+    @property
+    def lap_time_best(self) -> float | None:
+        """Time of the fastest complete lap, s; None if there was no lap."""
+        return min(self.lap_times, default=None)
+
+    @property
+    def lap_time_mean(self) -> float | None:
+        """Mean time of a complete lap, s; None if there was no lap."""
+        return _mean(self.lap_times) if self.lap_times else None
+
+    @property
+    def speed_max(self) -> float:
+        """Highest speed at the end of any control step, m/s."""
+        return max(episode.speed_max for episode in self.episodes)
+
+    @property
+    def speed_mean(self) -> float:
+        """Mean speed over all control steps, m/s."""
+        flown = sum(episode.speed_mean * episode.length for episode in self.episodes)
+        return flown / sum(episode.length for episode in self.episodes)
+
+    @property
+    def gate_offset_mean(self) -> float | None:
+        """Mean distance from the gate's centre at a pass, m; None if no gate was passed."""
+        offsets = [offset for episode in self.episodes for offset in episode.gate_offsets]
+        return _mean(offsets) if offsets else None
+
+    @property
+    def action_change_mean(self) -> float:
+        """Mean norm of the change of the action over all pairs of successive control steps: 0 is smoothest.
+
+        The pairs are those of one episode; actions are taken as the drone takes them, clipped to [−1, 1].
+        """
+        changes = sum(episode.action_change_mean * (episode.length - 1) for episode in self.episodes)
+        return changes / max(1, sum(episode.length - 1 for episode in self.episodes))
+
+    @classmethod
+    def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """Put evaluations on tracks with the same number of gates together, in order."""
+        return cls(
+            [episode for part in parts for episode in part.episodes],
+            parts[0].num_gates,
+            [trajectory for part in parts for trajectory in part.trajectories],
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all statistics and, under ``episodes``, every episode; nothing but what JSON knows."""
+        names = (
+            "success_rate",
+            "gates_per_episode",
+            "lap_time_best",
+            "lap_time_mean",
+            "speed_max",
+            "speed_mean",
+            "gate_offset_mean",
+            "action_change_mean",
+            "crashes",
+            "crashes_by_gate",
+            "timeout_rate",
+            "return_mean",
+            "return_std",
+            "episode_length",
+        )
+        statistics = {name: getattr(self, name) for name in names}
+        return {"num_episodes": len(self.episodes), **statistics, "episodes": [asdict(e) for e in self.episodes]}
+
+    def to_json(self) -> str:
+        """Return ``to_dict`` as the text of ``evaluation.json``."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+    def summary(self) -> str:
+        """Return a small table for a person."""
+        crashes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.crashes.items() if count)
+        finished = sum(episode.outcome == FINISHED for episode in self.episodes)
+        timeouts = sum(episode.outcome == TIMEOUT for episode in self.episodes)
+        best, mean, offset = (
+            "–" if value is None else f"{value:.2f} {unit}"
+            for value, unit in ((self.lap_time_best, "s"), (self.lap_time_mean, "s"), (self.gate_offset_mean, "m"))
+        )
+        rows = (
+            ("episodes", f"{len(self.episodes)}, {self.episode_length:.0f} steps on average"),
+            ("finished", f"{finished} ({self.success_rate:.0%}); {timeouts} ran out of time"),
+            ("crashed", crashes or "0"),
+            ("gates per episode", f"{self.gates_per_episode:.2f}"),
+            ("lap time", f"best {best}, mean {mean} ({len(self.lap_times)} laps)"),
+            ("speed", f"max {self.speed_max:.1f} m/s, mean {self.speed_mean:.1f} m/s"),
+            ("gate offset", f"mean {offset}"),
+            ("action change", f"mean {self.action_change_mean:.3f} a step"),
+            ("return", f"{self.return_mean:.1f} ± {self.return_std:.1f}"),
+        )
+        return "\n".join(f"{name:<18} {value}" for name, value in rows)
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int,
+    *,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    num_trajectories: int = 1,
+    max_recorded_steps: int = 1000,
+    record_pixels: bool = True,
+) -> Evaluation:
+    """Fly exactly this many whole episodes.
+
+    Episodes are dealt to the environments beforehand (number k to environment k mod N), so that how long an episode
+    lasts has no influence on whether it counts. Only recorded images are kept.
+
+    Args:
+        env: a `DroneRacingEnv` with ``evaluation=True``, batch size [N], or a `TransformedEnv` of one with whatever
+            the policy needs (`InitTracker`, `TensorDictPrimer`). It is reset first, and left in the middle of episodes.
+        policy: writes ``action``; put it into the mode wanted (for instance ``DreamerPolicy.deterministic``).
+        episodes: how many.
+        exploration_type: what TorchRL's probabilistic policies return: mode or sample.
+        num_trajectories: the first episode of this many environments is recorded.
+        max_recorded_steps: a recording stops here, K at most.
+        record_pixels: whether recordings keep images, 12 KB a step.
+
+    Returns:
+        The episodes and the recordings.
+
+    Raises:
+        ValueError: the environment is no evaluation environment or lacks what is measured, or no episode is asked for.
+
+    Example:
+        >>> env = DroneRacingEnv("circle", num_envs=2, from_pixels=False, evaluation=True, episode_steps=5)
+        >>> policy = TensorDictModule(lambda position: torch.zeros(2, 4), [("privileged", "position")], ["action"])
+        >>> evaluate(env, policy, episodes=3).episode_length
+        5.0
+    """
+    control_dt = _check(env, episodes)
+    num_envs = env.batch_size[0]
+    shares = [episodes // num_envs + (index < episodes % num_envs) for index in range(num_envs)]
+    logs = [_EpisodeLog(control_dt) for _ in range(num_envs)]
+    flown: list[list[Episode]] = [[] for _ in range(num_envs)]
+    with set_exploration_type(exploration_type):
+        tensordict = env.reset()
+        recorder = TrajectoryRecorder(
+            tensordict, min(num_trajectories, num_envs, episodes), max_recorded_steps, record_pixels
+        )
+        action = torch.zeros(env.action_spec.shape, device=env.device)
+        while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
+            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            action, action_before = _as_flown(tensordict["action"]), action
+            steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))
+            for index, (log, step) in enumerate(zip(logs, steps, strict=True)):
+                if len(flown[index]) < shares[index]:
+                    flown[index] += log.add(step)
+            recorder.add(tensordict, [_outcome(step) for step in steps])
+            tensordict = following
+    waves = range(max(shares))
+    ordered = [flown[index][wave] for wave in waves for index in range(num_envs) if wave < shares[index]]
+    return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt))
+
+
+def _check(env: EnvBase, episodes: int) -> float:
+    """Refuse what cannot be evaluated; return the duration of a control step, s."""
+    if episodes < 1:
+        raise ValueError(f"episodes={episodes}: at least one episode is needed.")
+    if len(env.batch_size) != 1:
+        raise ValueError(f"env has batch size {list(env.batch_size)}; evaluate() takes a batched one, [N].")
+    if not env.worlds.evaluation:
+        raise ValueError(
+            "env is a training environment: its episodes begin at random places and never finish. "
+            "Make it with DroneRacingEnv(..., evaluation=True)."
+        )
+    if ("privileged", "linear_velocity") not in env.observation_spec.keys(include_nested=True):
+        raise ValueError(
+            "env has no ('privileged', ...) entries, from which speed and paths are read: privileged=True."
+        )
+    return float(env.worlds.parameters.control_dt)
+
+
+def _as_flown(action: Tensor) -> Tensor:
+    """Return actions (N, A) as the drones take them; one that is not finite ends its episode and counts as zero."""
+    return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
+
+
+def _read_step(after: TensorDictBase, action_change: Tensor) -> list[dict[str, float]]:
+    """Read what is measured in one step; one dictionary for each of the N environments, in one transfer.
+
+    Args:
+        after: what the step led to.
+        action_change: norm of the change from the action before, (N, 1).
+    """
+    columns = {
+        "action_change": action_change,
+        "target_gate": after["privileged", "target_gate"],
+        "reward": after["reward"],
+        "done": after["done"],
+        "speed": after["privileged", "linear_velocity"].norm(dim=-1, keepdim=True),
+        **{name: after["race", name] for name in ("crash", "finished", "gates_passed", "gate_offset", "lap_time")},
+    }
+    rows = torch.cat([column.double() for column in columns.values()], dim=-1).tolist()  # (N, columns)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+def _outcome(step: dict[str, float]) -> str | None:
+    """Name how the episode ended in this step; None if it goes on."""
+    if not step["done"]:
+        return None
+    if step["crash"]:
+        return CrashCause(int(step["crash"])).name.lower()
+    return FINISHED if step["finished"] else TIMEOUT
+
+
+class _EpisodeLog:
+    """Adds up one environment's steps to episodes."""
+
+    def __init__(self, control_dt: float) -> None:
+        self._control_dt = control_dt
+        self._values: dict[str, list[float]] = defaultdict(list)
+
+    def add(self, step: dict[str, float]) -> list[Episode]:
+        """Add one step; return the episode that it ended, if it did."""
+        for name in ("reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change"):
+            self._values[name].append(step[name])
+        outcome = _outcome(step)
+        if outcome is None:
+            return []
+        values, self._values = self._values, defaultdict(list)
+        speeds = [speed for speed in values["speed"] if speed < float("inf")] or [0.0]  # a lost state has no speed
+        length = len(values["reward"])
+        passed = values["gates_passed"]
+        changes = values["action_change"][1:]  # the first is from another episode's last action
+        episode = Episode(
+            reward_sum=sum(values["reward"]),
+            length=length,
+            duration=length * self._control_dt,
+            gates_passed=int(step["gates_passed"]),
+            outcome=outcome,
+            lap_times=[time for time in values["lap_time"] if time > 0],
+            gate_offsets=[
+                offset
+                for offset, before, after in zip(values["gate_offset"], [0, *passed], passed, strict=False)
+                if after > before
+            ],
+            speed_max=max(speeds),
+            speed_mean=_mean(speeds),
+            action_change_mean=_mean(changes) if changes else 0.0,
+            crash_gate=int(step["target_gate"]) if outcome in CRASHES else None,
+        )
+        return [episode]
+
+
+def _mean(values: list[Any]) -> float:
+    return float(sum(values) / len(values))

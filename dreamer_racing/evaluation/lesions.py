@@ -1,0 +1,110 @@
+"""Camera lesions: a policy that flies by sight must fail when its images are frozen, blank or noise.
+
+Shapes: N environments, H × W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TensorDictPrimer
+
+from dreamer_racing.evaluation.protocol import RacingPolicy
+
+GREY = 128
+Lesion = Callable[[Tensor, Tensor], Tensor]
+"""Images (N, H, W, 3) uint8 and where an episode begins, (N,) bool → the images that the policy sees instead."""
+
+
+class Intact:
+    """Leaves images as they are: what lesions are compared with."""
+
+    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
+        """Return the images."""
+        return pixels
+
+
+class Frozen:
+    """Shows the first image of an episode until its end."""
+
+    def __init__(self) -> None:
+        self._first: Tensor | None = None  # (N, H, W, 3)
+
+    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
+        """Return the first images; where an episode begins, these."""
+        begins = is_init.view(-1, 1, 1, 1)
+        self._first = pixels.clone() if self._first is None else torch.where(begins, pixels, self._first)
+        return self._first
+
+
+class Blank:
+    """Shows grey."""
+
+    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
+        """Return grey images."""
+        return torch.full_like(pixels, GREY)
+
+
+class Noise:
+    """Shows uniform noise, drawn anew for every pixel, colour and step.
+
+    Args:
+        seed: of the noise.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
+        """Return noise."""
+        noise = torch.randint(256, pixels.shape, generator=self._generator, dtype=torch.uint8)
+        return noise.to(pixels.device)
+
+
+LESIONS: dict[str, Callable[[], Lesion]] = {"intact": Intact, "frozen": Frozen, "blank": Blank, "noise": Noise}
+"""Makers of lesions by name; one is made for every flight, for it may remember images."""
+
+
+class LesionedPolicy(torch.nn.Module):
+    """A policy behind a lesion of its camera; nothing but the policy sees the other images.
+
+    Args:
+        policy: that reads ``pixels``.
+        lesion: what happens to them.
+
+    Example:
+        >>> result = fly(LesionedPolicy(policy, Blank()), {"track": "circle"}, episodes=10)
+    """
+
+    def __init__(self, policy: RacingPolicy, lesion: Lesion) -> None:
+        super().__init__()
+        self.policy = policy
+        self._lesion = lesion
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether the policy takes modes instead of samples."""
+        return self.policy.deterministic
+
+    @deterministic.setter
+    def deterministic(self, deterministic: bool) -> None:
+        self.policy.deterministic = deterministic
+
+    def make_primer(self) -> TensorDictPrimer:
+        """Make the policy's own."""
+        return self.policy.make_primer()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act on the images that the lesion leaves.
+
+        Raises:
+            ValueError: there are no images.
+        """
+        pixels = tensordict.get("pixels", None)
+        if pixels is None:
+            raise ValueError("a camera lesion needs a policy that sees: the environment has no 'pixels'.")
+        seen = tensordict.copy().set("pixels", self._lesion(pixels, tensordict["is_init"].flatten()))
+        return self.policy(seen).set("pixels", pixels)

@@ -1,0 +1,249 @@
+"""The evaluation protocol: under which conditions a policy is flown, and the table of what came of it.
+
+docs/evaluation.md says what is measured and why. Shapes: N environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
+
+from dreamer_racing.envs.simulator.looks import LooksRandomisation
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import Track, displace_gates, load_track
+from dreamer_racing.evaluation.evaluate import Evaluation, evaluate
+
+EPISODES = 100
+"""The fewest episodes of each condition that the protocol asks for."""
+
+PRESETS = ("easy", "faithful")
+MODES = ("deterministic", "stochastic")
+
+
+class RacingPolicy(Protocol):
+    """What is flown: a module on tensordicts of batch size [N] that writes ``action``."""
+
+    deterministic: bool
+    """Whether it takes modes instead of samples; may be set at any time."""
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, and what the policy remembers."""
+        ...
+
+    def make_primer(self) -> TensorDictPrimer:
+        """Make the transform that adds what the policy remembers to an environment."""
+        ...
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way in which a race differs from the one that the agent was trained on.
+
+    Args:
+        name: in files.
+        meaning: in words.
+        start_noise: of the start pose, as a multiple of the noise of training starts.
+        camera_tilt: half-width of the uniform draw that is added to the camera's tilt in every episode, degrees.
+        gate_shift: radius of the ball in which every gate is displaced, m.
+        gate_turn: half-width of the uniform draw of every gate's turn, degrees.
+        num_tracks: how many displaced tracks there are; episodes are dealt evenly to them.
+    """
+
+    name: str
+    meaning: str
+    start_noise: float = 0.0
+    camera_tilt: float = 0.0
+    gate_shift: float = 0.0
+    gate_turn: float = 0.0
+    num_tracks: int = 1
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether nothing changes for an agent without a camera."""
+        return self.camera_tilt > 0.0
+
+    def races(self, track: Track, seed: int) -> Iterator[dict[str, Any]]:
+        """Yield the arguments of `DroneRacingEnv` of each of the condition's tracks.
+
+        Raises:
+            TrackError: the gates cannot be displaced like that.
+        """
+        looks = None
+        if self.camera_tilt:
+            looks = LooksRandomisation(0.0, 0.0, 0.0, camera_tilt=self.camera_tilt, field_of_view=0.0, noise=0.0)
+        for number in range(self.num_tracks):
+            displaced = track
+            if self.gate_shift or self.gate_turn:
+                displaced = displace_gates(track, self.gate_shift, self.gate_turn, seed + number)
+            yield {"track": displaced, "start_noise": self.start_noise, "looks": looks, "seed": seed + number}
+
+
+CONDITIONS = (
+    Condition("nominal", "the race as trained: from the start pose, at rest"),
+    Condition(
+        "start_noise",
+        "starts within ±1.0/1.0/0.6 m, ±10° roll and pitch, ±20° yaw: twice the noise of training",
+        start_noise=2.0,
+    ),
+    Condition("camera_tilt", "camera tilted by up to ±5° more or less than in training", camera_tilt=5.0),
+    Condition(
+        "gate_displacement",
+        "every gate moved by up to 0.3 m and turned by up to ±10°: ten such tracks",
+        gate_shift=0.3,
+        gate_turn=10.0,
+        num_tracks=10,
+    ),
+)
+"""The conditions of the protocol; their numbers are this project's choice [choice]."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one condition, with one preset of physics and one mode of the policy."""
+
+    preset: str
+    condition: str
+    mode: str
+    track: Track  # of the recorded flight; the others may be displaced otherwise
+    evaluation: Evaluation
+
+    @property
+    def name(self) -> str:
+        """For files."""
+        return f"{self.preset}_{self.condition}_{self.mode}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the statistics without the episodes; nothing but what JSON knows."""
+        statistics = self.evaluation.to_dict()
+        del statistics["episodes"]
+        return {"preset": self.preset, "condition": self.condition, "policy": self.mode, **statistics}
+
+
+def run_protocol(
+    policy: RacingPolicy,
+    worlds: Mapping[str, Any],
+    episodes: int = EPISODES,
+    *,
+    conditions: Sequence[Condition] = CONDITIONS,
+    presets: Sequence[str] = PRESETS,
+    num_envs: int = 20,
+    seed: int = 0,
+) -> Iterator[Result]:
+    """Fly a policy under all conditions, with each preset, in both modes, and yield what came of each.
+
+    Conditions that only a camera feels are left out for an agent without images.
+
+    Args:
+        policy: what is flown.
+        worlds: arguments of `DroneRacingEnv`: ``track``, ``camera``, ``renderer``, ``from_pixels``.
+        episodes: of each condition.
+        conditions: which.
+        presets: of physics.
+        num_envs: episodes flown side by side.
+        seed: of starts, displaced gates, physics and looks: the same races for both modes, and for every policy.
+    """
+    track = load_track(worlds["track"])
+    for preset in presets:
+        for condition in conditions:
+            if condition.needs_images and not worlds.get("from_pixels", True):
+                continue
+            races = list(condition.races(track, seed))
+            shares = [episodes // len(races) + (index < episodes % len(races)) for index in range(len(races))]
+            for mode in MODES:
+                parts = [
+                    fly(
+                        policy,
+                        {**worlds, "preset": preset, **race},
+                        share,
+                        mode == "deterministic",
+                        num_envs,
+                        num_trajectories=int(race is races[0]),
+                    )
+                    for race, share in zip(races, shares, strict=True)
+                    if share
+                ]
+                yield Result(preset, condition.name, mode, races[0]["track"], Evaluation.join(parts))
+
+
+def fly(
+    policy: RacingPolicy,
+    worlds: Mapping[str, Any],
+    episodes: int,
+    deterministic: bool = True,
+    num_envs: int = 20,
+    **recording: Any,
+) -> Evaluation:
+    """Make races, fly a policy in them, and free them.
+
+    Args:
+        policy: what is flown, on whichever device it is.
+        worlds: arguments of `DroneRacingEnv`.
+        episodes: how many.
+        deterministic: the mode of the policy.
+        num_envs: episodes flown side by side.
+        recording: arguments of `evaluate`: ``num_trajectories``, ``max_recorded_steps``, ``record_pixels``.
+    """
+    base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, **worlds)
+    env = TransformedEnv(base, Compose(InitTracker(), policy.make_primer()))
+    policy.deterministic = deterministic
+    weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        return policy(tensordict.to(weight.device)).to(base.device)
+
+    try:
+        return evaluate(env, act, episodes, **{"max_recorded_steps": base.worlds.race.episode_steps, **recording})
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def results_table(results: Sequence[Result], condition: str = "condition") -> str:
+    """Write results as a Markdown table, one row each.
+
+    Args:
+        results: what came of the conditions.
+        condition: what a condition is called at the table's head.
+    """
+    head = (
+        "physics", condition, "policy", "success", "gates", "best lap (s)", "mean lap (s)", "top speed (m/s)",
+        "mean speed (m/s)", "gate offset (m)", "action change", "crashes",
+    )  # fmt: skip
+    rows = [head, ("---",) * len(head)]
+    for result in results:
+        flown = result.evaluation
+        rows.append(
+            (
+                result.preset,
+                result.condition,
+                result.mode,
+                f"{flown.success_rate:.0%}",
+                f"{flown.gates_per_episode:.2f}",
+                _number(flown.lap_time_best),
+                _number(flown.lap_time_mean),
+                f"{flown.speed_max:.1f}",
+                f"{flown.speed_mean:.1f}",
+                _number(flown.gate_offset_mean),
+                f"{flown.action_change_mean:.3f}",
+                crashes_in_words(flown),
+            )
+        )
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def crashes_in_words(evaluation: Evaluation) -> str:
+    """Name how many episodes crashed, by which cause and on the way to which gate, counted from 1."""
+    words = []
+    for cause, counts in evaluation.crashes_by_gate.items():
+        places = [f"{count} at gate {gate}" for gate, count in enumerate(counts, start=1) if count]
+        if places:
+            words.append(f"{cause.replace('_', ' ')}: {', '.join(places)}")
+    return "; ".join(words) or "none"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"

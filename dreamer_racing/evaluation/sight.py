@@ -1,0 +1,153 @@
+"""What the nose camera looks at: how far its axis points away from gates and decoys, and which of them it sees.
+
+A gate is taken for its centre, and a decoy likewise. It is in view while that point projects into the image; what may
+stand before it (another gate's frame, nothing else) is ignored, and so is the side from which a gate is seen, for both
+look the same. Reference: paper, Fig. "Ablation study on the perception aware behaviour".
+
+Shapes: K control steps of an episode, L points, M observations, G race gates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.evaluation.evaluate import Trajectory
+
+NEXT_GATE, NEAREST_VISIBLE_GATE = "next gate", "nearest visible gate"
+QUANTILES = (5, 25, 50, 75, 95)  # percent
+BIN_DEGREES = 5
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How one thing stood to the camera in each of M observations."""
+
+    angle: Tensor
+    """(M,) between the camera's axis and the direction from the camera to the thing, degrees; NaN where it is none."""
+    in_view: Tensor
+    """(M,) bool: its centre was in the image."""
+
+    @property
+    def share_in_view(self) -> float:
+        """Share of observations, and so of time, in which it was in view."""
+        return float(self.in_view.float().mean())
+
+    def histogram(self) -> Tensor:
+        """Return the share of its observations in each bin of 5° from 0° to 180°, (36,)."""
+        angles = self.angle[self.angle.isfinite()]
+        bins = 180 // BIN_DEGREES
+        counts = torch.bincount((angles / BIN_DEGREES).long().clamp(0, bins - 1), minlength=bins)
+        return counts / max(1, len(angles))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return share, mean, quantiles and histogram of the angle; nothing but what JSON knows."""
+        angles = self.angle[self.angle.isfinite()].double()
+        levels = torch.tensor(QUANTILES, dtype=torch.float64) / 100
+        quantiles = angles.quantile(levels).tolist() if len(angles) else [None] * len(QUANTILES)
+        return {
+            "observations": len(self.angle),
+            "share_in_view": self.share_in_view,
+            "angle_mean_degrees": float(angles.mean()) if len(angles) else None,
+            "angle_quantiles_degrees": {f"{level} %": value for level, value in zip(QUANTILES, quantiles, strict=True)},
+            "angle_histogram": [round(share, 5) for share in self.histogram().tolist()],
+        }
+
+
+def measure_sight(
+    trajectories: Sequence[Trajectory], track: Track, camera: Camera, decoys: Sequence[Gate] = ()
+) -> dict[str, Sight]:
+    """Measure what the camera was turned to, over all observations of some flights.
+
+    Args:
+        trajectories: the flights.
+        track: whose race gates were flown through.
+        camera: the nose camera.
+        decoys: where decoys stand, or would stand if there were any.
+
+    Returns:
+        ``next gate``: the one to pass next. ``nearest visible gate``: of the race gates in view the one nearest to the
+        camera; its angle is NaN while none is in view. ``decoy 1``, ``decoy 2`` and so on; ``any decoy``:
+        in view if one of them is; its angle is that to the one nearest to the camera's axis.
+    """
+    position, attitude, target_gate = (
+        torch.cat([getattr(trajectory, name) for trajectory in trajectories])
+        for name in ("position", "attitude", "target_gate")
+    )
+    known = position.isfinite().all(-1) & attitude.isfinite().all(-1)
+    position, attitude, target_gate = position[known].double(), attitude[known].double(), target_gate[known]
+    gates = points_in_camera(position, attitude, track.gate_positions(dtype=torch.float64), camera)  # (M, G, 3)
+    row = torch.arange(len(gates))
+    angle, in_view = angles(gates), is_in_view(gates, camera)  # (M, G)
+    distance = gates.norm(dim=-1).masked_fill(~in_view, math.inf)
+    nearest = distance.argmin(-1)
+    any_gate = in_view.any(-1)
+    sights = {
+        NEXT_GATE: Sight(angle[row, target_gate], in_view[row, target_gate]),
+        NEAREST_VISIBLE_GATE: Sight(angle[row, nearest].masked_fill(~any_gate, math.nan), any_gate),
+    }
+    if decoys:
+        places = torch.tensor([gate.position for gate in decoys], dtype=torch.float64)
+        points = points_in_camera(position, attitude, places, camera)  # (M, L, 3)
+        angle, in_view = angles(points), is_in_view(points, camera)
+        sights |= {f"decoy {number + 1}": Sight(angle[:, number], in_view[:, number]) for number in range(len(decoys))}
+        sights["any decoy"] = Sight(angle.amin(-1), in_view.any(-1))
+    return sights
+
+
+def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
+    """Return points in the camera's own axes.
+
+    Args:
+        position: of the drone, (M, 3), m.
+        attitude: of the drone, (M, 4) wxyz, body → world.
+        points: in the world, (L, 3), m.
+        camera: the nose camera.
+
+    Returns:
+        (M, L, 3) m: along the camera's axis, to the left, and up in the image.
+    """
+    mount = torch.tensor(camera.position, dtype=position.dtype)
+    eye = position + rotate(attitude, mount.expand_as(position))  # (M, 3)
+    body = rotate_inverse(attitude.unsqueeze(1).expand(-1, len(points), 4), points - eye.unsqueeze(1))  # (M, L, 3)
+    x, left, z = body.unbind(-1)
+    cosine, sine = math.cos(math.radians(camera.tilt)), math.sin(math.radians(camera.tilt))
+    return torch.stack((cosine * x + sine * z, left, cosine * z - sine * x), dim=-1)
+
+
+def angles(points: Tensor) -> Tensor:
+    """Return the angles between the camera's axis and points (..., 3) in its axes, (...), degrees."""
+    return torch.rad2deg(torch.atan2(points[..., 1:].norm(dim=-1), points[..., 0]))
+
+
+def is_in_view(points: Tensor, camera: Camera) -> Tensor:
+    """Tell which points (..., 3) in the camera's axes project into the image, (...) bool."""
+    up = math.tan(math.radians(camera.field_of_view) / 2)
+    left = up * camera.width / camera.height
+    depth = points[..., 0]
+    return (depth > 0) & (points[..., 1].abs() <= left * depth) & (points[..., 2].abs() <= up * depth)
+
+
+def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
+    """Write what the camera was turned to as a Markdown table.
+
+    Args:
+        flights: the sights of each kind of flight, by name.
+    """
+    head = ("flights", "looked at", "in view", "angle: mean", *(f"{level} %" for level in QUANTILES))
+    rows = [head, ("---",) * len(head)]
+    for flight, sights in flights.items():
+        for name, sight in sights.items():
+            numbers = sight.to_dict()
+            values = [numbers["angle_mean_degrees"], *numbers["angle_quantiles_degrees"].values()]
+            cells = ("–" if value is None else f"{value:.0f}°" for value in values)
+            rows.append((flight, name, f"{sight.share_in_view:.0%}", *cells))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"

@@ -1,0 +1,126 @@
+"""One recorded flight, and the recorder that makes it.
+
+Shapes: N environments, M of them recorded, K steps of an episode, A action (4).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from dreamer_racing.envs.race.gates import CrashCause
+
+FINISHED, TIMEOUT = "finished", "timeout"
+CRASHES = tuple(cause.name.lower() for cause in CrashCause if cause is not CrashCause.NONE)
+"""Names of the causes of a crash; an episode's outcome is one of these, ``finished`` or ``timeout``."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One recorded episode of K control steps, all tensors on the CPU; row 0 is before the first step."""
+
+    position: Tensor
+    """(K + 1, 3) m."""
+    attitude: Tensor
+    """(K + 1, 4) unit quaternion wxyz, body → world."""
+    linear_velocity: Tensor
+    """(K + 1, 3) in the world, m/s."""
+    target_gate: Tensor
+    """(K + 1,) int64: the gate to pass next."""
+    action: Tensor
+    """(K, A): row k leads from k to k + 1."""
+    pixels: Tensor | None
+    """(K + 1, H, W, 3) uint8, or None if the environment has no images."""
+    control_dt: float
+    """Duration of a step, s."""
+    outcome: str | None
+    """How the episode ended; None if the recording was stopped before its end."""
+
+    @property
+    def speed(self) -> Tensor:
+        """(K + 1,) m/s."""
+        return self.linear_velocity.norm(dim=-1)
+
+    def part(self, first: int, last: int) -> Trajectory:
+        """Return the stretch from row ``first`` to row ``last``, both included; its end is open if it is cut off."""
+        rows = {name: getattr(self, name)[first : last + 1] for name in ("position", "attitude", "linear_velocity")}
+        return Trajectory(
+            **rows,
+            target_gate=self.target_gate[first : last + 1],
+            action=self.action[first:last],
+            pixels=None if self.pixels is None else self.pixels[first : last + 1],
+            control_dt=self.control_dt,
+            outcome=self.outcome if last >= len(self.position) - 1 else None,
+        )
+
+    @property
+    def crashed(self) -> bool:
+        """Whether the last row is where the drone crashed."""
+        return self.outcome in CRASHES
+
+
+class TrajectoryRecorder:
+    """Records the first episode of the first M environments, all of them with one copy per step and entry.
+
+    Args:
+        root: after the reset, batch size [N].
+        count: M, at most N.
+        max_steps: a recording stops here, K at most.
+        pixels: whether to keep images too, where there are any.
+    """
+
+    def __init__(self, root: TensorDictBase, count: int, max_steps: int, pixels: bool = True) -> None:
+        self._max_steps = max_steps
+        self._pixels = pixels
+        self._rows: dict[str, list[Tensor]] = defaultdict(list)  # each (M, ...)
+        self._lengths = [0] * count
+        self._outcomes: list[str | None] = [None] * count
+        self._running = [True] * count
+        if count:
+            self._observe(root)
+
+    def add(self, step: TensorDictBase, outcomes: Sequence[str | None]) -> None:
+        """Record a step, its action at the root and its observation under ``next``.
+
+        Args:
+            step: batch size [N].
+            outcomes: how the episode of each of the N environments ended in this step; None if it goes on.
+        """
+        if not any(self._running):
+            return
+        self._rows["action"].append(self._copy(step["action"].float()))
+        self._observe(step["next"])
+        for index, outcome in enumerate(outcomes[: len(self._running)]):
+            if self._running[index]:
+                self._lengths[index] += 1
+                self._outcomes[index] = outcome
+                self._running[index] = outcome is None and self._lengths[index] < self._max_steps
+
+    def trajectories(self, control_dt: float) -> list[Trajectory]:
+        """Return the M recordings; ``control_dt`` is the duration of a step, s."""
+        rows = {name: torch.stack(values) for name, values in self._rows.items()}  # each (K [+ 1], M, ...)
+        cut = []
+        for index, (length, outcome) in enumerate(zip(self._lengths, self._outcomes, strict=True)):
+            own = {
+                name: values[: length + (name != "action"), index].clone() for name, values in rows.items()
+            }  # clones, so that one recording does not keep all alive
+            pixels = own.pop("pixels", None)
+            cut.append(Trajectory(**own, pixels=pixels, control_dt=control_dt, outcome=outcome))
+        return cut
+
+    def _observe(self, tensordict: TensorDictBase) -> None:
+        for name in ("position", "attitude", "linear_velocity"):
+            self._rows[name].append(self._copy(tensordict["privileged", name]))
+        self._rows["target_gate"].append(self._copy(tensordict["privileged", "target_gate"].squeeze(-1)))
+        pixels = tensordict.get("pixels", None) if self._pixels else None
+        if pixels is not None:
+            self._rows["pixels"].append(self._copy(pixels))
+
+    def _copy(self, value: Tensor) -> Tensor:
+        """(N, ...) → (M, ...) on the CPU, not changed by later steps."""
+        return value[: len(self._running)].to("cpu", copy=True)

@@ -1,0 +1,1 @@
+"""What a policy meets: collected, dealt to streams, kept in a replay."""

@@ -1,0 +1,343 @@
+"""Replay of what a collector yields: records, batches of windows, checkpoints.
+
+Records live in per-environment streams, see `dreamer_racing.experience.streams`.
+
+Shapes: N streams (= environments), L records a stream, B windows a batch, T records a window or steps a rollout,
+M records of one rollout. The record layout is the table of ``docs/architecture.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs.transforms import Transform
+
+from dreamer_racing.experience.streams import (
+    RecordStorage,
+    StreamMemmapStorage,
+    StreamSampler,
+    StreamTensorStorage,
+    StreamWriter,
+    check_layout,
+)
+from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
+
+RACE_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
+"""The reward of a race and the terms of which `RelabelReward` recomputes it."""
+_END_KEYS = ("terminated", "truncated")
+
+
+def records_from_rollout(
+    rollout: TensorDictBase,
+    observation_keys: Sequence[NestedKey] = ("pixels",),
+    reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+    latents: LatentFormat | None = None,
+) -> TensorDictBase:
+    """Converts what a TorchRL collector yields into replay records.
+
+    Every transition gives one record, of the observation it arrived at; every root with ``is_init`` gives one more,
+    of the first observation of its episode. An episode of K steps therefore leaves K + 1 records.
+
+    Args:
+        rollout: batch ``[N, T]`` (further leading dimensions, as of a multi-process collector, are flattened into N)
+            with root keys ``action``, ``is_init`` and the observations, and ``("next", ...)`` keys of the
+            observations, the rewards, ``terminated``, ``truncated``.
+        observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
+        latents: how the policy's latents are kept as each record's ``context``: what it had in mind before it saw the
+            record's observation. None: they are not.
+
+    Returns:
+        Records, batch ``[M]`` with M = N·T + number of first observations, first all arrivals, then all first
+        observations. Beside the record's own keys: ``stream`` int64 ``(M,)``, the environment, and ``order`` int64
+        ``(M,)``, how many of these records precede it in its stream. Stored records carry neither.
+
+    Raises:
+        KeyError: if the rollout lacks a key.
+        ValueError: if the rollout has no time dimension.
+    """
+    _check_rollout(rollout, observation_keys, reward_keys, latents)
+    steps = rollout.shape[-1]
+    flat = rollout.reshape(-1)  # [N·T], environment by environment
+    is_init = flat["is_init"].reshape(-1)
+    first = is_init.nonzero().squeeze(-1)  # (K,)
+    stream = torch.arange(len(flat), device=is_init.device) // steps  # (N·T,)
+    # Records up to and including each arrival, over all streams, less those of the streams before.
+    count = (1 + is_init.long()).cumsum(0)
+    before = torch.nn.functional.pad(count[steps - 1 :: steps], (1, 0))[stream]  # (N·T,)
+    order = count - before - 1
+
+    arrival = flat["next"].select(*observation_keys, *reward_keys, *_END_KEYS)
+    arrival.update({"previous_action": flat["action"], "is_init": torch.zeros_like(flat["is_init"])})
+    arrival.update({"stream": stream, "order": order})
+    if latents is not None:
+        arrival.set(CONTEXT, latents.pack(flat["next", "belief"], flat["next", "state"]))
+    initial = flat.select(*observation_keys)[first]
+    zeros = arrival.select("previous_action", *reward_keys, *_END_KEYS, CONTEXT, strict=False)[: len(first)]
+    initial.update(zeros.apply(torch.zeros_like))
+    initial.update({"is_init": flat["is_init"][first], "stream": stream[first], "order": order[first] - 1})
+    return torch.cat([arrival, initial])
+
+
+def _check_rollout(
+    rollout: TensorDictBase,
+    observation_keys: Sequence[NestedKey],
+    reward_keys: Sequence[str],
+    latents: LatentFormat | None,
+) -> None:
+    if rollout.ndim < 2:
+        raise ValueError(f"Expected a rollout of batch [environments, time], got batch {list(rollout.shape)}.")
+    root = [*observation_keys, "action", "is_init"]
+    arrived = [*observation_keys, *reward_keys, *_END_KEYS, *(("belief", "state") if latents is not None else ())]
+    missing = [key for key in root if rollout.get(key, None) is None]
+    missing += [("next", key) for key in arrived if rollout["next"].get(key, None) is None]
+    if missing:
+        raise KeyError(
+            f"The rollout lacks {missing}. The replay needs {root} at the root and {arrived} under 'next'; "
+            "'is_init' comes from torchrl's InitTracker, the reward terms from DroneRacingEnv."
+        )
+
+
+class StreamReplay(TensorDictReplayBuffer):
+    """TorchRL replay buffer over streams; build it with `make_replay`.
+
+    ``len(replay)`` is the number of records held; a collector may be given it as its ``replay_buffer``.
+
+    Args:
+        observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
+        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
+        **kwargs: of `TensorDictReplayBuffer`.
+    """
+
+    _storage: RecordStorage
+    _writer: StreamWriter
+    _sampler: StreamSampler
+    _rng: torch.Generator
+
+    def __init__(
+        self,
+        *,
+        observation_keys: Sequence[NestedKey] = ("pixels",),
+        reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+        latents: LatentFormat | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self.observation_keys = tuple(observation_keys)
+        self.reward_keys = tuple(reward_keys)
+        self.latents = latents
+
+    def extend(self, rollout: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
+        """Appends a collector's rollout ``[N, T]``; see `records_from_rollout`. Returns the slots, int64 ``(M,)``."""
+        records = records_from_rollout(rollout, self.observation_keys, self.reward_keys, self.latents)
+        return super().extend(records, update_priority=update_priority)
+
+    def refresh(self, slots: Tensor, belief: Tensor, state: Tensor) -> None:
+        """Replaces the context of sampled records by what the world model makes of the records before them now.
+
+        Args:
+            slots: of windows just sampled (``"index"`` of the sample), int64 ``(B, T)``.
+            belief: after each of their records, ``(B, T, D)``.
+            state: likewise, ``(B, T, S)``.
+
+        Reference: danijar/dreamerv3, ``replay_context`` (latents written back to the replay after each update).
+        """
+        assert self.latents is not None, "made without latents: there is no context to refresh"
+        packed = self.latents.pack(belief[:, :-1], state[:, :-1]).flatten()
+        # Windows may overlap: of each slot the last, so that belief and state are of the same window.
+        unique, place = slots[:, 1:].cpu().flatten().unique(return_inverse=True)
+        last = torch.zeros_like(unique).scatter_reduce_(0, place, torch.arange(len(place)), "amax")
+        packed = packed[last.to(packed.device)]
+        self._storage.overwrite(unique, TensorDict({CONTEXT: packed}, packed.batch_size))
+
+    def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
+        """Returns windows ``[num_windows, length]`` of records that are never sampled, delivered as samples are.
+
+        They are drawn from the newest ``recent`` records of the streams that are held out, by how much has been
+        written. None if there are no such streams, or if those are too short yet.
+        """
+        slots = self._sampler.held_out(num_windows, length, recent)
+        if slots is None:
+            return None
+        records = self._storage.get(slots)
+        return self._transform(records) if self._transform is not None and len(self._transform) else records
+
+    def records(self, stream: int) -> TensorDictBase:
+        """Returns all records of one stream, oldest first, untransformed, batch ``[filled]``."""
+        return self._storage.get(self._writer.slots(stream))
+
+    def dumps(self, path: str | Path) -> None:
+        """Saves the filled part of every stream, the cursors and the random generator into a folder.
+
+        Plain files are written, not memory maps: on a full disk a map ends the process with a bus error.
+        """
+        path = Path(path)
+        path.mkdir(parents=True, exist_ok=True)
+        fields = []
+        for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
+            fields.append({"key": key, "shape": list(stored.shape[1:]), "dtype": str(stored.dtype)})
+            with (path / f"{number}.bin").open("wb") as file:
+                for part in self._filled():
+                    file.write(stored[part].cpu().contiguous().view(torch.uint8).numpy().data)
+        state = {"streams": self._writer.state_dict(), "fields": fields, "generator": self._rng.get_state().tolist()}
+        (path / "replay.json").write_text(json.dumps(state), encoding="utf-8")
+
+    def loads(self, path: str | Path) -> None:
+        """Restores what `dumps` saved.
+
+        Raises:
+            ValueError: if the saved streams or records do not have this replay's shape.
+        """
+        path = Path(path)
+        state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
+        saved = self._open_fields(path, state["fields"], sum(state["streams"]["filled"]))
+        self._writer.load_state_dict(state["streams"])
+        start = 0
+        for part in self._filled():
+            count = part.stop - part.start
+            self._storage.set(part, saved[start : start + count], set_cursor=False)
+            start += count
+        self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
+
+    def _filled(self) -> list[slice]:
+        """The filled slots of each stream: a ring that is not full has never wrapped."""
+        starts = range(0, self._storage.max_size, self._writer.stream_length)
+        pairs = zip(starts, self._writer.filled.tolist(), strict=True)
+        return [slice(start, start + count) for start, count in pairs if count]
+
+    def _open_fields(self, path: Path, fields: list[dict[str, Any]], count: int) -> TensorDictBase:
+        saved = TensorDict({}, batch_size=[count])
+        for number, field in enumerate(fields):
+            key = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
+            dtype = getattr(torch, field["dtype"].removeprefix("torch."))
+            size = count * math.prod(field["shape"])
+            values = torch.from_file(str(path / f"{number}.bin"), shared=False, size=size, dtype=dtype)
+            saved.set(key, values.view(count, *field["shape"]))
+        for key, stored in self._storage.fields() if fields else ():
+            check_layout(key, saved.get(key), stored)
+        return saved
+
+
+def replay_bytes(
+    capacity: int,
+    image_shape: Sequence[int] = (64, 64, 3),
+    action_size: int = 4,
+    numbers: int = 0,
+    latents: LatentFormat | None = None,
+) -> int:
+    """Returns the size in bytes of a replay of ``capacity`` records (12.3 KB each at 64×64).
+
+    Args:
+        capacity: records.
+        image_shape: of ``pixels``.
+        action_size: A.
+        numbers: float32 observed beside the image: ``vector`` and the privileged one.
+        latents: how latents are kept, if they are.
+    """
+    flags, context = 1 + len(_END_KEYS), latents.bytes if latents else 0
+    floats = action_size + len(RACE_REWARD_KEYS) + numbers
+    return capacity * (math.prod(image_shape) + 4 * floats + flags + context)
+
+
+def make_replay(
+    capacity: int,
+    num_envs: int,
+    batch_size: int,
+    batch_length: int,
+    device: torch.device | str = "cpu",
+    *,
+    storage: Literal["tensor", "memmap"] = "tensor",
+    storage_device: torch.device | str | None = None,
+    scratch_dir: str | Path | None = None,
+    seed: int = 0,
+    transform: Transform | None = None,
+    observation_keys: Sequence[NestedKey] = ("pixels",),
+    reward_keys: Sequence[str] = RACE_REWARD_KEYS,
+    recent_share: float = 0.0,
+    recent_records: int | None = None,
+    held_out: int = 0,
+    prefetch: int | None = None,
+    latents: LatentFormat | None = None,
+) -> StreamReplay:
+    """Builds the replay of N streams.
+
+    Args:
+        capacity: records in all; each stream keeps ``capacity // num_envs``.
+        num_envs: N.
+        batch_size: B, windows a sample (not records, unlike TorchRL's `SliceSampler`).
+        batch_length: T, records a window.
+        device: where samples are delivered.
+        storage: ``"tensor"`` keeps records in memory, ``"memmap"`` in files below ``scratch_dir``.
+        storage_device: where ``"tensor"`` keeps them; ``device`` if None.
+        scratch_dir: folder of ``"memmap"``, overwritten; a temporary one, removed at exit, if None.
+        seed: of the sampler's own generator.
+        transform: applied to samples, for example `RelabelReward`.
+        observation_keys: what of an observation is kept.
+        reward_keys: which rewards are kept.
+        recent_share: share of a sample's windows drawn from the newest records, so that the model soon knows where the
+            policy has come to; the others are drawn from all. Reference: danijar/dreamerv3, ``replay.fracs.recency``.
+        recent_records: how many records in all those are; all if None.
+        held_out: the last streams are kept out of samples, for `StreamReplay.held_out`.
+        prefetch: samples drawn ahead in threads, which hides the transfer to ``device``; they may lack the newest
+            records, and a restored replay then does not continue the same samples.
+        latents: how the policy's latents are kept as each record's ``context``; None: they are not.
+
+    Raises:
+        ValueError: if a stream could not hold one window, ``recent_share`` is not a share, or all streams are held out.
+
+    Example:
+        >>> replay = make_replay(capacity=100_000, num_envs=16, batch_size=16, batch_length=64)
+        >>> replay.batch_size, len(replay)
+        (16, 0)
+    """
+    if not 0.0 <= recent_share <= 1.0:
+        raise ValueError(f"recent_share={recent_share}: a share lies between 0 and 1.")
+    if not 0 <= held_out < num_envs:
+        raise ValueError(f"held_out={held_out} of num_envs={num_envs} streams: at least one must be left to sample.")
+    stream_length = capacity // num_envs
+    if stream_length < batch_length:
+        raise ValueError(
+            f"capacity={capacity} gives each of num_envs={num_envs} streams {stream_length} records, less than one "
+            f"window of batch_length={batch_length}: the capacity must be at least {num_envs * batch_length}."
+        )
+    slots = stream_length * num_envs
+    if storage == "memmap":
+        records = StreamMemmapStorage(slots, scratch_dir=scratch_dir, existsok=True)
+    else:
+        records = StreamTensorStorage(slots, device=storage_device or device)
+    writer = StreamWriter(num_envs, stream_length)
+    replay = StreamReplay(
+        storage=records,
+        writer=writer,
+        sampler=StreamSampler(
+            writer,
+            batch_length,
+            recent_share,
+            None if recent_records is None else recent_records // num_envs,
+            held_out,
+        ),
+        generator=torch.Generator().manual_seed(seed),
+        transform=transform,
+        batch_size=batch_size,
+        observation_keys=observation_keys,
+        reward_keys=reward_keys,
+        latents=latents,
+        prefetch=prefetch,
+    )
+    if records.device != torch.empty((), device=device).device:
+        # Copies from pinned memory do not wait for the device.
+        pinned = torch.device(device).type == "cuda" and records.device.type == "cpu"
+        replay.append_transform(
+            lambda sample: (sample.pin_memory() if pinned else sample).to(device, non_blocking=pinned)
+        )
+    return replay

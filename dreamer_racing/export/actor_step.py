@@ -1,0 +1,325 @@
+"""Export of the recurrent actor as one explicit step, published only if its copies fly as the original does.
+
+`ActorStep` takes all recurrent state as inputs and gives it back as outputs: ``(observation, h, z, previous_action,
+is_init[, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
+``torch.export`` program, and publishes both, with the contract of `export_contract`, only if they pass `export_parity`.
+
+Shape legend: D belief, S state = L·K, L latents, K classes, A action, V numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
+from dreamer_racing.export.parity import ACTION_TOLERANCE, Flight, TorchActor, check_parity, check_steps
+from dreamer_racing.export.weights_file import write_weights
+from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules import join_features
+from dreamer_racing.modules.rssm import mix_uniform
+from dreamer_racing.training.checkpoint import ensure_writable
+
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+OUTPUTS = ("action", "h_next", "z_next")
+WEIGHTS = "weights.safetensors"
+PROTOBUF_LIMIT = 2_000_000_000
+"""Bytes that an ONNX file may have without external data."""
+
+
+class MissingPackagesError(ImportError):
+    """Packages that only the export needs are not installed."""
+
+
+class ActorStep(nn.Module):
+    """One acting step of explicit state, with the posterior's mode for z and the actor's mean for the action.
+
+    Args:
+        agent: Its encoder, RSSM and actor are copied.
+
+    Attributes:
+        noise_shape: Shape of the input ``noise``, or None if there is none.
+
+    Raises:
+        ValueError: If the agent sees images and numbers both.
+
+    Example:
+        >>> from dreamer_racing.modules import get_size
+        >>> step = ActorStep(Agent(get_size("debug"), Interface(), decode=False))
+        >>> list(step.example_inputs())
+        ['image_u8', 'h', 'z', 'previous_action', 'is_init']
+        >>> [tuple(output.shape) for output in step(*step.example_inputs().values())]
+        [(1, 4), (1, 32), (1, 16)]
+    """
+
+    latent = "mode"
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.interface, self.size = agent.interface, agent.world_model.size
+        if len(self.interface.observation_keys) != 1:
+            seen = " and ".join(self.interface.observation_keys)
+            raise ValueError(f"This agent sees {seen}; only actors of one observation can be exported.")
+        self.encoder = copy.deepcopy(agent.world_model.encoder)
+        self.rssm = copy.deepcopy(agent.world_model.rssm)
+        self.actor = copy.deepcopy(agent.actor)
+        for parameter in self.parameters():
+            # torch.export saves no channels-last weights.
+            parameter.data = parameter.data.cpu().contiguous()
+        self.requires_grad_(False)
+
+    @property
+    def noise_shape(self) -> tuple[int, int] | None:
+        """Shape (L, K) of the noise of one step; None if it takes none."""
+        return None
+
+    def forward(
+        self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Step.
+
+        Args:
+            observation: uint8 ``(1, height, width, 3)``, or float32 ``(1, V)``.
+            h: Belief after the last step, ``(1, D)``; like the next two ignored where ``is_init``.
+            z: State after the last step, ``(1, S)``.
+            previous_action: ``(1, A)``.
+            is_init: Whether this is the first step of an episode, bool ``(1,)``.
+
+        Returns:
+            Action ``(1, A)`` in [−1, 1], next belief ``(1, D)``, next state ``(1, S)``.
+        """
+        h, z = self.rssm.observe_step(self._embed(observation), previous_action, is_init, h, z, deterministic=True)
+        return self._act(h, z)
+
+    def example_inputs(self) -> dict[str, Tensor]:
+        """Return inputs by name, in the order of ``forward``."""
+        size, interface = self.size, self.interface
+        seen = (
+            {"image_u8": torch.zeros(1, *interface.image_shape, dtype=torch.uint8)}
+            if interface.pixels
+            else {"vector": torch.zeros(1, interface.vector_dim)}
+        )
+        noise = {} if self.noise_shape is None else {"noise": torch.full((1, *self.noise_shape), 0.5)}
+        return {
+            **seen,
+            "h": torch.zeros(1, size.belief),
+            "z": torch.zeros(1, size.state),
+            "previous_action": torch.zeros(1, interface.action_dim),
+            "is_init": torch.ones(1, dtype=torch.bool),
+            **noise,
+        }
+
+    def _embed(self, observation: Tensor) -> Tensor:
+        return self.encoder({self.interface.observation_keys[0]: observation})
+
+    def _act(self, h: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.actor(join_features(h, z)).mode(), h, z
+
+
+class SampledActorStep(ActorStep):
+    """One acting step of explicit state whose z is a sample of the posterior, by the Gumbel-max trick.
+
+    The distribution is that of the training policy, which inverts the cumulative one instead. There rounding moves all
+    later classes' edges; here it matters only between the two best classes, so that copies flip less often.
+
+    Reference: Maddison et al., "A* Sampling", 2014.
+    """
+
+    latent = "sample"
+
+    @property
+    def noise_shape(self) -> tuple[int, int] | None:
+        """Shape (L, K) of the noise of one step."""
+        return self.size.latents, self.size.classes
+
+    def forward(  # type: ignore[override]  # one input more: the noise
+        self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, noise: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Step; arguments as in `ActorStep.forward`, and ``noise``: uniform numbers in [0, 1), ``(1, L, K)``."""
+        posterior = self.rssm.observe(
+            self._embed(observation).unsqueeze(1),
+            previous_action.unsqueeze(1),
+            is_init.unsqueeze(1),
+            (h, z),
+            deterministic=True,
+        )
+        probabilities = mix_uniform(posterior.posterior_logits.squeeze(1), self.rssm.unimix)
+        gumbel = -(-noise.log()).log()
+        index = (probabilities.log() + gumbel).argmax(-1, keepdim=True)
+        z = torch.zeros_like(probabilities).scatter(-1, index, 1.0).flatten(1)
+        return self._act(posterior.belief.squeeze(1), z)
+
+
+LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep, SampledActorStep)}
+"""What z is in an exported step, by name."""
+
+
+def make_step(agent: Agent, latent: str) -> ActorStep:
+    """Make the step of a latent mode.
+
+    Raises:
+        ValueError: Unknown latent mode, or an agent that cannot be exported.
+    """
+    if latent not in LATENTS:
+        raise ValueError(f"latent={latent}: there are {' and '.join(LATENTS)}.")
+    if latent == "sample" and not agent.world_model.rssm.sampled:
+        raise ValueError(
+            "latent=sample: this agent's states are the probabilities of their categoricals, of which nothing is drawn "
+            "(model.sampled=false): export it with latent=mode."
+        )
+    return LATENTS[latent](agent)
+
+
+def check_output(output: str | Path) -> Path:
+    """Refuse what could only fail after the work is done.
+
+    Returns:
+        The absolute path of the ``.onnx`` file to be; its folder exists.
+
+    Raises:
+        ValueError: Another suffix, or a folder that already holds the contract of another actor.
+        PermissionError: The folder cannot be written.
+        MissingPackagesError: Packages that the export needs are not installed.
+    """
+    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise MissingPackagesError(
+            f"The export needs {', '.join(missing)}, not installed here: pip install 'dreamer_racing[export]' "
+            "(in a checkout: pip install -e '.[export]')."
+        )
+    output = Path(output).expanduser().absolute()
+    if output.suffix != ".onnx":
+        raise ValueError(f"output={output}: the name must end in .onnx, for instance {output.with_suffix('.onnx')}.")
+    try:
+        ensure_writable(output.parent)
+    except PermissionError as error:
+        reason = error.__cause__ or error
+        raise PermissionError(f"output={output}: cannot write to its folder ({reason}).") from error
+    contract = output.parent / CONTRACT
+    if contract.exists() and not output.exists():
+        raise ValueError(
+            f"output={output}: {contract} describes another actor. Every actor has a folder of its own: choose another "
+            "folder, or remove that export."
+        )
+    return output
+
+
+def export_actor(
+    step: ActorStep,
+    contract: Mapping[str, Any],
+    flight: Flight,
+    output: str | Path,
+    seed: int = 0,
+    shared_weights: bool = False,
+) -> dict[str, float]:
+    """Write a step as ``.onnx`` and ``.pt2`` with contract.json beside them, if both fly as the original does.
+
+    Args:
+        step: The step.
+        contract: From `export_contract.make_contract`.
+        flight: To compare them over, at least ``MIN_STEPS`` steps.
+        output: Path of the ``.onnx`` file; the ``.pt2`` has the same stem. Those of an earlier export are replaced.
+        seed: Of the noise that samples latents in the comparison.
+        shared_weights: Keep the weights in a file beside the ``.onnx``, which torch can read too, instead of inside of
+            it; the ``.pt2``, which would hold them once more, is compared and left out.
+
+    Returns:
+        Largest deviation of an action from the original's, of either.
+
+    Raises:
+        ParityError: If one does not fly alike; no file is left and those of an earlier export stay.
+        ValueError: If the flight is too short, or the weights too many for one ONNX file; as `check_output`.
+        PermissionError, MissingPackagesError: As `check_output`.
+    """
+    check_steps(len(flight.observations))
+    output = check_output(output)
+    partial = output.parent / f".{output.stem}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    try:
+        onnx, program = partial / output.name, partial / output.with_suffix(".pt2").name
+        write_step(step, onnx, program)
+        written = {"onnx": onnx, "torch_export": program}
+        if shared_weights:
+            written = {"onnx": onnx, "weights": partial / WEIGHTS}
+            share_weights(step, onnx, written["weights"])
+        files = {kind: {"name": path.name, "sha256": hash_file(path)} for kind, path in written.items()}
+        full = {**contract, "files": files}
+        _write_json(partial / CONTRACT, full)
+        actors: dict[str, RecurrentActor] = {
+            "torch": TorchActor(full, step),
+            "onnxruntime": OnnxActor(onnx),
+            "torch.export": TorchActor(full, torch.export.load(program).module()),
+        }
+        deviation = check_parity(actors, flight, seed)
+        full["verification"] = {
+            "steps": len(flight.observations),
+            "episodes": flight.episodes,
+            "action_deviation_max": deviation,
+            "action_deviation_allowed": ACTION_TOLERANCE,
+            "latent_flips": 0,
+        }
+        _write_json(partial / CONTRACT, full)
+        for path in (*written.values(), partial / CONTRACT):
+            os.replace(path, output.parent / path.name)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return deviation
+
+
+def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
+    """Write a step as ONNX file, weights inside, and as ``torch.export`` program.
+
+    Raises:
+        ValueError: If the weights are too many for one ONNX file.
+    """
+    size = sum(parameter.nbytes for parameter in step.parameters())
+    if size >= PROTOBUF_LIMIT:
+        raise ValueError(f"The actor's weights are {size / 1e9:.1f} GB; an ONNX file holds less than 2 GB.")
+    inputs = step.example_inputs()
+    with torch.no_grad():
+        exported = torch.export.export(step, tuple(inputs.values()))
+    for node in exported.graph.nodes:
+        # Paths of this machine's source files, which both formats would keep.
+        node.meta.pop("stack_trace", None)
+    torch.export.save(exported, program)
+    torch.onnx.export(
+        exported,
+        f=onnx,
+        dynamo=True,
+        input_names=list(inputs),
+        output_names=list(OUTPUTS),
+        external_data=False,
+        verbose=False,
+    )
+
+
+def share_weights(step: ActorStep, onnx: Path, weights: Path) -> None:
+    """Write the weights of a step to a file, and have its ONNX file point into that instead of holding them.
+
+    What the exporter has transformed, or has found to be equal to another weight, stays inside of the ONNX file.
+    """
+    import onnx as onnx_format
+
+    extents = write_weights(weights, step.state_dict())
+    content = weights.read_bytes()
+    model = onnx_format.load(onnx)
+    for tensor in model.graph.initializer:
+        extent = extents.get(tensor.name)
+        if extent and tensor.raw_data == content[extent.offset : extent.offset + extent.length]:
+            onnx_format.external_data_helper.set_external_data(tensor, weights.name, *extent)
+            tensor.ClearField("raw_data")
+    onnx.write_bytes(model.SerializeToString())
+
+
+def _write_json(path: Path, value: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,148 @@
+"""The contract of an exported actor: everything that those who fly it must know, as JSON values."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+from torch import Tensor, nn
+
+from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.race.race_vector import RACE_VECTOR_ENTRIES
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.export.actor_step import OUTPUTS, ActorStep
+from dreamer_racing.export.onnx_actor import FORMAT, FORMAT_VERSION
+
+
+def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Camera, **source: Any) -> dict[str, Any]:
+    """Describe everything that a step takes and gives, for those who fly it without this project.
+
+    Args:
+        step: The step.
+        parameters: Of the drone that the agent was trained with.
+        camera: Through which it saw.
+        source: Where it comes from, JSON values: checkpoint, env_steps, track, preset.
+
+    Returns:
+        What contract.json holds, but for ``files`` and ``verification``.
+    """
+    size = step.size
+    outputs = dict(zip(OUTPUTS, step(*step.example_inputs().values()), strict=True))
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "project_version": version("dreamer_racing"),
+        "source": source,
+        "weights_sha256": hash_weights(step),
+        "model": {
+            **asdict(size),
+            "parameters": sum(parameter.numel() for parameter in step.parameters()),
+        },
+        "latent": step.latent,
+        "inputs": _describe(step.example_inputs()),
+        "outputs": _describe(outputs),
+        "feedback": {"h": "h_next", "z": "z_next", "previous_action": "action"},
+        "reset": (
+            "At the first step of an episode set is_init to true: h, z and previous_action are then ignored and "
+            f"replaced inside the graph by {'the learned initial h and z' if size.learned_initial else 'zeros'} and a "
+            "zero action. At every other step is_init is false and the three are the outputs of the step before, as "
+            "'feedback' says."
+        ),
+        "preprocessing": (
+            "None outside the graph: pixels go in as rendered, uint8 RGB, row 0 at the top (the graph computes "
+            "x / 255 - 0.5)."
+            if step.interface.pixels
+            else "Divide the numbers as 'vector' says; the graph computes their symlog."
+        ),
+        "camera": describe_camera(camera) if step.interface.pixels else None,
+        "vector": None if step.interface.pixels else _describe_vector(),
+        "control": {"rate_hz": 1.0 / parameters.control_dt, "period_s": parameters.control_dt},
+        "frames": {
+            "body": "FLU: x forward, y left, z up, right-handed",
+            "body_rates": "right-handed about the body axes: +x rolls right, +y pitches nose down, +z yaws left",
+            "collective_thrust": "along body +z, thrust divided by mass",
+        },
+        "action": _describe_action(parameters),
+    }
+
+
+_MEANINGS = {
+    "image_u8": "what the nose camera sees now: (1, height, width, RGB)",
+    "vector": "what the drone knows now, instead of an image",
+    "h": "deterministic state (belief) after the step before",
+    "z": "stochastic state after the step before: one-hots of (latents, classes), flattened",
+    "previous_action": "the action of the step before",
+    "is_init": "whether this is the first step of an episode",
+    "noise": "uniform numbers in [0, 1), fresh at every step, one for each class of each latent: "
+    "z is argmax(log p - log(-log(noise)))",
+    "action": "mean of the policy, tanh of the network's output, in [-1, 1]: nothing is sampled",
+    "h_next": "deterministic state, to be given back as h",
+    "z_next": "stochastic state, to be given back as z",
+}
+
+
+def _describe(tensors: Mapping[str, Tensor]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "shape": list(value.shape),
+            "type": str(value.dtype).removeprefix("torch."),
+            "meaning": _MEANINGS[name],
+        }
+        for name, value in tensors.items()
+    ]
+
+
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """Return what a contract says of a camera."""
+    return {
+        "width_px": camera.width,
+        "height_px": camera.height,
+        "vertical_field_of_view_deg": camera.field_of_view,
+        "focal_length_px": camera.height / 2 / math.tan(math.radians(camera.field_of_view) / 2),
+        "tilt_up_deg": camera.tilt,
+        "position_body_m": list(camera.position),
+        "model": "pinhole without distortion, looks along body +x tilted up, square pixels, centre at the image's",
+    }
+
+
+def _describe_vector() -> dict[str, Any]:
+    names = [f"{meaning}, {axis}" for meaning, _, _ in RACE_VECTOR_ENTRIES for axis in "xyz"]
+    scales = [(unit, divisor) for _, unit, divisor in RACE_VECTOR_ENTRIES for _ in "xyz"]
+    return {
+        "formula": "entry = physical / divisor, all vectors in the body frame",
+        "channels": [
+            {"name": name, "unit": unit, "divisor": divisor}
+            for name, (unit, divisor) in zip(names, scales, strict=True)
+        ],
+    }
+
+
+def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
+    thrust = parameters.collective_thrust_scale
+    return {
+        "formula": "physical = offset + scale * action, action clipped to [-1, 1]",
+        "channels": [
+            {"name": "collective_thrust", "unit": "m/s^2", "offset": thrust, "scale": thrust},
+            *(
+                {"name": f"body_rate_{axis}", "unit": "rad/s", "offset": 0.0, "scale": scale}
+                for axis, scale in zip("xyz", parameters.body_rate_max, strict=True)
+            ),
+        ],
+        "hover": [parameters.hover_action, 0.0, 0.0, 0.0],
+        "trained_mass_kg": parameters.mass,
+        "trained_command_delay_s": parameters.command_delay,
+    }
+
+
+def hash_weights(step: nn.Module) -> str:
+    """Return the SHA-256 of all weights: name, type, shape and little-endian bytes of each, in order of names."""
+    digest = hashlib.sha256()
+    for name, value in sorted(step.state_dict().items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        digest.update(value.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,258 @@
+"""Flies an exported actor on the vehicle's computer: numpy, onnxruntime and the standard library, nothing else.
+
+The file stands alone: beside an installed `dreamer_racing` it is `dreamer_racing.export.onnx_actor`, and copied to the flight
+computer it is a module `onnx_actor` of its own. Run as a program it measures one step there:
+
+    python onnx_actor.py actor.onnx --steps 1000
+
+Shape legend: D belief, S state, A action, L latents, K classes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+logger = logging.getLogger(__name__)
+
+CONTRACT = "contract.json"
+FORMAT, FORMAT_VERSION = "dreamer_racing.actor", 1
+RECURRENT = ("h", "z", "previous_action")
+WARM_UP_STEPS = 20
+
+
+class RecurrentActor:
+    """Carries h, z and the previous action from step to step; what computes a step is the subclass's.
+
+    Args:
+        contract: As `read_contract` returns it.
+        seed: Of the noise that samples latents, where the actor has any.
+
+    Attributes:
+        contract: As given.
+        state: What goes into the next step: ``h`` (1, D), ``z`` (1, S) and ``previous_action`` (1, A), float32.
+        is_init: Whether the next step is an episode's first.
+    """
+
+    def __init__(self, contract: dict[str, Any], seed: int | None = None) -> None:
+        self.contract = contract
+        self._shapes = {entry["name"]: tuple(entry["shape"]) for entry in contract["inputs"]}
+        observation = contract["inputs"][0]
+        self._observed, self._dtype = observation["name"], np.dtype(observation["type"])
+        self._random = np.random.default_rng(seed)
+        self.reset()
+
+    @property
+    def noise_shape(self) -> tuple[int, ...] | None:
+        """Shape (L, K) of the noise of one step; None if the actor takes none."""
+        return self._shapes["noise"][1:] if "noise" in self._shapes else None
+
+    def reset(self) -> None:
+        """Begin an episode: the next step forgets everything before it."""
+        self.state = {name: np.zeros(self._shapes[name], np.float32) for name in RECURRENT}
+        self.is_init = True
+
+    def step(self, observation: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
+        """Take in what is seen now and return what to do; call it once per control period.
+
+        Args:
+            observation: uint8 RGB image (height, width, 3), top row first, or the float32 vector (V,) of an actor that
+                sees numbers; the contract's first input says which.
+            noise: Only for ``latent=sample``: uniform numbers in [0, 1), float32 (L, K); drawn here if None.
+
+        Returns:
+            float32 (A,) in [−1, 1]; `setpoint` gives it units.
+
+        Raises:
+            ValueError: Wrong shape or type, numbers that are not finite, or noise for an actor that takes none.
+        """
+        feed = {
+            **self.state,
+            self._observed: self._checked(self._observed, observation, self._dtype),
+            "is_init": np.array([self.is_init]),
+        }
+        if self.noise_shape is not None:
+            noise = self._random.random(self.noise_shape, np.float32) if noise is None else noise
+            feed["noise"] = self._checked("noise", noise, np.dtype(np.float32))
+        elif noise is not None:
+            raise ValueError("noise: this actor was exported with latent=mode, which takes none.")
+        action, *latent = self._run(feed)
+        self.state = dict(zip(RECURRENT, (*latent, action), strict=True))
+        self.is_init = False
+        return action[0].copy()
+
+    def setpoint(self, action: np.ndarray) -> np.ndarray:
+        """Give an action (A,) its units: collective thrust in m/s², body rates x, y, z in rad/s (body frame FLU)."""
+        channels = self.contract["action"]["channels"]
+        offset, scale = (np.array([channel[name] for channel in channels]) for name in ("offset", "scale"))
+        return offset + scale * np.clip(action, -1.0, 1.0)
+
+    def _run(self, feed: dict[str, np.ndarray]) -> Sequence[np.ndarray]:
+        """Compute action (1, A), next h (1, D) and next z (1, S) from the inputs by name."""
+        raise NotImplementedError
+
+    def _checked(self, name: str, value: Any, dtype: np.dtype) -> np.ndarray:
+        """Return an input with a leading 1, or refuse it."""
+        shape = self._shapes[name][1:]
+        if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
+            given = f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise ValueError(f"{name}: got {given}, but this actor takes a numpy array {dtype} of shape {shape}.")
+        if dtype.kind == "f" and not np.isfinite(value).all():
+            raise ValueError(f"{name}: contains numbers that are not finite.")
+        return value[None]
+
+
+class OnnxActor(RecurrentActor):
+    """An exported actor in onnxruntime, on the CPU.
+
+    Args:
+        path: The ``.onnx`` file; its contract.json lies beside it.
+        seed: Of the noise that samples latents; only ``latent=sample`` has any.
+        threads: Threads that one step may use; more than one rarely helps at batch size 1.
+
+    Raises:
+        FileNotFoundError: There is no such file, or no contract beside it.
+        ValueError: The contract is broken, of another version, or does not describe this file.
+        ImportError: onnxruntime is not installed.
+
+    Example:
+        >>> actor = OnnxActor("actor.onnx")  # doctest: +SKIP
+        >>> action = actor.step(np.zeros((64, 64, 3), np.uint8))  # doctest: +SKIP
+        >>> collective_thrust, *body_rates = actor.setpoint(action)  # doctest: +SKIP
+    """
+
+    def __init__(self, path: str | Path, seed: int | None = None, threads: int = 1) -> None:
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"There is no file {path}: give the .onnx file that recipes/export.py wrote.")
+        super().__init__(read_contract(path.parent / CONTRACT), seed)
+        self._check_files(path)
+        self._session = _open_session(path, threads)
+        self._check_session(path)
+        self._outputs = [entry["name"] for entry in self.contract["outputs"]]
+
+    def _check_files(self, path: Path) -> None:
+        """Refuse a contract that belongs to other files; there are `weights` where the ONNX file holds none."""
+        described = self.contract["files"]
+        files = {"onnx": path}
+        if "weights" in described:
+            files["weights"] = path.parent / described["weights"]["name"]
+        for kind, file in files.items():
+            if not file.is_file():
+                raise FileNotFoundError(f"There is no {file}: it belongs beside {path.name}, from the same export.")
+            if hash_file(file) != described[kind]["sha256"]:
+                raise ValueError(
+                    f"{path.parent / CONTRACT} does not describe {file}: the SHA-256 of the file differs from the one "
+                    "written there. Copy both from the same export."
+                )
+
+    def _check_session(self, path: Path) -> None:
+        """Refuse a contract that promises what the file does not have."""
+        for kind, arguments in (("inputs", self._session.get_inputs()), ("outputs", self._session.get_outputs())):
+            there = [(argument.name, list(argument.shape)) for argument in arguments]
+            promised = [(entry["name"], entry["shape"]) for entry in self.contract[kind]]
+            if there != promised:
+                raise ValueError(f"{path} has the {kind} {there}, but its contract promises {promised}.")
+
+    def _run(self, feed: dict[str, np.ndarray]) -> Sequence[np.ndarray]:
+        return self._session.run(self._outputs, feed)
+
+
+def read_contract(path: str | Path) -> dict[str, Any]:
+    """Read a contract.json.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is no contract of an exported actor, or of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no {path}: it belongs beside the .onnx file, from the same export.")
+    try:
+        contract = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not valid JSON: {error}.") from error
+    found = (contract.get("format"), contract.get("format_version")) if isinstance(contract, dict) else (None, None)
+    if found != (FORMAT, FORMAT_VERSION):
+        raise ValueError(
+            f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, version {FORMAT_VERSION}. "
+            "Use the onnx_actor.py of the release that exported it, or export again."
+        )
+    if absent := [key for key in ("inputs", "outputs", "files", "model", "action") if key not in contract]:
+        raise ValueError(f"{path} lacks {', '.join(absent)}: copy it from the export again.")
+    return contract
+
+
+def hash_file(path: str | Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal, as sha256sum prints it."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Latency(NamedTuple):
+    """Durations of single steps, ms."""
+
+    p50: float
+    p99: float
+    max: float
+
+    def __str__(self) -> str:
+        return f"p50 {self.p50:.2f} ms, p99 {self.p99:.2f} ms, max {self.max:.2f} ms"
+
+
+def measure_latency(step: Callable[[np.ndarray], object], observations: Sequence[np.ndarray] | np.ndarray) -> Latency:
+    """Time single steps, after some that are not counted.
+
+    Args:
+        step: Called with one observation.
+        observations: One for each timed step.
+    """
+    for index in range(WARM_UP_STEPS):
+        step(observations[index % len(observations)])
+    durations = []
+    for observation in observations:
+        start = time.perf_counter()
+        step(observation)
+        durations.append(1e3 * (time.perf_counter() - start))
+    return Latency(*(float(value) for value in np.percentile(durations, (50, 99, 100))))
+
+
+def _open_session(path: Path, threads: int) -> Any:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError("onnxruntime is not installed: pip install onnxruntime") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def main() -> None:
+    """Measure the latency of an exported actor on this computer, with noise for images."""
+    parser = argparse.ArgumentParser(description="Measure the latency of one step of an exported actor.")
+    parser.add_argument("path", help="the .onnx file")
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    try:
+        actor = OnnxActor(arguments.path, threads=arguments.threads)
+    except (OSError, ValueError, ImportError) as error:
+        parser.error(str(error))
+    entry = actor.contract["inputs"][0]
+    seen = np.random.default_rng(0).integers(0, 256, (arguments.steps, *entry["shape"][1:])).astype(entry["type"])
+    logger.info("onnxruntime, %d steps, %d thread(s): %s", arguments.steps, arguments.threads,
+                measure_latency(actor.step, seen))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

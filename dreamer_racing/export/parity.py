@@ -1,0 +1,179 @@
+"""Proof that copies of an actor fly alike: a recorded flight, what flies it again, and the comparison.
+
+Shape legend: A action, L latents, V numbers, T steps of a recorded flight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.onnx_actor import RecurrentActor
+from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules import DreamerPolicy
+
+ACTION_TOLERANCE = 1e-4
+"""Largest deviation of an action, in [−1, 1], from the original's: 1.3 mm/s² of thrust, 0.001 rad/s."""
+MIN_STEPS = 200
+"""Steps of a recorded flight that an export must reproduce at least."""
+MIN_EPISODES = 4
+"""Episodes, hence resets, that those steps are made of at least."""
+
+
+class ParityError(RuntimeError):
+    """An exported copy of the actor does not fly as the original does."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A recorded flight of T steps.
+
+    Attributes:
+        observations: uint8 ``(T, height, width, 3)`` or float32 ``(T, V)``.
+        is_init: Whether each step is its episode's first, bool ``(T,)``.
+        actions: What the policy did, ``(T, A)``.
+    """
+
+    observations: np.ndarray
+    is_init: np.ndarray
+    actions: np.ndarray
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return int(self.is_init.sum())
+
+
+@torch.no_grad()
+def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> Flight:
+    """Fly the deterministic policy in an environment of one drone and keep what it sees.
+
+    Args:
+        env: ``num_envs=1``; give it ``episode_steps`` of `episode_steps`, so that there are resets.
+        agent: Whose policy flies.
+        steps: T.
+
+    Raises:
+        ValueError: An environment of several drones.
+    """
+    if env.batch_size != (1,):
+        raise ValueError(f"env has batch size {list(env.batch_size)}; a flight is recorded with num_envs=1.")
+    policy = DreamerPolicy(agent.world_model, agent.actor, deterministic=True)
+    flying = TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
+    names = (agent.interface.observation_keys[0], "is_init", "action")
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    tensordict = flying.reset()
+    for _ in range(steps):
+        flown, tensordict = flying.step_and_maybe_reset(policy(tensordict))
+        for name in names:
+            rows[name].append(flown[name][0].numpy().copy())
+    observations, is_init, actions = (np.stack(rows[name]) for name in names)
+    return Flight(observations, is_init[:, 0], actions)
+
+
+def episode_steps(steps: int) -> int:
+    """Return after how many steps to end an episode, so that a flight has several.
+
+    Raises:
+        ValueError: Fewer than ``MIN_STEPS`` steps.
+    """
+    check_steps(steps)
+    return math.ceil(steps / MIN_EPISODES)
+
+
+def check_steps(steps: int) -> None:
+    """Refuse a flight that is too short to prove anything.
+
+    Raises:
+        ValueError: Fewer than ``MIN_STEPS`` steps.
+    """
+    if steps < MIN_STEPS:
+        raise ValueError(f"steps={steps}: an export must be compared over at least {MIN_STEPS} steps.")
+
+
+class TorchActor(RecurrentActor):
+    """Flies a step in torch as `OnnxActor` does in onnxruntime.
+
+    Args:
+        contract: Of the step.
+        step: An `ActorStep`, or the module of its ``torch.export`` program.
+        seed: Of the noise that samples latents.
+    """
+
+    def __init__(
+        self, contract: dict[str, Any], step: Callable[..., Sequence[Tensor]], seed: int | None = None
+    ) -> None:
+        super().__init__(contract, seed)
+        self._step = step
+
+    @torch.no_grad()
+    def _run(self, feed: dict[str, np.ndarray]) -> Sequence[np.ndarray]:
+        return [output.numpy() for output in self._step(*(torch.tensor(feed[name]) for name in self._shapes))]
+
+
+def check_parity(actors: Mapping[str, RecurrentActor], flight: Flight, seed: int = 0) -> dict[str, float]:
+    """Fly actors through a recorded flight, each carrying its own state, and compare them with the first.
+
+    Args:
+        actors: By name; the first is the original.
+        flight: What they see, and where episodes begin.
+        seed: Of the noise that samples latents, the same for all.
+
+    Returns:
+        Largest deviation of an action by name, without the first actor's.
+
+    Raises:
+        ParityError: If an action deviates by more than ``ACTION_TOLERANCE`` or a latent has another class.
+    """
+    original, *others = actors
+    shape = actors[original].noise_shape
+    steps = len(flight.observations)
+    noise = None if shape is None else np.random.default_rng(seed).random((steps, *shape), np.float32)
+    flown = {name: _replay(actor, flight, noise) for name, actor in actors.items()}
+    try:
+        return {name: _compare(original, flown[original], name, flown[name]) for name in others}
+    except ParityError as error:
+        if noise is None:
+            raise
+        hint = "A sample may also fall where two classes are equal to within rounding: try another seed."
+        raise ParityError(f"{error} {hint}") from None
+
+
+def _replay(actor: RecurrentActor, flight: Flight, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the actions (T, A) and the class of every latent (T, L)."""
+    actions, classes = [], []
+    for index, observation in enumerate(flight.observations):
+        if flight.is_init[index]:
+            actor.reset()
+        actions.append(actor.step(observation, None if noise is None else noise[index]))
+        classes.append(actor.state["z"].reshape(actor.contract["model"]["latents"], -1).argmax(-1))
+    return np.stack(actions), np.stack(classes)
+
+
+def _compare(
+    original: str, expected: tuple[np.ndarray, np.ndarray], name: str, got: tuple[np.ndarray, np.ndarray]
+) -> float:
+    """Return the largest deviation, or raise at the first step of one that is too large or of another latent."""
+    deviation = np.abs(expected[0] - got[0]).max(1)  # (T,)
+    flipped = expected[1] != got[1]  # (T, L)
+    bad = ~(deviation <= ACTION_TOLERANCE) | flipped.any(1)
+    if not bad.any():
+        return float(deviation.max())
+    step = int(bad.argmax())
+    latents = ", ".join(
+        f"latent {latent} has class {got[1][step, latent]} instead of {expected[1][step, latent]}"
+        for latent in np.flatnonzero(flipped[step])[:3]
+    )
+    raise ParityError(
+        f"{name} does not fly as {original} does: at step {step} of {len(bad)} the action deviates by "
+        f"{deviation[step]:.2e} (allowed: {ACTION_TOLERANCE:.0e}){', ' + latents if latents else ''}; "
+        f"{int(bad.sum())} steps are affected, the largest deviation is {deviation.max():.2e}. Nothing was written."
+    )

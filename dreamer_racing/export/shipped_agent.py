@@ -1,0 +1,211 @@
+"""The agent that flies, out of a checkpoint of a run or out of a folder of its own that ships.
+
+An agent folder holds `FILES`: the export of the actor with its contract, the weights that it and torch both read, the
+configuration of the run, and agent.json, which says where it comes from and how well it flies. Critic, heads, decoders,
+optimiser and replay are not in it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.actor_step import WEIGHTS, ActorStep
+from dreamer_racing.export.contract import describe_camera, hash_weights
+from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
+from dreamer_racing.export.weights_file import read_weights
+from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
+from dreamer_racing.training.checkpoint import load_state
+
+AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"
+FILES = (ACTOR, WEIGHTS, CONTRACT, CONFIG, AGENT)
+AVERAGED, TRAINED = "averaged", "trained"
+CHOICES = ("auto", AVERAGED, TRAINED)
+"""Which weights of a checkpoint are to fly: ``auto`` takes the averaged ones where they are kept."""
+
+_ABSENT = ("critic", "world_model.reward_head", "world_model.continue_head")
+_CAMERA_SETTINGS = {"width_px": "env.image_size", "height_px": "env.image_size", "tilt_up_deg": "env.camera_tilt"}
+
+
+def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path) -> str:
+    """Return which weights fly, ``averaged`` or ``trained``.
+
+    Args:
+        wanted: One of ``CHOICES``.
+        kept: What there is.
+        source: Checkpoint or agent folder, for the message.
+
+    Raises:
+        ValueError: If that is no choice, or not there.
+
+    Example:
+        >>> choose_weights("auto", ("averaged", "trained"), "runs/mine")
+        'averaged'
+    """
+    kept = (kept,) if isinstance(kept, str) else kept
+    if wanted not in CHOICES:
+        raise ValueError(f"weights={wanted}: there are {', '.join(CHOICES)}.")
+    if wanted == "auto":
+        return AVERAGED if AVERAGED in kept else TRAINED
+    if wanted not in kept:
+        raise ValueError(f"weights={wanted}: {source} holds the {' and the '.join(kept)} weights only.")
+    return wanted
+
+
+def kept_weights(state: dict[str, Any]) -> tuple[str, ...]:
+    """Say which weights the state of a learner holds."""
+    return (AVERAGED, TRAINED) if AVERAGED in state else (TRAINED,)
+
+
+def load_agent(checkpoint: str | Path, interface: Interface, weights: str = "auto") -> tuple[Agent, dict[str, Any]]:
+    """Restore the agent of a checkpoint that flies, without decoders, on the CPU.
+
+    Args:
+        checkpoint: Run directory, folder of checkpoints, or one checkpoint.
+        interface: What the agent sees and does.
+        weights: One of ``CHOICES``.
+
+    Returns:
+        The agent and the checkpoint's metadata, with ``env_steps`` and with ``weights``, which of them these are.
+
+    Raises:
+        FileNotFoundError: If there is no complete checkpoint.
+        CheckpointError: If it has no learner.
+        ValueError: If its networks do not fit the interface, or it does not have those weights.
+    """
+    state, metadata = load_state(checkpoint, "learner")
+    chosen = choose_weights(weights, kept_weights(state), checkpoint)
+    agent = Agent(_size(state["size"]), interface, decode=False)
+    try:
+        missing = agent.load_state_dict(state[AVERAGED if chosen == AVERAGED else "agent"], strict=False).missing_keys
+    except RuntimeError as error:
+        raise ValueError(f"The networks of {checkpoint} do not fit {interface}: {error}") from error
+    if missing:
+        raise ValueError(f"The networks of {checkpoint} do not fit {interface}: {', '.join(missing[:3])} are missing.")
+    return agent.requires_grad_(False), {**metadata, "weights": chosen}
+
+
+@dataclass
+class ShippedAgent:
+    """An agent out of a folder of its own.
+
+    Attributes:
+        folder: Where it lies.
+        agent: Encoder, RSSM and actor; it has no critic and no heads.
+        about: What agent.json says.
+        device: Where it acts.
+    """
+
+    folder: Path
+    agent: Agent
+    about: dict[str, Any]
+    device: torch.device
+
+    @classmethod
+    def load(cls, folder: str | Path, env: DroneRacingEnv, device: torch.device | str = "cpu") -> ShippedAgent:
+        """Restore an agent, to fly in an environment.
+
+        Args:
+            folder: Of the agent.
+            env: With the camera and the control rate that the agent was trained with.
+            device: Where it is to act.
+
+        Raises:
+            FileNotFoundError: If the folder lacks a file.
+            ValueError: If the environment is another than the agent was trained for, or the weights are not those that
+                contract.json describes.
+        """
+        folder, device = Path(folder), torch.device(device)
+        about, contract = read_about(folder), read_contract(folder / CONTRACT)
+        check_env(folder, contract, env)
+        agent = Agent(_size(contract["model"]), Interface.of(env), decode=False)
+        for name in _ABSENT:
+            parent, _, child = name.rpartition(".")
+            agent.get_submodule(parent).register_module(child, None)
+        weights = read_weights(folder / WEIGHTS)
+        names = {"encoder": "world_model.encoder", "rssm": "world_model.rssm", "actor": "actor"}
+        try:
+            for short, name in names.items():
+                own = {
+                    key.removeprefix(f"{short}."): value
+                    for key, value in weights.items()
+                    if key.startswith(f"{short}.")
+                }
+                agent.get_submodule(name).load_state_dict(own)
+        except RuntimeError as error:
+            raise ValueError(f"{folder / WEIGHTS} does not fit {folder / CONTRACT}: {error}") from error
+        if hash_weights(ActorStep(agent)) != contract["weights_sha256"]:
+            raise ValueError(
+                f"{folder / WEIGHTS} holds other weights than {folder / CONTRACT} describes: copy it again."
+            )
+        return cls(folder, agent.requires_grad_(False).to(device), about, device)
+
+    def evaluation_policy(self, deterministic: bool = False) -> DreamerPolicy:
+        """Return the acting step, which shares the agent's parameters."""
+        return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
+
+
+def is_agent(folder: str | Path) -> bool:
+    """Whether a folder is one of an agent."""
+    return (Path(folder) / AGENT).is_file()
+
+
+def agents_in(folder: str | Path) -> list[str]:
+    """Return the names of the agents that lie in a folder, sorted."""
+    return sorted(path.parent.name for path in Path(folder).glob(f"*/{AGENT}"))
+
+
+def read_about(folder: str | Path) -> dict[str, Any]:
+    """Read the agent.json of a folder.
+
+    Raises:
+        FileNotFoundError: If the folder lacks a file.
+        ValueError: If agent.json is not readable.
+    """
+    folder = Path(folder)
+    if missing := [name for name in FILES if not (folder / name).is_file()]:
+        raise FileNotFoundError(f"The agent {folder} lacks {', '.join(missing)}: copy the whole folder again.")
+    try:
+        return json.loads((folder / AGENT).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{folder / AGENT} is not valid JSON: {error}.") from error
+
+
+def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv) -> None:
+    """Refuse an environment in which an agent would see or act otherwise than it was trained to.
+
+    Args:
+        folder: Of the agent, for the message.
+        contract: Of its actor.
+        env: To fly in.
+
+    Raises:
+        ValueError: The message names the setting, the agent's value and the environment's.
+    """
+    there = {"env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt)}
+    there["env.from_pixels"] = (contract["camera"] is not None, env.from_pixels)
+    if contract["camera"] is not None and env.from_pixels:
+        here = describe_camera(env.worlds.camera)
+        pairs = {name: (value, here[name]) for name, value in contract["camera"].items()}
+        there |= {_CAMERA_SETTINGS.get(name, f"camera.{name}"): pair for name, pair in pairs.items()}
+    for setting, (trained, given) in there.items():
+        same = abs(trained - given) < 1e-6 * abs(trained) if isinstance(trained, float) else trained == given
+        if not same:
+            raise ValueError(
+                f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
+                "with nothing else."
+            )
+
+
+def _size(saved: dict[str, Any]) -> ModelSize:
+    """Read a size as files keep it: lists for tuples, and perhaps more beside it."""
+    names = {field.name for field in fields(ModelSize)}
+    known = {name: value for name, value in saved.items() if name in names}
+    size: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
+    return ModelSize(**size)

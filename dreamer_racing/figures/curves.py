@@ -1,0 +1,370 @@
+"""Learning curves over seeds: what is drawn, as numbers, and as a CSV file from which it can be drawn again.
+
+Shapes: S seeds, P points of the common axis, D draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.figures.runs import CurveKey, RunData, group_runs
+
+POINTS = 240  # P
+WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
+GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
+ENDS_EARLY = 0.98  # of the longest run of a curve: one that ends before is mentioned
+WEIGHT = "curriculum/body_rate_weight"
+ALL_TRACKS = "all tracks"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something to draw over env_steps."""
+
+    label: str
+    column: str
+    """Of `metrics.csv`."""
+    comparable: bool = False
+    """Whether the same value means the same on every track, so that tracks may be pooled: a rate from 0 to 1."""
+    counted: bool = False
+    """Whether it is never negative."""
+
+
+QUANTITIES = {
+    "return": Quantity("Return (training episodes)", "episode/return"),
+    "evaluation_return": Quantity("Return (deterministic)", "evaluation/return_mean"),
+    "success_rate": Quantity("Success rate (deterministic)", "evaluation/success_rate", comparable=True),
+    "stochastic_success_rate": Quantity(
+        "Success rate (stochastic)", "evaluation_stochastic/success_rate", comparable=True
+    ),
+    "gates": Quantity("Gates per episode (deterministic)", "evaluation/gates_per_episode", counted=True),
+    "stochastic_gates": Quantity(
+        "Gates per episode (stochastic)", "evaluation_stochastic/gates_per_episode", counted=True
+    ),
+    "training_gates": Quantity("Gates (training episodes)", "episode/gates_passed", counted=True),
+    "lap_time": Quantity("Mean lap time (s, deterministic)", "evaluation/lap_time_mean"),
+    "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best"),
+    "image_error": Quantity("Image error (held out)", "held_out/image_error"),
+}
+"""Those of evaluations are of the deterministic or of the sampling (stochastic) policy, both paid at b₂ = 0."""
+PRESENCE = ("num_episodes", "return_mean")
+"""Columns, after `evaluation/` or `evaluation_stochastic/`, that have a value in the row of every evaluation."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a figure and the band around it, all (P,)."""
+
+    key: CurveKey
+    quantity: str
+    env_steps: np.ndarray
+    centre: np.ndarray
+    low: np.ndarray
+    """NaN, like `high`, where there is a single seed."""
+    high: np.ndarray
+    seeds: np.ndarray
+    """int: how many runs have a value there."""
+
+
+@dataclass(frozen=True)
+class LearningCurves:
+    """Everything that a figure of learning curves shows."""
+
+    curves: list[Curve]
+    raises: dict[CurveKey, np.ndarray]
+    """env_steps at which the curriculum raised b₂, of all seeds together."""
+    aggregate: str
+    window: float
+    """Of the running mean, env_steps."""
+    problems: list[str]
+    """What was left out, a line each."""
+
+
+def wanted_columns(quantities: Sequence[str]) -> list[str]:
+    """Name the columns of `metrics.csv` that some quantities are drawn from.
+
+    Raises:
+        ValueError: unknown quantity.
+    """
+    for name in quantities:
+        if name not in QUANTITIES:
+            raise ValueError(f"quantities={name}: there are {', '.join(QUANTITIES)}.")
+    columns = [QUANTITIES[name].column for name in quantities]
+    return [*dict.fromkeys([*columns, *(name for column in columns for name in _presence(column)), WEIGHT])]
+
+
+def _presence(column: str) -> list[str]:
+    """Name the columns that tell in which rows this one could have had a value; none if it is no evaluation's."""
+    prefix = column.partition("/")[0]
+    return [f"{prefix}/{name}" for name in PRESENCE] if prefix.startswith("evaluation") else []
+
+
+def learning_curves(
+    runs: Sequence[RunData],
+    quantities: Sequence[str] = ("return",),
+    aggregate: str = "mean",
+    window: float | None = None,
+    problems: Sequence[str] = (),
+) -> LearningCurves:
+    """Aggregate runs over seeds on a common axis of env_steps.
+
+    Args:
+        runs: of any algorithms and tracks.
+        quantities: names out of `QUANTITIES`.
+        aggregate: ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
+        window: of the running mean, env_steps; None for 2 % of the longest run.
+        problems: what was left out already.
+
+    Raises:
+        ValueError: no runs, an unknown name, or runs of one curve that were not configured alike.
+    """
+    wanted_columns(quantities)
+    if aggregate not in AGGREGATES:
+        raise ValueError(f"aggregate={aggregate}: there are {', '.join(AGGREGATES)}.")
+    if not runs:
+        raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
+    groups = group_runs(runs)
+    longest = max(run.metrics.env_steps.max(initial=0) for run in runs)
+    width = float(max(window if window is not None else WINDOW_SHARE * longest, 1.0))
+    grid = np.linspace(0.0, longest, POINTS)
+    missing, curves = [*problems, *_short_runs(groups)], []
+    for name in quantities:
+        sampled: dict[CurveKey, Sampled] = {}
+        for key, group in groups.items():
+            absent = [run.name for run in group if QUANTITIES[name].column not in run.metrics.columns]
+            if absent:
+                who = ", ".join(absent) if len(absent) < len(group) else f"all runs of {key}"
+                missing.append(f"no values of {QUANTITIES[name].column}: {who}")
+            if len(absent) < len(group):
+                sampled[key] = sample(group, QUANTITIES[name].column, grid, width)
+        gaps = sum(value.has_gaps for value in sampled.values())
+        missing += [f"{QUANTITIES[name].label}: {GAPS} ({gaps} of {len(sampled)} curves)"] if gaps else []
+        curves += [_aggregate(key, name, grid, [value], aggregate) for key, value in sampled.items()]
+        if aggregate == "iqm" and QUANTITIES[name].comparable:
+            pooled = _pool(sampled).items()
+            curves += [_aggregate(key, name, grid, strata, aggregate) for key, strata in pooled]
+    if not curves:
+        raise ValueError(f"no run has values of {', '.join(quantities)}. {'; '.join(missing)}")
+    raises = {key: np.concatenate([weight_raises(run) for run in group]) for key, group in groups.items()}
+    return LearningCurves(curves, raises, aggregate, width, missing)
+
+
+class Sampled(NamedTuple):
+    """The runs of one curve on the common axis, (S, P) each."""
+
+    values: np.ndarray
+    """NaN where a run has none."""
+    reached: np.ndarray
+    """bool: whether the run was being measured there, with a value or without."""
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether some run has a value where another one was measured without."""
+        present = np.isfinite(self.values)
+        return bool((present.any(0) & (self.reached & ~present).any(0)).any())
+
+
+def sample(group: Sequence[RunData], column: str, grid: np.ndarray, window: float) -> Sampled:
+    """Take the running means of runs on the common axis (P,), each as far as the run was measured."""
+    tables = [measurements(run, column) for run in group]
+    values = np.stack([resample(*table, grid, window) for table in tables])
+    ends = np.array([(steps[0], steps[-1]) if len(steps) else (np.inf, -np.inf) for steps, _ in tables])  # (S, 2)
+    reached = (grid + window / 2 >= ends[:, :1]) & (grid - window / 2 <= ends[:, 1:])
+    return Sampled(values, reached)
+
+
+def measurements(run: RunData, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a column, with NaN for every evaluation that left no value of it: a lap time without a lap.
+
+    Returns:
+        env_steps, rising, and values, (R,) each; empty if there is nothing.
+    """
+    columns = run.metrics.columns
+    steps, values = columns.get(column, (np.empty(0), np.empty(0)))
+    evaluated = [columns[name][0] for name in _presence(column) if name in columns]
+    without = np.setdiff1d(np.concatenate([*evaluated, np.empty(0)]), steps)
+    order = np.argsort(np.concatenate((steps, without)), kind="stable")
+    filled = np.concatenate((values, np.full(len(without), np.nan)))
+    return np.concatenate((steps, without))[order], filled[order]
+
+
+def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: float) -> np.ndarray:
+    """Take the running mean of a metric at other env_steps.
+
+    Args:
+        steps: (R,) env_steps of the values, rising.
+        values: (R,); NaN where the metric was looked for and not found.
+        grid: (P,) env_steps to return values for.
+        window: env_steps around each, over which to average.
+
+    Returns:
+        (P,): the mean of the values within the window; without any, between the neighbours, or NaN if one of them is;
+        NaN beyond the ends.
+    """
+    if not len(steps):
+        return np.full(len(grid), np.nan)
+    first = np.searchsorted(steps, grid - window / 2, "left")
+    last = np.searchsorted(steps, grid + window / 2, "right")
+    found = np.isfinite(values)
+    sums = np.concatenate(([0.0], np.cumsum(np.where(found, values, 0.0))))
+    counts = np.concatenate(([0], np.cumsum(found)))
+    count = counts[last] - counts[first]
+    mean = (sums[last] - sums[first]) / np.maximum(count, 1)
+    return np.where(count > 0, mean, np.interp(grid, steps, values, left=np.nan, right=np.nan))
+
+
+def weight_raises(run: RunData) -> np.ndarray:
+    """Find the env_steps at which the curriculum raised b₂ by a whole increment."""
+    if WEIGHT not in run.metrics.columns:
+        return np.empty(0)
+    steps, weight = run.metrics.columns[WEIGHT]
+    # A row is the mean of what was in force since the row before: one between two levels is no level of its own.
+    levels = np.floor(weight / float(run.config.get("curriculum.increment") or 1e-9) + 1e-3)
+    return steps[1:][np.diff(levels) > 0]
+
+
+def interquartile_mean(scores: np.ndarray) -> np.ndarray:
+    """Average the middle half along the first axis.
+
+    Reference: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.
+
+    Args:
+        scores: (S, ...) of S runs, of which a quarter, rounded down, is cut off at either end.
+    """
+    cut = len(scores) // 4
+    return np.sort(scores, axis=0)[cut : len(scores) - cut].mean(axis=0)
+
+
+def bootstrap_interval(
+    strata: Sequence[np.ndarray],
+    statistic: Callable[[np.ndarray], np.ndarray] = interquartile_mean,
+    draws: int = 2000,
+    seed: int = 0,
+) -> np.ndarray:
+    """Bound a statistic of pooled runs by a stratified percentile bootstrap: every track keeps its number of runs.
+
+    Reference: Agarwal et al., 2021, whose library rliable is not used: it needs arch, pandas and seaborn, and its
+    stratified bootstrap draws from numpy's global generator.
+
+    Args:
+        strata: the runs of each track, (S, P).
+        statistic: of an array (S, ...) along its first axis.
+        draws: D.
+        seed: of the draws.
+
+    Returns:
+        (2, P): the 2.5 and the 97.5 percentile.
+    """
+    generator = np.random.default_rng(seed)
+    pooled = [stratum[generator.integers(len(stratum), size=(len(stratum), draws))] for stratum in strata]
+    return np.percentile(statistic(np.concatenate(pooled)), (2.5, 97.5), axis=0)  # of (D, P)
+
+
+def _deviation(strata: Sequence[np.ndarray]) -> np.ndarray:
+    pooled = np.concatenate(strata)
+    return pooled.mean(0) + np.array([[-1.0], [1.0]]) * pooled.std(0, ddof=1)
+
+
+def _mean(scores: np.ndarray) -> np.ndarray:
+    return scores.mean(0)
+
+
+AGGREGATES = {"mean": (_mean, _deviation), "iqm": (interquartile_mean, bootstrap_interval)}
+"""The centre of runs (S, P), and the band (2, P) around it of runs by track."""
+
+
+def _aggregate(key: CurveKey, quantity: str, grid: np.ndarray, strata: list[Sampled], aggregate: str) -> Curve:
+    """Aggregate the runs of each stratum, at every point those that have a value there, if that is half of them."""
+    present = np.isfinite(np.concatenate([stratum.values for stratum in strata]))  # (S, P)
+    reached = np.concatenate([stratum.reached for stratum in strata])  # (S, P)
+    shown = present & (2 * present.sum(0) >= (present | reached).sum(0))
+    result = np.full((3, len(grid)), np.nan)  # centre, low, high
+    centre, band = AGGREGATES[aggregate]
+    for pattern in np.unique(shown, axis=1).T:
+        points = (shown == pattern[:, None]).all(0)
+        chosen = np.split(pattern, np.cumsum([len(stratum.values) for stratum in strata])[:-1])
+        kept = [stratum.values[runs][:, points] for stratum, runs in zip(strata, chosen, strict=True) if runs.any()]
+        if kept:
+            result[0, points] = centre(np.concatenate(kept))
+        if max(map(len, kept), default=0) > 1:  # one run knows of no spread
+            result[1:, points] = band(kept)
+    return Curve(key, quantity, grid, result[0], result[1], result[2], present.sum(0))
+
+
+def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
+    """Put the tracks of an algorithm together, if it has been run on all of several."""
+    tracks = {key.track for key in sampled}
+    pooled: dict[CurveKey, list[Sampled]] = defaultdict(list)
+    for key, value in sampled.items():
+        pooled[key._replace(track=ALL_TRACKS)].append(value)
+    return {key: strata for key, strata in pooled.items() if len(strata) == len(tracks) > 1}
+
+
+def _short_runs(groups: dict[CurveKey, list[RunData]]) -> list[str]:
+    """Mention the runs that end before the others of their curve do."""
+    lines = []
+    for group in groups.values():
+        ends = [run.metrics.env_steps.max(initial=0) for run in group]
+        lines += [
+            f"{run.name} ends at {end:,.0f} of {max(ends):,.0f} env_steps: fewer seeds from there"
+            for run, end in zip(group, ends, strict=True)
+            if end < ENDS_EARLY * max(ends)
+        ]
+    return lines
+
+
+_COLUMNS = ("quantity", "track", "algorithm", "variant", "env_steps", "centre", "low", "high", "seeds")
+_RAISE = "b2_raised"  # in the column quantity, of rows that have no value
+
+
+def write_curves(path: str | Path, curves: LearningCurves) -> None:
+    """Write curves as one CSV file, a row a point, under lines with `#` that say how they were made."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        file.write(f"# aggregate: {curves.aggregate}\n# window: {curves.window!r}\n")
+        file.writelines(f"# problem: {problem}\n" for problem in curves.problems)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        for curve in curves.curves:
+            numbers = zip(curve.env_steps, curve.centre, curve.low, curve.high, curve.seeds, strict=True)
+            for steps, *values, seeds in numbers:
+                cells = [f"{value:.6g}" if math.isfinite(value) else "" for value in values]
+                writer.writerow((curve.quantity, *curve.key, f"{steps:.0f}", *cells, seeds))
+        for key, steps in curves.raises.items():
+            writer.writerows((_RAISE, *key, f"{step:.0f}", "", "", "", "") for step in steps)
+
+
+def read_curves(path: str | Path) -> LearningCurves:
+    """Read what `write_curves` wrote.
+
+    Raises:
+        ValueError: this is no such file.
+    """
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        lines = file.readlines()
+    notes = [line[2:].rstrip("\n").partition(": ") for line in lines if line.startswith("# ")]
+    head = {name: text for name, _, text in notes if name != "problem"}
+    reader = csv.DictReader(line for line in lines if not line.startswith("#"))
+    if tuple(reader.fieldnames or ()) != _COLUMNS or head.keys() != {"aggregate", "window"}:
+        raise ValueError(f"{path} holds no learning curves: they are written by recipes/plot.py.")
+    rows: dict[tuple[str, CurveKey], list[list[float]]] = defaultdict(list)
+    for row in reader:
+        key = CurveKey(row["track"], row["algorithm"], row["variant"])
+        rows[row["quantity"], key].append([float(row[name] or "nan") for name in _COLUMNS[4:]])
+    tables = {names: np.array(values).T for names, values in rows.items()}  # (5, P)
+    curves = [
+        Curve(key, quantity, env_steps, centre, low, high, seeds.astype(int))
+        for (quantity, key), (env_steps, centre, low, high, seeds) in tables.items()
+        if quantity != _RAISE
+    ]
+    raises = {key: table[0] for (quantity, key), table in tables.items() if quantity == _RAISE}
+    problems = [text for name, _, text in notes if name == "problem"]
+    return LearningCurves(curves, raises, head["aggregate"], float(head["window"]), problems)

@@ -1,0 +1,411 @@
+"""Pictures of races and of learning: PNG, PDF or SVG by the path's suffix.
+
+Everything is drawn on a `matplotlib.figure.Figure` of its own; pyplot and its global state are not touched.
+Shapes: K control steps of an episode.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import EngFormatter, MultipleLocator
+
+from dreamer_racing.envs.drone.rotation import rotate
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.training.metrics_file import read_metrics
+
+GATE_COLOR = "#e8590c"
+DECOY_COLOR = "#c2255c"
+INK, MUTED, FAINT = "#212529", "#868e96", "#dee2e6"
+CRASH_COLOR = "#e03131"
+SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
+    "speed", ["#3b1f6b", "#2f5fb3", "#1fa2a6", "#7bc043", "#f2b705"]
+)
+ARROW_INTERVAL = 0.1  # s between camera arrows
+ARROW_LENGTH = 0.6  # m
+MAX_WARNINGS = 8  # above a figure
+NOTE_LETTERS = 14  # of a note beside a figure, an inch of its width
+HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is worth its space
+
+DEFAULT_PANELS: dict[str, tuple[str, ...]] = {
+    "Return": ("episode/return", "evaluation/return_mean"),
+    "Gates per episode": ("episode/gates_passed", "evaluation/gates_per_episode"),
+    "Losses": ("loss", "loss_*", "loss/*"),
+}
+
+
+def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title: str | None = None) -> None:
+    """Draw a track and the path of one episode from above, and from the side if the gates differ in height.
+
+    Gates are bars with an arrow in the direction of flight and their number in the order of flight; black arrows along
+    the path are the camera's direction, as in the paper's figure of perception-aware flight.
+
+    Args:
+        track: the track.
+        trajectory: the path, coloured by speed.
+        path: the file to write; missing folders are made.
+        title: above the picture; None for the track's name, and the episode's time and outcome.
+    """
+    heights = [gate.position[2] for gate in track.gates]
+    side_view = max(heights) - min(heights) > HEIGHT_SPREAD
+    figure, axes, side = _layout(track, side_view)
+    speed = speed_scale([trajectory])
+    panels: list[tuple[Axes, tuple[int, int]]] = [(axes, (0, 1))]
+    draw_track(axes, track)
+    if side is not None:
+        _draw_track_side(side, track)
+        axes.set_xlabel("")
+        panels.append((side, (0, 2)))
+    for panel, plane in panels:
+        draw_flight(panel, trajectory, speed, plane)
+    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), cax=axes.inset_axes((1.015, 0.0, 0.022, 1.0)))
+    bar.set_label("speed (m/s)")
+    bar.outline.set_visible(False)
+    axes.set_title(title or _title(track, trajectory), loc="left", fontsize=11, color=INK, pad=8)
+    _add_legend(figure, track, trajectory)
+    save(figure, path)
+
+
+def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
+    """Return the scale of colours from 0 to the highest speed of some flights, rounded up to whole m/s."""
+    top = max(float(np.nanmax(trajectory.speed.numpy())) for trajectory in trajectories)
+    return Normalize(0.0, max(1.0, math.ceil(top)))
+
+
+def draw_flight(
+    axes: Axes,
+    trajectory: Trajectory,
+    speed: Normalize,
+    plane: tuple[int, int] = (0, 1),
+    tilt: float = Camera.tilt,
+) -> None:
+    """Draw a path coloured by speed, the camera's directions along it, its start, and its end if that is a crash.
+
+    Args:
+        axes: where; `draw_track` draws what belongs below.
+        trajectory: the flight.
+        speed: scale of the colours.
+        plane: the two world axes that are seen.
+        tilt: of the camera, degrees.
+    """
+    _draw_path(axes, trajectory, plane, speed)
+    _draw_cameras(axes, trajectory, plane, tilt)
+    _draw_ends(axes, trajectory, plane)
+
+
+def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
+    """Draw a track from above: its bounding box, gates and decoys, with equal scales on both axes.
+
+    Args:
+        axes: where.
+        track: the track.
+        labels: whether gates are numbered and axes labelled.
+    """
+    (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
+    axes.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, **_BOX))
+    for gate in track.decoys:
+        _draw_gate(axes, gate, track.shape.outer, DECOY_COLOR)
+    for number, gate in enumerate(track.gates, start=1):
+        _draw_gate(axes, gate, track.shape.outer, GATE_COLOR)
+        if labels:
+            _number_gate(axes, track, number)
+    margin = 0.02 * max(x_high - x_low, y_high - y_low)
+    axes.set(xlim=(x_low - margin, x_high + margin), ylim=(y_low - margin, y_high + margin))
+    _dress_map(axes, "y (m)" if labels else None)
+    if labels:
+        axes.set_xlabel("x (m)")
+
+
+def plot_curve(
+    metrics_csv: str | Path,
+    path: str | Path,
+    columns: Mapping[str, Sequence[str]] | None = None,
+    title: str | None = None,
+) -> None:
+    """Draw learning curves over `env_steps` from a run's `metrics.csv`, one panel above the other.
+
+    Args:
+        metrics_csv: the file.
+        path: the file to write; missing folders are made.
+        columns: for each panel its title and its columns, in which `*` stands for anything; None for return, gates per
+            episode and losses. Panels without a column in the file are left out.
+        title: above the picture.
+
+    Raises:
+        ValueError: the file has no rows, or none of the columns.
+    """
+    table = read_metrics(metrics_csv).columns
+    wanted = columns or DEFAULT_PANELS
+    found = {name: _match(table, patterns) for name, patterns in wanted.items()}
+    panels = {name: matches for name, matches in found.items() if matches}
+    if not panels:
+        patterns = ", ".join(pattern for patterns in wanted.values() for pattern in patterns)
+        raise ValueError(f"{metrics_csv} has no values for any of: {patterns}. It has: {', '.join(table)}.")
+    figure = Figure(figsize=(8.0, 0.6 + 2.1 * len(panels)), layout="constrained")
+    stack = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, matches) in zip(stack, panels.items(), strict=True):
+        _draw_curves(axes, name, {column: table[column] for column in matches})
+    stack[-1].set_xlabel("env_steps")
+    stack[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
+    if title:
+        figure.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)
+    save(figure, path)
+
+
+def save(figure: Figure, path: str | Path, warnings: Sequence[str] = ()) -> None:
+    """Write a figure.
+
+    Args:
+        figure: which.
+        path: the file; missing folders are made.
+        warnings: what a reader must know, a line each; they are written above the figure, which grows by them.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    width, height = figure.get_size_inches()
+    if lines := _warning_lines(warnings, width):
+        figure.set_size_inches(width, height + 0.16 * len(lines) + 0.1)
+        style: dict[str, Any] = {"fontsize": 8, "color": CRASH_COLOR, "linespacing": 1.35}
+        figure.suptitle("\n".join(lines), x=0.08 / width, ha="left", **style)
+    figure.savefig(path, dpi=150, facecolor="white")
+
+
+def _warning_lines(warnings: Sequence[str], width: float) -> list[str]:
+    shown = list(warnings[:MAX_WARNINGS])
+    if len(warnings) > len(shown):
+        shown.append(f"and {len(warnings) - len(shown)} more")
+    return [
+        line
+        for warning in shown
+        for line in textwrap.wrap(f"! {warning}", int(NOTE_LETTERS * width), subsequent_indent="   ")
+    ]
+
+
+def dress(axes: Axes) -> None:
+    """Draw a faint grid, and neither frame nor ticks."""
+    axes.set_axisbelow(True)
+    axes.grid(color=FAINT, linewidth=0.6)
+    axes.tick_params(colors=MUTED, labelsize=8, length=0)
+    axes.spines[:].set_visible(False)
+
+
+def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
+    """Where the nose camera looks.
+
+    Args:
+        attitude: (..., 4) unit quaternions wxyz, body → world.
+        tilt: of the camera, upwards from the body's x axis, degrees.
+
+    Returns:
+        (..., 3) unit vectors in the world.
+    """
+    angle = math.radians(tilt)
+    axis = torch.tensor((math.cos(angle), 0.0, math.sin(angle)), dtype=attitude.dtype)
+    return rotate(attitude, axis.expand(*attitude.shape[:-1], 3))
+
+
+_BADGE: dict[str, Any] = {
+    "boxstyle": "circle,pad=0.22",
+    "facecolor": "white",
+    "edgecolor": GATE_COLOR,
+    "linewidth": 1.0,
+}
+_BOX: dict[str, Any] = {
+    "facecolor": "#f8f9fa",
+    "edgecolor": MUTED,
+    "linewidth": 1.0,
+    "linestyle": (0, (5, 3)),
+    "zorder": 0,
+}
+
+
+def _layout(track: Track, side_view: bool) -> tuple[Figure, Axes, Axes | None]:
+    """Make a figure whose panels have the track's proportions: 9 inches wide, as high as that needs."""
+    width, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
+    scale = 7.6 / width  # inches per metre
+    if not side_view:
+        figure = Figure(figsize=(9.0, depth * scale + 1.5), layout="constrained")
+        return figure, figure.subplots(), None
+    figure = Figure(figsize=(9.0, (depth + height) * scale + 2.0), layout="constrained")
+    axes, side = figure.subplots(2, 1, sharex=True, height_ratios=[depth, height])
+    return figure, axes, side
+
+
+def _dress_map(axes: Axes, y_label: str | None) -> None:
+    axes.set_aspect("equal")
+    axes.xaxis.set_major_locator(MultipleLocator(2.0))
+    axes.yaxis.set_major_locator(MultipleLocator(2.0))
+    dress(axes)
+    if y_label:
+        axes.set_ylabel(y_label)
+
+
+def _draw_gate(axes: Axes, gate: Gate, width: float, color: str) -> None:
+    """Draw a gate from above: a bar as wide as the frame, and arrows in the direction of flight at its ends.
+
+    In the middle they would lie under the path.
+    """
+    centre, left, forward = (np.array(vector[:2]) for vector in (gate.position, gate.left, gate.forward))
+    ends = np.stack((centre - left * width / 2, centre + left * width / 2))  # (2, 2)
+    axes.plot(*ends.T, color=color, linewidth=4.5, solid_capstyle="butt", zorder=4)
+    if gate.kind == "race":
+        arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}
+        for side in (-0.42, 0.42):
+            foot = centre + side * width * left
+            axes.annotate("", xy=tuple(foot + 0.6 * forward), xytext=tuple(foot), arrowprops=arrow, zorder=4)
+
+
+def _number_gate(axes: Axes, track: Track, number: int) -> None:
+    """Write a gate's number beside its outer end: the one farther from the middle of the track."""
+    gate = track.gates[number - 1]
+    middle = np.mean([other.position[:2] for other in track.gates], axis=0)
+    centre, left = np.array(gate.position[:2]), np.array(gate.left[:2])
+    outwards = 1.0 if np.dot(left, centre - middle) >= 0 else -1.0
+    above = [other for other in track.gates[: number - 1] if math.dist(other.position[:2], gate.position[:2]) < 0.5]
+    side = -outwards if above else outwards  # one above the other: a number at either end
+    place = centre + side * left * (track.shape.outer / 2 + 0.45)
+    axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
+
+
+def _draw_track_side(axes: Axes, track: Track) -> None:
+    """Draw a track from the side, x–z: each gate as the outline of its frame, seen along y."""
+    (x_low, _, z_low), (x_high, _, z_high) = track.bounds_low, track.bounds_high
+    axes.add_patch(Rectangle((x_low, z_low), x_high - x_low, z_high - z_low, **_BOX))
+    outer = track.shape.outer
+    labels: list[tuple[float, float]] = []
+    for number, gate in enumerate(track.gates, start=1):
+        width = max(outer * abs(gate.left[0]), 0.15)
+        x, _, z = gate.position
+        corner = (x - width / 2, z - outer / 2)
+        axes.add_patch(Rectangle(corner, width, outer, fill=False, edgecolor=GATE_COLOR, linewidth=2.0, zorder=4))
+        while any(math.dist((x, z), label) < 0.6 for label in labels):
+            z += 0.3  # above the number of a gate that is hidden behind this one
+        labels.append((x, z))
+        axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
+    axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
+    _dress_map(axes, "z (m)")
+
+
+def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed: Normalize) -> None:
+    points = trajectory.position[:, list(plane)].numpy()  # (K + 1, 2)
+    segments = np.stack((points[:-1], points[1:]), axis=1)  # (K, 2, 2)
+    lines = LineCollection(list(segments), cmap=SPEED_COLORS, norm=speed, linewidth=2.8, capstyle="round", zorder=5)
+    lines.set_array(trajectory.speed[1:].numpy())
+    axes.add_collection(lines, autolim=False)
+
+
+def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], tilt: float) -> None:
+    """Draw the camera's direction, projected into the plane, every 0.1 s."""
+    every = max(1, round(ARROW_INTERVAL / trajectory.control_dt))
+    origin = trajectory.position[::every, list(plane)].numpy()  # (M, 2)
+    direction = camera_directions(trajectory.attitude[::every], tilt)[:, list(plane)].numpy()
+    axes.quiver(
+        *origin.T,
+        *(ARROW_LENGTH * direction).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        units="inches",
+        width=0.010,
+        headwidth=4.5,
+        headlength=5.0,
+        headaxislength=4.5,
+        color=INK,
+        alpha=0.7,
+        zorder=6,
+    )
+
+
+def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
+    start, end = trajectory.position[0, list(plane)].tolist(), trajectory.position[-1, list(plane)].tolist()
+    axes.plot(*start, **_START, zorder=8)
+    if trajectory.crashed:
+        axes.plot(*end, **_CRASH, zorder=9)
+
+
+_START: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 8,
+    "color": "white",
+    "markeredgecolor": INK,
+    "markeredgewidth": 1.8,
+}
+_CRASH: dict[str, Any] = {
+    "marker": "X",
+    "markersize": 12,
+    "color": CRASH_COLOR,
+    "markeredgecolor": "white",
+    "markeredgewidth": 1.2,
+}
+
+
+def _title(track: Track, trajectory: Trajectory) -> str:
+    seconds = (len(trajectory.position) - 1) * trajectory.control_dt
+    top = float(np.nanmax(trajectory.speed.numpy()))
+    outcome = (trajectory.outcome or "recording stopped").replace("_", " ")
+    return f"{track.name}: {seconds:.2f} s, up to {top:.1f} m/s ({outcome})"
+
+
+def _add_legend(figure: Figure, track: Track, trajectory: Trajectory) -> None:
+    handles = flight_legend(bool(track.decoys), trajectory.crashed)
+    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles), frameon=False, fontsize=9)
+
+
+def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
+    """Make the entries of the legend of a flight from above, with decoys or a crash if there are any."""
+    bar: dict[str, Any] = {"linewidth": 4.5, "solid_capstyle": "butt"}
+    handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
+    if decoys:
+        handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))
+    handles.append(Line2D([], [], linestyle="", label="start", **_START))
+    if crash:
+        handles.append(Line2D([], [], linestyle="", label="crash", **_CRASH))
+    handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
+    handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
+    return handles
+
+
+def _match(names: Mapping[str, object], patterns: Sequence[str]) -> list[str]:
+    return [name for name in names if any(fnmatch(name, pattern) for pattern in patterns)]
+
+
+def _draw_curves(axes: Axes, title: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Draw a panel's columns; a long noisy one faintly, under its running mean."""
+    for index, (name, (steps, values)) in enumerate(curves.items()):
+        color = f"C{index}"
+        window = len(values) // 50
+        marker = "o" if len(values) < 3 else ""
+        if window > 1:
+            axes.plot(steps, values, color=color, alpha=0.25, linewidth=0.8)
+        axes.plot(steps, _smooth(values, window), color=color, linewidth=1.6, marker=marker, markersize=3, label=name)
+    values = np.concatenate([values for _, values in curves.values()])
+    if len(curves) > 1:
+        axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.03))
+        sizes = [np.median(np.abs(values)) for _, values in curves.values()]
+        if max(sizes) > 50 * min(sizes):
+            axes.set_yscale("log" if values.min() > 0 else "symlog")
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    dress(axes)
+
+
+def _smooth(values: np.ndarray, window: int) -> np.ndarray:
+    """Centred running mean; near the ends over what there is."""
+    if window < 2:
+        return values
+    kernel = np.ones(window)
+    return np.convolve(values, kernel, mode="same") / np.convolve(np.ones_like(values), kernel, mode="same")

@@ -1,0 +1,261 @@
+"""Videos and GIFs of flights, and of a world model's predictions beside them.
+
+Shapes: T frames of H × W pixels, RGB, uint8.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track
+
+VIDEO_HEIGHT = 256  # pixels that a video has at least, unless its scale is given
+CONTEXT_COLOR = (64, 160, 80)  # the model sees the images
+OPEN_LOOP_COLOR = (230, 120, 20)  # it predicts them from actions alone
+MAP_MARGIN = 1.6  # m around the gates of a moving map
+MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
+
+
+def write_video(
+    path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None, quality: int = 8
+) -> None:
+    """Write an H.264 (yuv420p) mp4 file that plays everywhere.
+
+    Args:
+        path: the file; missing folders are made.
+        frames: (T, H, W, 3) uint8.
+        fps: frames per second.
+        scale: whole factor by which pixels are enlarged, without blurring; None for one that makes the video at least
+            256 pixels high. Odd sizes then grow by one pixel, because H.264 wants even ones.
+        quality: from 1 to 10.
+
+    Raises:
+        ValueError: frames of another shape or type, or none.
+    """
+    import imageio.v2 as imageio  # starts slowly
+
+    array = _as_frames(frames, "frames")
+    scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    writer: Any = imageio.get_writer(
+        path, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=quality, macro_block_size=1
+    )
+    with writer:
+        for frame in array:
+            writer.append_data(_make_even(enlarge(frame, scale)))
+
+
+def write_gif(
+    path: str | Path,
+    frames: np.ndarray | torch.Tensor,
+    fps: float = 25,
+    scale: int = 1,
+    colors: int = 64,
+    loop: bool = True,
+) -> int:
+    """Write a small GIF: one palette for all frames, no dithering, so that what stands still costs nothing.
+
+    Args:
+        path: the file; missing folders are made.
+        frames: (T, H, W, 3) uint8.
+        fps: frames per second, 50 at most; the format counts in 1/100 s, to which the delay is rounded.
+        scale: whole factor by which pixels are enlarged, without blurring.
+        colors: size of the palette, 2 to 256.
+        loop: whether it starts again.
+
+    Returns:
+        Size of the file, bytes.
+
+    Raises:
+        ValueError: frames of another shape or type, or none.
+    """
+    array = _as_frames(frames, "frames")
+    palette = _shared_palette(array, colors)
+    images = [
+        Image.fromarray(enlarge(frame, scale)).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array
+    ]
+    delay = round(max(MIN_DELAY, 1 / fps), 2)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    images[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 * delay),
+        optimize=False,
+        disposal=1,
+        **({"loop": 0} if loop else {}),
+    )
+    return Path(path).stat().st_size
+
+
+def side_by_side(
+    real: np.ndarray | torch.Tensor,
+    imagined: np.ndarray | torch.Tensor,
+    context: int,
+    error: bool = False,
+    scale: int = 4,
+    border: int = 4,
+) -> np.ndarray:
+    """Compose on-board view | prediction | (if asked) absolute error.
+
+    The prediction's border is green while the model sees the images and orange where it predicts open loop.
+
+    Args:
+        real: (T, H, W, 3) uint8.
+        imagined: (T, H, W, 3) uint8.
+        context: number of first frames that the model saw.
+        error: whether to add the absolute difference.
+        scale: whole factor by which pixels are enlarged, without blurring.
+        border: its width, pixels.
+
+    Returns:
+        (T, scale H + 2 border, panels (scale W + 2 border), 3) uint8.
+
+    Raises:
+        ValueError: frames of another shape or type, or of different shapes.
+    """
+    seen, predicted = _as_frames(real, "real"), _as_frames(imagined, "imagined")
+    if seen.shape != predicted.shape:
+        raise ValueError(f"real has shape {seen.shape}, imagined {predicted.shape}; they must be equal.")
+    panels = [seen, predicted]
+    if error:
+        panels.append(np.abs(seen.astype(np.int16) - predicted).astype(np.uint8))
+    phase = np.full((len(seen), 3), OPEN_LOOP_COLOR, dtype=np.uint8)  # (T, 3)
+    phase[:context] = CONTEXT_COLOR
+    colors = [np.full_like(phase, 255), phase, np.full_like(phase, 255)]
+    framed = [
+        add_border(enlarge(panel, scale), color, border)
+        for panel, color in zip(panels, colors[: len(panels)], strict=True)
+    ]
+    return np.concatenate(framed, axis=2)
+
+
+def enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
+    """Repeat every pixel of (..., H, W, 3)."""
+    return pixels if scale == 1 else pixels.repeat(scale, axis=-3).repeat(scale, axis=-2)
+
+
+def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
+    """Put (T, H, W, 3) into a border of a colour for each frame (T, 3)."""
+    frames, height, width, _ = panel.shape
+    framed = np.empty((frames, height + 2 * border, width + 2 * border, 3), dtype=np.uint8)
+    framed[:] = color[:, None, None]
+    framed[:, border : border + height, border : border + width] = panel
+    return framed
+
+
+def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail: float = 1.0) -> np.ndarray:
+    """Draw a moving map: the drone from above, where its camera looks, and the last stretch of its path.
+
+    Args:
+        track: the track.
+        trajectory: a recorded episode of K steps.
+        size: side of the square picture, pixels.
+        tail: duration of the stretch of path that is shown, s.
+
+    Returns:
+        (K + 1, size, size, 3) uint8.
+    """
+    background, points = _map_of(track, 2 * size, trajectory.position[:, :2].numpy())
+    view = camera_directions(trajectory.attitude)[:, :2].numpy() * (1.0, -1.0)  # image rows go down
+    speed = trajectory.speed.numpy()
+    colors = (255 * SPEED_COLORS(speed / max(1.0, float(np.nanmax(speed))))[:, :3]).astype(int)
+    length = round(tail / trajectory.control_dt)
+    frames = np.empty((len(points), size, size, 3), dtype=np.uint8)
+    for now in range(len(points)):
+        image = background.copy()
+        draw = ImageDraw.Draw(image)
+        for step in range(max(1, now - length), now + 1):
+            draw.line([*points[step - 1], *points[step]], fill=tuple(colors[step].tolist()), width=8)
+        crashed = trajectory.crashed and now == len(points) - 1
+        _draw_drone(draw, points[now], view[now], size / 10, CRASH_COLOR if crashed else INK)
+        frames[now] = np.asarray(image.resize((size, size), Image.Resampling.BOX))
+    return frames
+
+
+def onboard_beside_map(track: Track, trajectory: Trajectory, size: int = 256, gap: int = 8) -> np.ndarray:
+    """Compose on-board view | moving map.
+
+    Args:
+        track: the track.
+        trajectory: a recorded episode of K steps with square images.
+        size: least side of either picture, pixels: images are enlarged to it, or just beyond, by a whole factor.
+        gap: between them, pixels.
+
+    Returns:
+        (K + 1, side, 2 side + gap, 3) uint8.
+
+    Raises:
+        ValueError: no images, or images that are not square.
+    """
+    if trajectory.pixels is None:
+        raise ValueError("the trajectory has no images: record it in an environment with from_pixels=True.")
+    height, width = trajectory.pixels.shape[1:3]
+    if height != width:
+        raise ValueError(f"images of {height} × {width} pixels do not fit beside a square map.")
+    view = enlarge(trajectory.pixels.numpy(), math.ceil(size / height))
+    side = view.shape[1]
+    between = np.full((len(view), side, gap, 3), 255, dtype=np.uint8)
+    return np.concatenate((view, between, top_down_frames(track, trajectory, side)), axis=2)
+
+
+def _map_of(track: Track, size: int, positions: np.ndarray) -> tuple[Image.Image, np.ndarray]:
+    """Draw the empty map; return it, and where in it the positions (M, 2), m, are: (M, 2), pixels."""
+    figure = Figure(figsize=(4.0, 4.0), dpi=size / 4.0)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_track(axes, track, labels=False)
+    axes.set_axis_off()
+    gates = np.array([gate.position[:2] for gate in (*track.gates, *track.decoys)])
+    shown = np.concatenate((gates - MAP_MARGIN, gates + MAP_MARGIN, positions[np.isfinite(positions).all(1)]))
+    low, high = shown.min(0), shown.max(0)
+    (x, y), half = (low + high) / 2, (high - low).max() / 2
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    pixels = axes.transData.transform(positions)
+    return image, np.stack((pixels[:, 0], image.height - pixels[:, 1]), axis=1)
+
+
+def _draw_drone(draw: ImageDraw.ImageDraw, place: np.ndarray, view: np.ndarray, size: float, color: str) -> None:
+    """Draw a dot with a wedge of 90°, the camera's field of view, towards the direction view (2,)."""
+    if not np.isfinite(place).all():
+        return
+    x, y = place.tolist()
+    heading = math.degrees(math.atan2(view[1], view[0]))
+    reach = 1.6 * size * max(0.3, float(np.hypot(*view)))
+    draw.pieslice((x - reach, y - reach, x + reach, y + reach), heading - 45, heading + 45, fill="#adb5bd")
+    radius = 0.32 * size
+    draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color, outline="white", width=2)
+
+
+def _as_frames(frames: np.ndarray | torch.Tensor, name: str) -> np.ndarray:
+    array = frames.detach().cpu().numpy() if isinstance(frames, torch.Tensor) else frames
+    if array.ndim != 4 or array.shape[-1] != 3 or not array.size or array.dtype != np.uint8:
+        raise ValueError(
+            f"{name} is {array.dtype} of shape {array.shape}; wanted: uint8 (T, H, W, 3), at least 1 frame."
+        )
+    return array
+
+
+def _make_even(frame: np.ndarray) -> np.ndarray:
+    """Repeat the last row or column of (H, W, 3) where there is an odd number of them."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _shared_palette(frames: np.ndarray, colors: int) -> Image.Image:
+    """Choose the palette from up to 16 frames spread over all, one above the other."""
+    chosen = frames[np.linspace(0, len(frames) - 1, min(16, len(frames))).round().astype(int)]
+    return Image.fromarray(chosen.reshape(-1, *chosen.shape[2:])).quantize(colors, method=Image.Quantize.MEDIANCUT)

@@ -1,0 +1,282 @@
+"""Figures of what training has logged: learning curves over seeds, and variants of an experiment side by side.
+
+Shapes: S seeds of a variant.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
+from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Curve, LearningCurves
+from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
+from dreamer_racing.figures.runs import CurveKey
+
+ALGORITHMS = {"dreamer_v3": ("DreamerV3", "#1c7ed6"), "ppo": ("PPO", "#f76707"), "sac": ("SAC", "#e03131")}
+"""Names and the paper's colours; another algorithm is drawn in grey under its own name."""
+TRACKS = ("circle", "kidney", "figure8")  # columns of the paper, in its order; others follow
+VARIANT_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+VARIANT_SHADES = (0.0, -0.55, 0.5, -0.28)  # of an algorithm's colour: darker below 0, lighter above
+MANY_VARIANTS = 4  # of an algorithm: with more of them the reference is thick, the others thin and without a band
+LETTER = 0.072  # width of one in the legend, inches
+BANDS = {
+    "mean": ("mean", "sample standard deviation (n − 1)"),
+    "iqm": ("interquartile mean", "95 % bootstrap interval"),
+}
+DRAWN = ("gates", "evaluation_return")  # panels of the comparison
+Styles = dict[CurveKey, dict[str, Any]]
+SMALL: dict[str, Any] = {"fontsize": 8, "color": MUTED}
+OTHER_COLOR = "#74c0fc"  # of a variant that is not the reference
+
+
+def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
+    """Draw a column a track and a row a quantity, a colour an algorithm and a line style a variant.
+
+    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named above.
+
+    Reference: paper, Fig. "Reward evolution".
+
+    Args:
+        curves: what to draw.
+        path: the file to write; missing folders are made.
+
+    Raises:
+        ValueError: an algorithm has more variants than can be told apart.
+    """
+    tracks = _in_order({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, TRACKS)
+    quantities = [name for name in QUANTITIES if any(curve.quantity == name for curve in curves.curves)]
+    keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
+    styles = line_styles(keys)
+    longest = max(curve.env_steps[-1] for curve in curves.curves)
+    width = max(7.0, 0.6 + 3.9 * len(tracks))
+    labels = {key: f"{_label(key)} ({_seed_count(curves, key)})" for key in keys}
+    columns = max(1, int((width - 0.8) / (0.6 + LETTER * max(map(len, labels.values())))))
+    caption = textwrap.wrap(_caption(curves, styles), int((width - 0.8) / LETTER))
+    lines = len(caption) + math.ceil((len(keys) + any(map(len, curves.raises.values()))) / columns)
+    legend_height = 0.1 + 0.2 * lines  # inches
+    figure = Figure(figsize=(width, 2.7 * len(quantities) + 0.5 + legend_height), layout="constrained")
+    grid = figure.add_gridspec(
+        len(quantities) + 1, len(tracks), height_ratios=[2.7] * len(quantities) + [legend_height]
+    )
+    for row, quantity in enumerate(quantities):
+        for column, track in enumerate(tracks):
+            axes = figure.add_subplot(grid[row, column])
+            if row == 0:
+                axes.set_title(_track_title(track), fontsize=11, color=INK)
+            shown = [curve for curve in curves.curves if curve.quantity == quantity and curve.key.track == track]
+            if track == ALL_TRACKS and not shown:
+                axes.set_axis_off()  # the tracks have no common scale
+                continue
+            _draw_panel(axes, shown, styles, longest)
+            _draw_raises(axes, curves, track, styles)
+            if column == 0:
+                axes.set_ylabel(QUANTITIES[quantity].label.replace(" (", "\n("), color=INK)
+            if row == len(quantities) - 1:
+                axes.set_xlabel("env_steps", color=INK)
+    handles = [Line2D([], [], label=labels[key], **styles[key]) for key in keys]
+    if any(map(len, curves.raises.values())):
+        tick: dict[str, Any] = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
+        handles.append(Line2D([], [], label="the curriculum raises b₂", **tick))
+    _draw_legend(figure.add_subplot(grid[-1, :]), handles, "\n".join(caption), columns)
+    save(figure, path, curves.problems)
+
+
+def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, longest: float) -> None:
+    for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
+        line = styles[curve.key._replace(track="")]
+        if curve.key.is_reference or not _crowded(curve.key, styles):
+            axes.fill_between(curve.env_steps, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
+        axes.plot(curve.env_steps, curve.centre, **line)
+    if not curves:
+        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=MUTED)
+        axes.set_yticks([])
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.set_xlim(0.0, longest)
+    if curves:
+        axes.set_ylim(*_limits(curves[0].quantity, axes.get_ylim()))
+    dress(axes)
+
+
+def _limits(quantity: str, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the ends of an axis: all of 0 to 1 for a rate, and from 0 to 1 at least for what is counted."""
+    if QUANTITIES[quantity].comparable:
+        return -0.02, 1.04
+    if QUANTITIES[quantity].counted:
+        return 0.0, max(1.0, limits[1])
+    return limits
+
+
+def _draw_raises(axes: Axes, curves: LearningCurves, track: str, styles: Styles) -> None:
+    """Draw a short tick for every rise of b₂, a level above the axis for each curve that has any."""
+    raised = [key for key in styles if len(curves.raises.get(key._replace(track=track), ()))]
+    for level, key in enumerate(raised):
+        bottom = 0.012 + 0.05 * level
+        steps = curves.raises[key._replace(track=track)]
+        axes.vlines(
+            steps,
+            bottom,
+            bottom + 0.04,
+            colors=[styles[key]["color"]],
+            linewidth=1.0,
+            alpha=0.8,
+            transform=axes.get_xaxis_transform(),
+        )
+
+
+def _draw_legend(axes: Axes, handles: Sequence[Line2D], caption: str, columns: int) -> None:
+    """Fill the space below the panels."""
+    axes.set_axis_off()
+    style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.0, "labelcolor": INK}
+    legend = axes.legend(handles=handles, loc="upper left", ncols=columns, title=caption, alignment="left", **style)
+    legend.get_title().set(fontsize=9, color=MUTED)
+
+
+def _caption(curves: LearningCurves, styles: Styles) -> str:
+    """Say what was aggregated how, and of what the band is drawn."""
+    centre, band = BANDS[curves.aggregate]
+    of = " of the default alone" if any(_crowded(key, styles) for key in styles) else ""
+    window = EngFormatter(sep="")(float(f"{curves.window:.2g}"))  # 24k, 1.5M
+    return f"{centre} over seeds, and {band}{of} (none of one seed); running mean over {window} env_steps"
+
+
+def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
+    """Say over how many seeds, and over how many at the end if they are fewer; by track if they differ."""
+    counts: dict[str, tuple[int, int]] = {}
+    for curve in curves.curves:
+        track = curve.key.track
+        if curve.key._replace(track="") == key and track != ALL_TRACKS:
+            most, last = counts.get(track, (0, 0))
+            counts[track] = max(most, int(curve.seeds.max())), max(last, _seeds_at_the_end(curve))
+    texts = {
+        track: f"{most} seed{'s' if most > 1 else ''}" + (f", {last} at the end" if last < most else "")
+        for track, (most, last) in counts.items()
+    }
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return "; ".join(f"{_track_title(track)}: {texts[track]}" for track in _in_order(set(texts), TRACKS))
+
+
+def _seeds_at_the_end(curve: Curve) -> int:
+    """Count the seeds a little before the last value, since runs do not end with the same step."""
+    end = ENDS_EARLY * curve.env_steps[curve.seeds > 0].max(initial=0.0)
+    return int(curve.seeds[np.searchsorted(curve.env_steps, end, "right") - 1])
+
+
+def _label(key: CurveKey) -> str:
+    name = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))[0]
+    return f"{name}, {key.variant}" if key.variant else name
+
+
+def line_styles(keys: Sequence[CurveKey]) -> Styles:
+    """Choose how to draw each curve: the algorithm's colour, darker or lighter, and dashes.
+
+    Args:
+        keys: in the order of the legend, without their tracks.
+
+    Returns:
+        Options of matplotlib's lines by key, all different.
+
+    Raises:
+        ValueError: an algorithm has more variants than can be told apart.
+    """
+    return {key: _line_style(key, [other for other in keys if other.algorithm == key.algorithm]) for key in keys}
+
+
+def _line_style(key: CurveKey, own: Sequence[CurveKey]) -> dict[str, Any]:
+    lines, shades = len(VARIANT_LINES), len(VARIANT_SHADES)
+    if len(own) > lines * shades:
+        raise ValueError(
+            f"{len(own)} variants of {key.algorithm}: a figure can tell {lines * shades} apart. Draw them in several "
+            "figures: runs=[...] takes folders and patterns."
+        )
+    index = own.index(key)
+    color = np.array(to_rgb(ALGORITHMS.get(key.algorithm, ("", MUTED))[1]))
+    shade = VARIANT_SHADES[(index + index // lines) % shades]  # both differ as long as they can
+    mixed = color * (1 + shade) if shade < 0 else color + (1 - color) * shade
+    thin = _crowded(key, own) and not key.is_reference
+    return {"color": tuple(mixed), "linestyle": VARIANT_LINES[index % lines], "linewidth": 1.2 if thin else 1.9}
+
+
+def _crowded(key: CurveKey, keys: Collection[CurveKey]) -> bool:
+    return sum(other.algorithm == key.algorithm for other in keys) > MANY_VARIANTS
+
+
+def _rank(key: CurveKey) -> tuple[int, bool, CurveKey]:
+    """Sort by algorithm, the reference before the other variants."""
+    names = list(ALGORITHMS)
+    return names.index(key.algorithm) if key.algorithm in names else len(names), not key.is_reference, key
+
+
+def _in_order(names: set[str], first: Sequence[str]) -> list[str]:
+    """Sort names: those that come first, the others by the alphabet, the pool of all at the end."""
+    return sorted(
+        names,
+        key=lambda name: (name == ALL_TRACKS, name not in first, *([first.index(name)] if name in first else []), name),
+    )
+
+
+def _track_title(track: str) -> str:
+    return re.sub(r"(?<=[a-z])(?=\d)", " ", track.replace("_", " ")).capitalize()
+
+
+def plot_comparison(comparison: Comparison, path: str | Path) -> None:
+    """Draw a bar a variant, its standard deviation over seeds, and a dot a seed; the reference is a dashed line.
+
+    Where values may be negative there is a diamond instead of the bar.
+
+    Args:
+        comparison: what to draw.
+        path: the file to write; missing folders are made.
+    """
+    results = comparison.results
+    shown = [name for name in DRAWN if any(name in result.values for result in results)]
+    several = len({result.key[:2] for result in results}) > 1
+    figure = Figure(figsize=(3.0 + 3.4 * max(len(shown), 1), 1.2 + 0.34 * len(results)), layout="constrained")
+    panels = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, shown, strict=False):
+        for place, result in enumerate(results):
+            _draw_bar(axes, place, result, name)
+            if result.key.is_reference and not several and len(result.values.get(name, ())):
+                axes.axvline(result.values[name].mean(), color=INK, linestyle=(0, (4, 3)), linewidth=0.9)
+        axes.set_title(QUANTITIES[name].label, loc="left", fontsize=10, color=INK)
+        axes.set_xlim(*_limits(name, axes.get_xlim()))
+        dress(axes)
+        axes.grid(axis="y", visible=False)
+    names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]
+    panels[0].set_yticks(np.arange(len(results)), names)
+    panels[0].invert_yaxis()
+    figure.supxlabel(
+        textwrap.fill(CAPTION, int(NOTE_LETTERS * figure.get_figwidth())), x=0.01, ha="left", fontsize=8, color=MUTED
+    )
+    save(figure, path, comparison.problems)
+
+
+def _draw_bar(axes: Axes, place: int, result: VariantResult, name: str) -> None:
+    values = result.values.get(name, np.empty(0))
+    if not len(values):
+        axes.annotate("no values", (0.0, place), xytext=(4, 0), textcoords="offset points", va="center", **SMALL)
+        return
+    error = values.std(ddof=1) if len(values) > 1 else None
+    color = INK if result.key.is_reference else OTHER_COLOR
+    if QUANTITIES[name].counted or QUANTITIES[name].comparable:
+        axes.barh(place, values.mean(), xerr=error, color=color, ecolor=MUTED, height=0.65)
+    else:  # a bar from zero would make the worst of what is negative look the largest
+        axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, ecolor=MUTED)
+    axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4)
+    if len(values) != result.seeds:
+        right = max(values.max(), values.mean() + (error or 0.0))
+        count = f"n = {len(values)}"
+        axes.annotate(count, (right, place), xytext=(6, 0), textcoords="offset points", va="center", **SMALL)

@@ -1,0 +1,215 @@
+"""What an evaluation leaves to look at: numbers, a plot of the flight, and the world model's dream beside it.
+
+Shapes: K control steps of a recorded episode.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.evaluation.dreams import record_dream
+from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
+from dreamer_racing.evaluation.flights import write_trajectory
+from dreamer_racing.figures.drawing import plot_top_down
+from dreamer_racing.figures.film import side_by_side, write_video
+from dreamer_racing.learners.dreamer import DreamerLearner, Flyer
+
+CONTEXT, DREAM = 10, 40  # control steps the model sees, then predicts on its own, in the video
+
+
+class EvaluationReport:
+    """Evaluates a learner's policy and writes plot, video and numbers into its run directory.
+
+    Args:
+        directory: of the run; files go to its `plots`, `videos` and `evaluations` folders.
+        learner: whose policy flies, and whose world model dreams if it has one.
+        worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
+        episodes: episodes of an evaluation.
+        video_steps: control steps K that the video shows at most.
+        num_envs: episodes flown side by side.
+        seed: of the evaluation's environment, anew at each evaluation: all meet the same starts and drones.
+    """
+
+    def __init__(
+        self,
+        directory: str | Path,
+        learner: Flyer,
+        worlds: dict[str, Any],
+        episodes: int,
+        video_steps: int = 500,
+        num_envs: int = 8,
+        seed: int = 0,
+    ) -> None:
+        self.directory = Path(directory)
+        self.episodes = episodes
+        self.video_steps = video_steps
+        self._learner = learner
+        self._seed = seed
+        track = worlds["track"]
+        self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
+        self._policy = learner.evaluation_policy()
+        self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
+        self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+
+        Returns:
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+        """
+        metrics = self._one(f"{env_steps:09d}", "evaluation", deterministic=True)
+        if stochastic:
+            metrics |= self._one(f"{env_steps:09d}_stochastic", "evaluation_stochastic", deterministic=False)
+        return metrics
+
+    def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
+        result = self.evaluate(deterministic)
+        self.write(name, result)
+        numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
+        return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
+
+    def evaluate(self, deterministic: bool) -> Evaluation:
+        """Fly the episodes."""
+        self._policy.deterministic = deterministic
+        self._base.worlds.seed(self._seed)
+        return evaluate(self._env, self._act, self.episodes, max_recorded_steps=self._base.worlds.race.episode_steps)
+
+    def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act on the learner's device, with the environment on the CPU."""
+        return self._policy(tensordict.to(self._learner.device)).to("cpu")
+
+    def write(self, name: str, result: Evaluation) -> None:
+        """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
+
+        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that imagines
+        images, `<name>_dream.npz`.
+        """
+        for folder in ("evaluations", "plots", "videos"):
+            (self.directory / folder).mkdir(parents=True, exist_ok=True)
+        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
+        trajectory = result.trajectories[0]
+        write_trajectory(self.directory / "evaluations" / f"{name}_trajectory.csv", trajectory, self._track)
+        plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
+        if trajectory.pixels is None:
+            return
+        frames = trajectory.pixels[: self.video_steps]
+        if isinstance(self._learner, DreamerLearner):
+            frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
+            if (dream := record_dream(self._learner, trajectory)) is not None:
+                dream.save(self.directory / "evaluations" / f"{name}_dream.npz")
+        write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+
+    def close(self) -> None:
+        """Free the evaluation's simulator."""
+        self._env.close(raise_if_closed=False)
+
+
+class ReturnReport:
+    """Evaluates a learner's policy in any environment by its returns, and films one episode.
+
+    Args:
+        directory: of the run; files go to its `videos` and `evaluations` folders.
+        learner: whose policy acts.
+        env: batch size [N], with `pixels` or `vector`.
+        episodes: episodes of an evaluation, dealt to the N worlds beforehand.
+        video_steps: steps that the video shows at most.
+    """
+
+    def __init__(
+        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
+    ) -> None:
+        self.directory = Path(directory)
+        self.episodes = episodes
+        self.video_steps = video_steps
+        self._learner = learner
+        self._policy = learner.evaluation_policy()
+        self._env = TransformedEnv(env, Compose(InitTracker(), self._policy.make_primer()))
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
+
+        Returns:
+            Metrics `evaluation/...`, and `evaluation_stochastic/...` if asked.
+        """
+        metrics: dict[str, float] = {}
+        for suffix in ("", "_stochastic") if stochastic else ("",):
+            self._policy.deterministic = not suffix
+            returns, lengths, frames = self._act()
+            numbers = {
+                "num_episodes": float(len(returns)),
+                "return_mean": returns.mean().item(),
+                "return_std": returns.std(correction=0).item(),
+                "episode_length": lengths.mean().item(),
+            }
+            self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
+            metrics |= {f"evaluation{suffix}/{name}": value for name, value in numbers.items()}
+        return metrics
+
+    @torch.no_grad()
+    def _act(self) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Return the episodes' returns and lengths ``(episodes,)`` and the images of world 0's first episode."""
+        num_envs = self._env.batch_size[0]
+        left = torch.tensor([self.episodes // num_envs + (i < self.episodes % num_envs) for i in range(num_envs)])
+        total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
+        returns, lengths, frames, filming = [], [], [], True
+        tensordict = self._env.reset()
+        while (left > 0).any():
+            if filming and "pixels" in tensordict:
+                frames.append(tensordict["pixels"][0].clone())
+            acted = self._policy(tensordict.to(self._learner.device)).to("cpu")
+            step, tensordict = self._env.step_and_maybe_reset(acted)
+            total, length = total + step["next", "reward"].view(-1), length + 1
+            done = step["next", "done"].view(-1)
+            counted = done & (left > 0)
+            returns.append(total[counted])
+            lengths.append(length[counted])
+            left, total, length = left - counted.long(), total.masked_fill(done, 0), length.masked_fill(done, 0)
+            filming = filming and not done[0] and len(frames) < self.video_steps
+        return torch.cat(returns), torch.cat(lengths), frames
+
+    def _write(self, name: str, numbers: dict[str, Any], frames: list[Tensor]) -> None:
+        for folder in ("evaluations", "videos"):
+            (self.directory / folder).mkdir(parents=True, exist_ok=True)
+        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(numbers, indent=2))
+        if frames:
+            write_video(self.directory / "videos" / f"{name}.mp4", torch.stack(frames), fps=30)
+
+    def close(self) -> None:
+        """Free the evaluation's simulators."""
+        self._env.close(raise_if_closed=False)
+
+
+@torch.no_grad()
+def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_steps: int) -> Tensor:
+    """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
+
+    Args:
+        learner: whose world model dreams.
+        trajectory: a recorded episode with images.
+        max_steps: K at most.
+
+    Returns:
+        uint8 frames (K, height, width, 3).
+    """
+    assert trajectory.pixels is not None
+    pixels = trajectory.pixels[:max_steps]
+    if learner.agent.world_model.decoder is None:
+        return pixels
+    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))[:max_steps]  # (K, A) the action that led here
+    is_init = torch.zeros(len(pixels), 1, dtype=torch.bool)
+    is_init[0] = True
+    shown = []
+    for start in range(0, len(pixels), CONTEXT + DREAM):
+        part = slice(start, start + CONTEXT + DREAM)
+        window = {"pixels": pixels[part], "previous_action": action[part], "is_init": is_init[part]}
+        batch = TensorDict({key: value.unsqueeze(0) for key, value in window.items()}, [1, len(pixels[part])])
+        dream = learner.open_loop(batch, min(CONTEXT, batch.shape[1]))[0].cpu()
+        shown.append(torch.as_tensor(side_by_side(pixels[part], dream, CONTEXT)))
+    return torch.cat(shown)

@@ -1,0 +1,255 @@
+"""Runs on disk: finding their folders, reading what a figure needs, and putting those together that belong together."""
+
+from __future__ import annotations
+
+import glob
+import json
+import math
+import os
+import re
+import textwrap
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import yaml
+
+from dreamer_racing.training.metrics_file import MetricsTable, read_metrics
+
+T = TypeVar("T")
+
+DEFAULT_ALGORITHM = "dreamer_v3"  # of configurations from before there was a choice
+REFERENCE = "default"  # the variant that others are compared with; so is one without a name
+REASON_LETTERS = 160  # of why a file cannot be read
+SAME_CURVE = (
+    "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
+    "replay.device", "evaluation.every", "evaluation.stochastic", "evaluation.video_steps", "model.compile",
+    "model.cuda_graph",
+)  # fmt: skip
+"""Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
+
+
+class CurveKey(NamedTuple):
+    """What the runs of one curve have in common."""
+
+    track: str
+    algorithm: str
+    variant: str
+    """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``; empty otherwise."""
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether the other variants are compared with this one."""
+        return self.variant in ("", REFERENCE)
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        return " ".join(filter(None, (self.algorithm, self.track, self.variant)))
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run directory, read.
+
+    Args:
+        directory: of the run.
+        config: settings of `config.yaml` by dotted name.
+        metrics: its `metrics.csv`.
+    """
+
+    directory: Path
+    config: dict[str, Any]
+    metrics: MetricsTable
+
+    @property
+    def name(self) -> str:
+        """Of the folder."""
+        return self.directory.name
+
+    @property
+    def seed(self) -> int:
+        """Of the run."""
+        return int(self.config.get("seed", 0))
+
+    @property
+    def key(self) -> CurveKey:
+        """Which curve the run belongs to."""
+        algorithm = str(self.config.get("algorithm", DEFAULT_ALGORITHM))
+        track = Path(str(self.config.get("track", "unknown"))).stem
+        named = re.fullmatch(rf"{re.escape(f'{algorithm}_{track}')}(?:_(?P<variant>.+))?_seed\d+", self.name)
+        return CurveKey(track, algorithm, (named and named["variant"]) or "")
+
+
+def find_runs(places: Sequence[str | Path]) -> list[Path]:
+    """Find run directories: folders with a `config.yaml` or a `metrics.csv`.
+
+    Args:
+        places: run directories, folders that hold some at any depth, or patterns with `*` of either.
+
+    Returns:
+        The folders, sorted, each once; what lies inside of a run (`best`, `evaluation`) is no run.
+
+    Raises:
+        ValueError: there is none in one of the places.
+    """
+    found = set()
+    for place in places:
+        folders = sorted(glob.glob(os.path.expanduser(str(place)), recursive=True))
+        inside = {run for folder in folders for run in _runs_below(Path(folder))}
+        if not inside:
+            raise ValueError(f"runs={place}: there is no run directory (a folder with config.yaml or metrics.csv).")
+        found |= inside
+    return sorted(found)
+
+
+def _runs_below(folder: Path) -> Iterator[Path]:
+    for path, folders, files in os.walk(folder):
+        if "config.yaml" in files or "metrics.csv" in files:
+            folders.clear()
+            yield Path(path)
+        folders.sort()
+
+
+def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None) -> tuple[list[RunData], list[str]]:
+    """Read runs, leaving out those that cannot be read.
+
+    Args:
+        directories: of the runs.
+        wanted: names of the columns of `metrics.csv` to read; None for all.
+
+    Returns:
+        The runs, and for everything left out a line that names the run and the reason.
+    """
+    runs, problems = [], []
+    for directory in directories:
+        try:
+            run = RunData(directory, _read_config(directory), read_metrics(directory / "metrics.csv", wanted))
+        except FileNotFoundError as error:
+            problems.append(f"{directory.name} left out: it has no {Path(error.filename).name}")
+        except (ValueError, OSError) as error:
+            reason = str(error).replace(f"{directory}{os.sep}", "").rstrip(".")
+            problems.append(f"{directory.name} left out: {reason}")
+        else:
+            runs.append(run)
+            problems += [f"{directory.name}: {problem}" for problem in run.metrics.problems]
+    return runs, problems
+
+
+def _read_config(directory: Path) -> dict[str, Any]:
+    path = directory / "config.yaml"
+    try:
+        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not YAML") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path} holds no settings")
+    return dict(_flatten(config))
+
+
+def _flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
+    """Put the runs of one curve together, in order of their seeds.
+
+    Raises:
+        ValueError: runs of one curve differ in a setting that changes what is learned, or not even in the seed; the
+            message names the settings and both values. What one of them does not have, because it was started by an
+            older version, is no difference.
+    """
+    groups = _by_curve(runs)
+    for key, group in groups.items():
+        for first, second in combinations(group, 2):
+            _check_alike(key, first, second)
+    return groups
+
+
+def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:
+    """Take the run of the lowest seed of each curve, alike or not."""
+    return [group[0] for group in _by_curve(runs).values()]
+
+
+def _by_curve(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
+    groups: dict[CurveKey, list[RunData]] = defaultdict(list)
+    for run in sorted(runs, key=lambda run: (run.key, run.seed, str(run.directory))):
+        groups[run.key].append(run)
+    return dict(groups)
+
+
+def _check_alike(key: CurveKey, first: RunData, second: RunData) -> None:
+    different = [
+        f"{name}: {first.config[name]} and {second.config[name]}"
+        for name in sorted(first.config.keys() & second.config.keys())
+        if not name.startswith(SAME_CURVE) and first.config[name] != second.config[name]
+    ]
+    if different:
+        raise ValueError(
+            f"{first.directory} and {second.directory} would be one curve ({key}), but "
+            f"were not configured alike: {'; '.join(different)}. Plot them apart, or name their folders "
+            "<algorithm>_<track>_<variant>_seed<k> with different variants."
+        )
+    if first.seed == second.seed:
+        raise ValueError(
+            f"{first.directory} and {second.directory} are the same run twice: the same settings, and "
+            f"seed: {first.seed} in both. Plot one of them."
+        )
+
+
+def evaluation_files(directory: Path, ending: str) -> dict[int, Path]:
+    """Find what the evaluations of a training run have left.
+
+    Args:
+        directory: of the run.
+        ending: of the files' names, after the env_steps.
+
+    Returns:
+        The files by env_steps, rising; those of stochastic policies are left out.
+    """
+    files = sorted((directory / "evaluations").glob(f"*{ending}"))
+    return {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
+
+
+def evaluation_score(directory: Path, env_steps: int) -> tuple[float, float]:
+    """Say how good an evaluation was: gates per episode, then the return; the worst if its numbers are missing."""
+    try:
+        numbers = json.loads((directory / "evaluations" / f"{env_steps:09d}.json").read_text(encoding="utf-8"))
+        return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return -math.inf, -math.inf
+
+
+def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
+    """Read the first of some files of a run's evaluations that can be read.
+
+    Args:
+        files: which, in the order of preference.
+        read: raises ValueError or OSError at what it cannot read.
+        problems: gets a line if files were passed over, with the run, the first of them and why.
+
+    Returns:
+        The file and what is in it; None if none of them can be read.
+    """
+    failures: list[tuple[Path, Exception]] = []
+    found = None
+    for file in files:
+        try:
+            found = file, read(file)
+            break
+        except (ValueError, OSError) as error:
+            failures.append((file, error))
+    if failures:
+        first, failure = failures[0]
+        more = len(failures) - 1
+        others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
+        reason = textwrap.shorten(str(failure).replace(f"{first.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
+        line = f"{first.parent.parent.name} without {first.name}{others}: {reason}"
+        problems += [line] if line not in problems else []
+    return found

@@ -1,0 +1,7 @@
+"""Model-free baselines: PPO and SAC with the paper's networks on TorchRL's losses."""
+
+from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize
+from dreamer_racing.learners.ppo import PPOConfig, PPOLearner
+from dreamer_racing.learners.sac import SACConfig, SACLearner
+
+__all__ = ["BaselinePolicy", "NetworkSize", "PPOConfig", "PPOLearner", "SACConfig", "SACLearner"]

@@ -1,0 +1,93 @@
+"""What the baselines' learners have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+
+from dreamer_racing.learners.finite_guard import FiniteGuard
+from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_size, size_of
+from dreamer_racing.modules import Interface
+
+
+class BaselineLearner(ABC):
+    """Networks, one optimiser, and their state.
+
+    Args:
+        size: Of the networks.
+        interface: What the agent sees and does.
+        device: Where the networks live and updates run.
+
+    Attributes:
+        actor: Whose policy acts.
+        networks: The trained parameters of each network.
+        optimizer: Of all of them.
+        device: As given.
+        updates: Gradient steps made.
+    """
+
+    actor: ProbabilisticTensorDictSequential
+    networks: dict[str, list[nn.Parameter]]
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, size: NetworkSize, interface: Interface, device: torch.device | str) -> None:
+        self.device = torch.device(device)
+        self.updates = 0
+        self._keys = interface.observation_keys
+        self._size = size_of(size, interface)
+        self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
+
+    def policy(self, deterministic: bool = False) -> BaselinePolicy:
+        """Return the acting step, which shares this learner's parameters."""
+        return BaselinePolicy(self.actor, deterministic)
+
+    def evaluation_policy(self, deterministic: bool = False) -> BaselinePolicy:
+        """Return the acting step to evaluate: the one that is trained."""
+        return self.policy(deterministic)
+
+    def check_finite(self) -> None:
+        """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
+        self._guard.settle()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        parts = {name: module.state_dict() for name, module in self._modules().items()}
+        return {"size": self._size, **parts, "optimizer": self.optimizer.state_dict(), "updates": self.updates}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned.
+
+        Raises:
+            ValueError: If it is that of networks of another size; nothing is changed then.
+        """
+        check_size(state_dict["size"], self._size)
+        for name, module in self._modules().items():
+            module.load_state_dict(state_dict[name])
+        rate = self.optimizer.param_groups[0]["lr"]
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.optimizer.param_groups[0]["lr"] = rate  # a setting of this learner, not state
+        self.updates = state_dict["updates"]
+
+    @abstractmethod
+    def _modules(self) -> dict[str, nn.Module]:
+        """Return what is saved."""
+
+
+@contextmanager
+def seeded(seed: int | None) -> Iterator[None]:
+    """Draw initial weights by a seed, without a trace in the global generator; None draws them from that."""
+    with torch.random.fork_rng(devices=[], enabled=seed is not None):
+        if seed is not None:
+            torch.manual_seed(seed)
+        yield
+
+
+def detached(outputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return metrics without their gradients."""
+    return {name: value.detach() for name, value in outputs.items()}

@@ -1,0 +1,203 @@
+"""The PPO learner: networks, TorchRL's clipped loss, and the gradient steps on one rollout.
+
+Shape legend: N environments, T steps of a rollout, M records of a minibatch, A action.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
+from dreamer_racing.learners.networks import (
+    GaussianNetwork,
+    NetworkModule,
+    NetworkSize,
+    ObservationNetwork,
+)
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.clock import Timer, untimed
+
+
+@dataclass
+class PPOConfig:
+    """Numbers of the learner.
+
+    Attributes:
+        learning_rate: Of Adam.
+        epochs: Times that every record of a rollout is trained on.
+        minibatches: Gradient steps of an epoch.
+        clip_epsilon: ε of the clipped ratio.
+        discount: γ.
+        lambda_: λ of the advantages.
+        entropy_scale: Weight of the policy's entropy.
+        critic_scale: Weight of the critic's squared error.
+        reward_scale: Factor on rewards before the critic sees them, so that its errors are of order one.
+        gradient_clip: Largest norm of a network's gradient; actor and critic are clipped apart.
+        initial_std: Of the actions, which later is learned, one number for each dimension.
+
+    Reference: Schulman et al. 2017, "Proximal policy optimization algorithms". Clipping, discount, λ and the weights of
+    the losses are the defaults of Stable-Baselines3; learning rate, epochs, minibatches, scale of rewards and initial
+    deviation are [choice].
+    """
+
+    learning_rate: float = 1e-3
+    epochs: int = 5
+    minibatches: int = 8
+    clip_epsilon: float = 0.2
+    discount: float = 0.99
+    lambda_: float = 0.95
+    entropy_scale: float = 0.0
+    critic_scale: float = 0.5
+    reward_scale: float = 0.1
+    gradient_clip: float = 0.5
+    initial_std: float = 0.6
+
+
+class PPOLearner(BaselineLearner):
+    """Actor and critic with TorchRL's ``ClipPPOLoss``, and one optimiser.
+
+    Actions are drawn from a normal that is not bounded: the environment clips them to [−1, 1].
+
+    Args:
+        size: Of both networks.
+        interface: What the agent sees and does.
+        config: Numbers of the learner.
+        device: Where the networks live and updates run.
+        seed: Of the initial weights; None takes them from the global generator.
+
+    Example:
+        >>> learner = PPOLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
+        >>> learner.policy().in_keys
+        ['vector']
+    """
+
+    def __init__(
+        self,
+        size: NetworkSize,
+        interface: Interface,
+        config: PPOConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(size, interface, device)
+        self.config = config or PPOConfig()
+        with seeded(seed):
+            self.actor = _make_actor(interface, size, self.config.initial_std).to(self.device)
+            self.critic = NetworkModule(ObservationNetwork(interface, 1, size), ["state_value"]).to(self.device)
+        self._loss = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=self.config.clip_epsilon,
+            entropy_coeff=self.config.entropy_scale,
+            entropy_bonus=self.config.entropy_scale > 0,
+            critic_coeff=self.config.critic_scale,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.networks = {"actor": list(self.actor.parameters()), "critic": list(self.critic.parameters())}
+        self.optimizer = torch.optim.Adam(
+            [p for group in self.networks.values() for p in group],
+            lr=self.config.learning_rate,
+            eps=1e-5,
+            fused=True,
+        )
+
+    def update(self, rollout: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Make ``epochs`` passes of gradient steps over a rollout.
+
+        Args:
+            rollout: Batch ``[N, T]`` as a collector returns it.
+            timed: Context manager by activity (``advantages``, ``optimise``).
+
+        Returns:
+            Losses and diagnostics, scalar tensors on the device, averaged over the gradient steps.
+
+        Raises:
+            NonFiniteLossError: If a loss or gradient is not finite.
+        """
+        with timed("advantages"):
+            records = self.with_advantages(rollout)
+        steps: list[dict[str, Tensor]] = []
+        with timed("optimise"):
+            for _ in range(self.config.epochs):
+                order = torch.randperm(len(records), device=self.device)
+                steps += [self._step(records[indices]) for indices in order.chunk(self.config.minibatches)]
+        return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+
+    @torch.no_grad()
+    def with_advantages(self, rollout: TensorDictBase) -> TensorDict:
+        """Return the records of a rollout ``[N T]`` with ``advantage`` and ``value_target`` ``(N T, 1)``."""
+        records = rollout.select(*self._keys, "action", "action_log_prob").to(self.device)
+        outcome = rollout["next"].select("reward", "done", "terminated").to(self.device)
+        value, next_value = self._values(records, rollout["next"])
+        advantage, target = vec_generalized_advantage_estimate(
+            self.config.discount,
+            self.config.lambda_,
+            value,
+            next_value,
+            outcome["reward"] * self.config.reward_scale,
+            outcome["done"],
+            outcome["terminated"],
+        )
+        return records.update({"advantage": advantage, "value_target": target}).flatten()
+
+    def _values(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the values of what was seen and of what came next, ``(N, T, 1)`` each.
+
+        What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
+        a crash it counts for nothing. So hardly any image is looked at twice.
+        """
+        value = self._judge(records.flatten()).view(*records.shape, 1)
+        next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
+        apart = following["done"].squeeze(-1).clone()
+        apart[:, -1] = True
+        apart &= ~following["terminated"].squeeze(-1)  # (N, T)
+        others = following.select(*self._keys)[apart].to(self.device)
+        next_value[apart.to(self.device)] = self._judge(others)
+        return value, next_value
+
+    def _judge(self, records: TensorDictBase) -> Tensor:
+        """Return the values of records ``[N]``, ``(N, 1)``, in parts, for a rollout of images is large."""
+        seen, size = records.select(*self._keys), max(1, math.ceil(len(records) / self.config.minibatches))
+        starts = range(0, max(1, len(records)), size)
+        return torch.cat([self.critic(seen[start : start + size])["state_value"] for start in starts])
+
+    def _step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step on a minibatch ``[M]``."""
+        outputs = self._loss(batch)
+        total = torch.stack([value for name, value in outputs.items() if name.startswith("loss_")]).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norms = {
+            f"gradient_norm/{name}": nn.utils.clip_grad_norm_(parameters, self.config.gradient_clip)
+            for name, parameters in self.networks.items()
+        }
+        metrics = detached({**outputs, **norms, "loss": total})
+        self._guard.check(metrics, batch)
+        self.optimizer.step()
+        self.updates += 1
+        return metrics
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"actor": self.actor, "critic": self.critic}
+
+
+def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
+    """Make a normal whose mean depends on what is seen, and whose deviation does not."""
+    network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
+    deviation = AddStateIndependentNormalScale(interface.action_dim, init_value=math.log(initial_std))
+    return ProbabilisticActor(
+        NetworkModule(GaussianNetwork(network, deviation), ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )

@@ -1,0 +1,166 @@
+"""The SAC learner: networks, TorchRL's loss, and one gradient step on replayed transitions.
+
+Shape legend: B batch, A action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import NormalParamExtractor
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
+from dreamer_racing.learners.networks import (
+    GaussianNetwork,
+    NetworkModule,
+    NetworkSize,
+    ObservationNetwork,
+)
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.clock import Timer, untimed
+
+NO_WEIGHT = 1e-30  # beside a transition's 1: lost in float32, but a sum of it is not 0
+
+
+@dataclass
+class SACConfig:
+    """Numbers of the learner.
+
+    Attributes:
+        learning_rate: Of Adam, for actor, critics and temperature.
+        batch_size: B, transitions.
+        replay_ratio: Transitions trained on per environment step.
+        discount: γ.
+        target_rate: Fraction by which the target critics move at each update.
+        initial_alpha: Temperature at the start; it is learned, towards an entropy of −A nats.
+        reward_scale: Factor on rewards.
+
+    Reference: Haarnoja et al. 2018, "Soft actor-critic algorithms and applications"; numbers of Stable-Baselines3, but
+    for batch size and replay ratio (there are many worlds), temperature and scale of rewards [choice].
+    """
+
+    learning_rate: float = 3e-4
+    batch_size: int = 1024
+    replay_ratio: float = 16.0
+    discount: float = 0.99
+    target_rate: float = 0.005
+    initial_alpha: float = 0.05
+    reward_scale: float = 1.0
+
+
+class SACLearner(BaselineLearner):
+    """Actor and two critics with TorchRL's ``SACLoss``, and one optimiser.
+
+    Args:
+        size: Of all networks.
+        interface: What the agent sees and does.
+        config: Numbers of the learner.
+        device: Where the networks live and updates run.
+        seed: Of the initial weights; None takes them from the global generator.
+
+    Example:
+        >>> learner = SACLearner(NetworkSize(2, 32), Interface(pixels=False, vector_dim=21), seed=0)
+        >>> learner.policy().in_keys
+        ['vector']
+    """
+
+    def __init__(
+        self,
+        size: NetworkSize,
+        interface: Interface,
+        config: SACConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(size, interface, device)
+        self.config = config or SACConfig()
+        with seeded(seed):
+            self.actor = _make_actor(interface, size).to(self.device)
+            critic = ObservationNetwork(interface, 1, size, with_action=True)
+            self._loss = SACLoss(
+                self.actor,
+                NetworkModule(critic, ["state_action_value"]),
+                alpha_init=self.config.initial_alpha,
+                target_entropy=-float(interface.action_dim),
+                loss_function="l2",
+                deactivate_vmap=True,
+            ).to(self.device)
+        self._loss.make_value_estimator(gamma=self.config.discount)
+        self._targets = SoftUpdate(self._loss, tau=self.config.target_rate)
+        self.networks = {
+            "actor": list(self.actor.parameters()),
+            "critic": list(self._loss.qvalue_network_params.values(True, True)),
+        }
+        trained = [*self.networks["actor"], *self.networks["critic"], self._loss.log_alpha]
+        self.optimizer = torch.optim.Adam(trained, lr=self.config.learning_rate, fused=True)
+
+    def update(self, windows: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Make one gradient step.
+
+        Args:
+            windows: Replay records ``[B, 2]``, see `transitions`.
+            timed: Context manager by activity (``optimise``).
+
+        Returns:
+            Losses and diagnostics, scalar tensors on the device.
+
+        Raises:
+            NonFiniteLossError: If a loss or gradient is not finite.
+        """
+        with timed("optimise"):
+            batch = self.transitions(windows.to(self.device, non_blocking=True))
+            outputs = self._loss(batch)
+            total = outputs["loss_actor"] + outputs["loss_qvalue"] + outputs["loss_alpha"]
+            self.optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            norms = {
+                f"gradient_norm/{name}": nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+                for name, parameters in self.networks.items()
+            }
+            metrics = detached({**outputs, **norms, "loss": total})
+            self._guard.check(metrics, batch)
+            self.optimizer.step()
+            self._targets.step()
+        self.updates += 1
+        return metrics
+
+    def transitions(self, windows: TensorDictBase) -> TensorDict:
+        """Make transitions ``[B]`` of windows of two records.
+
+        Where the second record begins an episode there was no transition from the first: it has next to no weight (not
+        none, for a batch of nothing else would have no mean).
+        """
+        before, after = windows[:, 0], windows[:, 1]
+        following = {key: after.get(key) for key in self._keys}
+        following |= {key: after.get(key) for key in ("terminated", "truncated")}
+        following["done"] = following["terminated"] | following["truncated"]
+        following["reward"] = after.get("reward") * self.config.reward_scale
+        observation = {key: before.get(key) for key in self._keys}
+        return TensorDict(
+            {
+                **observation,
+                "action": after.get("previous_action"),
+                "next": following,
+                "priority_weight": (~after.get("is_init").squeeze(-1)).float().clamp(min=NO_WEIGHT),
+            },
+            windows.batch_size[:1],
+        )
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"loss": self._loss}
+
+
+def _make_actor(interface: Interface, size: NetworkSize) -> ProbabilisticActor:
+    """Make a normal whose mean and deviation depend on what is seen, squashed into [−1, 1]."""
+    network = ObservationNetwork(interface, 2 * interface.action_dim, size, output_scale=0.01)
+    return ProbabilisticActor(
+        NetworkModule(GaussianNetwork(network, NormalParamExtractor()), ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )

@@ -1,0 +1,259 @@
+"""The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
+
+import random
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker
+
+from composing.arena import Environment, crash_causes, is_race, make_report, reward_terms, scene_name
+from composing.checks import refuse_to_replace
+from composing.command_line import CONFIG_DIR, choose_device, new_run_dir
+from composing.launching import Run
+from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage
+from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
+from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.learners.dreamer import Learner
+from dreamer_racing.machine import (
+    available_memory,
+    check_fits,
+)
+from dreamer_racing.modules import Interface
+from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.training.checkpoint import (
+    BestCheckpoint,
+    CollectorState,
+    RunCheckpoints,
+    ensure_writable,
+)
+from dreamer_racing.training.clock import RunClock
+from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.metrics import EpisodeTracker, MetricsLog
+
+R = TypeVar("R", bound=Run)
+
+
+def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
+    """Fill in what every recipe leaves open, and say what was chosen; return the learner's device."""
+    device = choose_device(config.device)
+    if config.device == "auto":
+        print(f"device: {device} (device=auto)")
+    config.device = str(device)
+    if OmegaConf.is_missing(config.env, "num_envs"):
+        config.env.num_envs = num_envs
+    if config.env.episode_steps is None:
+        config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
+    if config.env.device == "auto":
+        config.env.device = worlds_device(config)
+        print(f"worlds: {config.env.device} (env.device=auto)")
+    if config.run_dir is None:
+        config.run_dir = str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config))))
+    return device
+
+
+def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
+    """Fill in what a baseline leaves open, by what it sees (``pixels`` or ``state``), and say what was chosen.
+
+    Args:
+        config: of the recipe.
+        num_envs: worlds flown side by side, of either.
+    """
+    resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
+    if config.network.size == "auto":
+        sees = "images" if config.env.from_pixels else "numbers"
+        config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
+        print(f"network: {config.network.size} (network=auto, seeing {sees}, budget={config.budget})")
+    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml"))
+    for name in ("layers", "units"):
+        if OmegaConf.is_missing(config.network, name):
+            config.network[name] = numbers[name]
+    return config
+
+
+def worlds_device(config: DictConfig) -> str:
+    """The device for the worlds to train in: the learner's, where they have a simulator and the renderer asked for."""
+    on_cuda = torch.device(config.device).type == "cuda"
+    fits = config.env.suite == "race" and config.env.renderer in ("auto", "warp")
+    return str(config.device) if on_cuda and fits else "cpu"
+
+
+def seed_generators(seed: int) -> None:
+    """Seed all global generators, of which torch's samples actions and latents."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - what libraries draw from
+    torch.manual_seed(seed)
+
+
+def make_curriculum(config: RunConfig) -> BodyRateCurriculum | None:
+    """Make the schedule of the race's body-rate penalty; other suites have none."""
+    if not is_race(config):
+        return None
+    settings = asdict(config.curriculum)
+    del settings["relabel"]
+    return BodyRateCurriculum(**settings)
+
+
+def make_collector(config: RunConfig, env: Environment, policy: TensorDictModuleBase) -> Collector:
+    """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device."""
+    return Collector(
+        TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
+        policy,
+        frames_per_batch=config.env.num_envs * config.rollout_steps,
+        total_frames=-1,
+        env_device=env.device,
+        policy_device=config.device,
+        storing_device=env.device,
+        track_traj_ids=False,
+        no_cuda_sync=False,
+    )
+
+
+def make_run_replay(
+    config: DreamerConfig | SACRunConfig,
+    env: Environment,
+    curriculum: BodyRateCurriculum | None,
+    batch_size: int,
+    batch_length: int,
+    latents: LatentFormat | None = None,
+    **windows: Any,
+) -> StreamReplay:
+    """Make the replay, on the learner's device if it has room there; say where and how large.
+
+    Args:
+        config: resolved.
+        env: whose records it is to hold.
+        curriculum: by which old rewards are relabelled, if they are.
+        batch_size: windows in a batch.
+        batch_length: records in a window.
+        latents: how they are kept with the records, if they are.
+        windows: further arguments of `make_replay` on which windows are drawn.
+    """
+    settings, interface = config.replay, Interface.of(env)
+    numbers = interface.vector_dim + interface.privileged_dim
+    image = interface.image_shape if interface.pixels else (0,)
+    size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
+    storage_device = settings.device
+    if storage_device == "auto":
+        on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
+        storage_device = config.device if on_learner else "cpu"
+    where = storage_device if settings.storage is Storage.tensor else "files"
+    if settings.storage is Storage.tensor:
+        check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
+    print(
+        f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}; as much on disk "
+        f"in each of checkpoint.keep={config.checkpoint.keep} checkpoints"
+    )
+    return make_replay(
+        settings.capacity,
+        config.env.num_envs,
+        batch_size,
+        batch_length,
+        config.device,
+        storage=settings.storage.value,
+        storage_device=storage_device,
+        seed=config.seed,
+        transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
+        observation_keys=interface.replay_keys,
+        reward_keys=reward_terms(env),
+        latents=latents,
+        # Samples drawn ahead would not have the latents that the update before them leaves.
+        prefetch=2 if config.device != "cpu" and storage_device == "cpu" and latents is None else None,
+        **windows,
+    )
+
+
+def claim(config: RunConfig) -> RunLock:
+    """Take a run directory before anything large is made.
+
+    Raises:
+        ValueError: it holds another run, or is in use by a live one.
+    """
+    assert config.run_dir is not None, "resolve_common() names it"
+    lock = RunLock(ensure_writable(config.run_dir))
+    refuse_to_replace(config)
+    return lock
+
+
+def assemble(
+    kind: type[R],
+    config: RunConfig,
+    overrides: list[str],
+    lock: RunLock,
+    env: Environment,
+    learner: Learner,
+    collector: Collector,
+    curriculum: BodyRateCurriculum | None,
+    rollouts: Iterator[TensorDictBase] | None = None,
+    **own: Any,
+) -> R:
+    """Put a run together in its directory, restored from a checkpoint if it continues one.
+
+    Args:
+        kind: the recipe's class of runs.
+        config: resolved.
+        overrides: from which it was composed.
+        lock: of its directory.
+        env: to train in.
+        learner: what learns.
+        collector: of its rollouts.
+        curriculum: of rewards, if there is one.
+        rollouts: an iterator over the collector; None for its own.
+        own: further fields of ``kind``; a ``replay`` is saved with the run.
+    """
+    directory = lock.directory
+    tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
+    counters = {"env_steps": 0, "updates": 0, "episodes": 0}
+    parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
+    parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
+    parts |= {"replay": own["replay"]} if "replay" in own else {}
+    parts |= {"lag": own["lag"]} if "lag" in own else {}
+    checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
+    clock = RunClock(counters)
+    if config.resume:
+        clock.total = checkpoints.load(config.resume, may_lack=("lag",)).get("wall_clock", 0.0)
+        print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
+    best = BestCheckpoint(directory, {"learner": learner, "counters": counters})
+    for folder in (directory, best.directory):
+        OmegaConf.save(OmegaConf.structured(config), folder / "config.yaml")
+    kept = [override for override in overrides if not override.startswith("resume=")]
+    OmegaConf.save(OmegaConf.create(kept), directory / "overrides.yaml")
+    metrics = MetricsLog(
+        directory,
+        tensorboard=config.logger.tensorboard,
+        resume_env_steps=counters["env_steps"] if config.resume else None,
+    )
+    print(f"run directory: {directory}")
+    return kind(
+        config=config,
+        directory=directory,
+        env=env,
+        collector=collector,
+        rollouts=rollouts or iter(collector),
+        tracker=tracker,
+        curriculum=curriculum,
+        learner=learner,
+        report=make_report(
+            config,
+            directory,
+            learner,
+            config.evaluation.episodes,
+            config.evaluation.video_steps,
+            config.evaluation.start_noise,
+        ),
+        metrics=metrics,
+        checkpoints=checkpoints,
+        best=best,
+        counters=counters,
+        clock=clock,
+        lock=lock,
+        **own,
+    )

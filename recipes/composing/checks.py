@@ -1,0 +1,399 @@
+"""What the recipe refuses before anything is built: settings with which a run could not work.
+
+Every message names the setting as the user writes it, its value, and what would be right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from composing.arena import is_race
+from composing.schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
+from dreamer_racing.envs.drone.quadrotor import MIN_CONTROL_RATE, at_control_rate, load_preset
+from dreamer_racing.envs.race.gates import GateSweeper
+from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.losses import ImaginedPPOConfig
+from dreamer_racing.losses.ppo_actor import KL_TOLERANCE
+from dreamer_racing.modules import get_size
+from dreamer_racing.modules.encoder import smallest_map
+from dreamer_racing.training.checkpoint import latest_checkpoint
+
+
+class Range(NamedTuple):
+    """Allowed values of a setting: a whole interval, or one without its lower end."""
+
+    low: float
+    high: float = math.inf
+    open_below: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, (int, float)) and (
+            self.low < value <= self.high if self.open_below else self.low <= value <= self.high
+        )
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        below = f"above {self.low:g}" if self.open_below else f"at least {self.low:g}"
+        return below if self.high == math.inf else f"{below} and at most {self.high:g}"
+
+
+POSITIVE, SHARE, NOT_NEGATIVE = Range(0, open_below=True), Range(0, 1), Range(0)
+RANGES = {
+    "total_env_steps": Range(1),
+    "prefill": NOT_NEGATIVE,
+    "rollout_steps": Range(1),
+    "seed": Range(0, 2**32 - 1),
+    "env.num_envs": Range(1),
+    "env.episode_steps": Range(1),
+    "env.control_rate": Range(MIN_CONTROL_RATE),
+    "env.start_beyond_gate": SHARE,
+    "env.start_on_line": SHARE,
+    "env.miss_radius": NOT_NEGATIVE,
+    "model.batch_size": Range(1),
+    "model.batch_length": Range(2),
+    "model.replay_ratio": POSITIVE,
+    "model.learning_rate": POSITIVE,
+    "model.behavior_learning_rate": POSITIVE,
+    "model.warmup_updates": NOT_NEGATIVE,
+    "model.imagination_horizon": Range(1),
+    "model.imagination_starts": Range(1),
+    "model.average_rate": Range(0, 1, open_below=True),
+    "loss.discount": SHARE,
+    "loss.lambda_": SHARE,
+    "loss.entropy_scale": NOT_NEGATIVE,
+    "loss.min_std": Range(0, 1, open_below=True),
+    "schedule.wait_every": Range(1),
+    "loss.ppo.updates": Range(1),
+    "loss.ppo.epochs": Range(1),
+    "loss.ppo.minibatch": Range(1),
+    "loss.ppo.clip_epsilon": POSITIVE,
+    "loss.ppo.advantage_clip": POSITIVE,
+    "loss.ppo.kl_stop": POSITIVE,
+    "loss.ppo.kl_target": POSITIVE,
+    "loss.ppo.learning_rate": POSITIVE,
+    "loss.ppo.gradient_clip": POSITIVE,
+    "loss.dynamics_scale": NOT_NEGATIVE,
+    "loss.representation_scale": NOT_NEGATIVE,
+    "loss.free_nats": NOT_NEGATIVE,
+    "loss.privileged_scale": NOT_NEGATIVE,
+    "loss.barlow_scale": NOT_NEGATIVE,
+    "loss.replay_value_scale": NOT_NEGATIVE,
+    "network.layers": NOT_NEGATIVE,
+    "network.units": Range(1),
+    "ppo.learning_rate": POSITIVE,
+    "ppo.epochs": Range(1),
+    "ppo.minibatches": Range(1),
+    "ppo.clip_epsilon": POSITIVE,
+    "ppo.discount": SHARE,
+    "ppo.lambda_": SHARE,
+    "ppo.entropy_scale": NOT_NEGATIVE,
+    "ppo.critic_scale": NOT_NEGATIVE,
+    "ppo.reward_scale": POSITIVE,
+    "ppo.gradient_clip": POSITIVE,
+    "ppo.initial_std": POSITIVE,
+    "sac.learning_rate": POSITIVE,
+    "sac.batch_size": Range(1),
+    "sac.replay_ratio": POSITIVE,
+    "sac.discount": SHARE,
+    "sac.target_rate": SHARE,
+    "sac.initial_alpha": POSITIVE,
+    "sac.reward_scale": POSITIVE,
+    "replay.capacity": Range(1),
+    "replay.recent_share": SHARE,
+    "replay.recent_records": Range(1),
+    "replay.held_out": NOT_NEGATIVE,
+    "evaluation.every": NOT_NEGATIVE,
+    "evaluation.episodes": Range(1),
+    "evaluation.video_steps": Range(1),
+    "evaluation.start_noise": NOT_NEGATIVE,
+    "checkpoint.every": NOT_NEGATIVE,
+    "checkpoint.keep": Range(1),
+    "logger.every": NOT_NEGATIVE,
+}
+"""Allowed values by setting, of those that a recipe has; null is allowed where the schema allows it."""
+
+RACE_ONLY = {
+    "env.control_rate": 50.0,
+    "env.start_beyond_gate": 0.0,
+    "env.start_on_line": 0.0,
+    "env.miss_radius": 0.0,
+    "evaluation.start_noise": 0.0,
+}
+"""Settings that other suites have no use for, with the defaults at which they must be left."""
+
+
+def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a task without `env=dmc`, and a track or decoys with it: one of them would be ignored.
+
+    Raises:
+        ValueError: the message says what to add or leave out.
+    """
+    given = {override.partition("=")[0] for override in overrides}
+    race = config.env.suite == "race"
+    if race and "task" in given:
+        raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
+    if not race and config.decoys:
+        raise ValueError(f"decoys={config.decoys} are for races, and env.suite={config.env.suite}: leave them out.")
+    if not race and "track" in given:
+        raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
+
+
+def refuse_to_replace(config: RunConfig) -> None:
+    """Refuse to begin a run where another has left checkpoints.
+
+    Raises:
+        ValueError: the message names the newest of them.
+    """
+    if config.resume:
+        return
+    assert config.run_dir is not None
+    try:
+        newest = latest_checkpoint(Path(config.run_dir) / "checkpoints")
+    except FileNotFoundError:
+        return
+    raise ValueError(
+        f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with resume={config.run_dir}, "
+        "or choose another run_dir."
+    )
+
+
+class ReplayRatio(NamedTuple):
+    """How much a learner with a replay trains: so many records on per environment step made since the prefill.
+
+    Args:
+        ratio: records trained on per environment step.
+        records: that an update trains on.
+        prefill: env_steps collected before the first update.
+        setting: name of the ratio in the configuration.
+    """
+
+    ratio: float
+    records: int
+    prefill: int
+    setting: str
+
+    @classmethod
+    def of(cls, config: DreamerConfig | SACRunConfig) -> ReplayRatio:
+        """Read it off a configuration."""
+        if isinstance(config, SACRunConfig):
+            return cls(config.sac.replay_ratio, config.sac.batch_size, config.prefill, "sac.replay_ratio")
+        model = config.model
+        return cls(model.replay_ratio, model.batch_size * model.batch_length, config.prefill, "model.replay_ratio")
+
+    def updates(self, env_steps: int) -> int:
+        """Updates in a run of so many env_steps."""
+        return max(0, int((env_steps - self.prefill) * self.ratio / self.records))
+
+
+def check(config: RunConfig) -> None:
+    """Refuse settings that no recipe could run with.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    values = OmegaConf.structured(config)
+    for name, allowed in RANGES.items():
+        value = OmegaConf.select(values, name)
+        if value is not None and value not in allowed:
+            raise ValueError(f"{name}={value}: must be {allowed}.")
+    on_cuda = config.env.device.partition(":")[0] == "cuda"
+    if not on_cuda and config.env.device != "cpu":
+        raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
+    if on_cuda and not is_race(config):
+        raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
+    if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
+        raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
+    if is_race(config):
+        check_race(config)
+        return
+    for name, default in RACE_ONLY.items():
+        if (value := OmegaConf.select(values, name)) != default:
+            raise ValueError(f"{name}={value} is for races, and env.suite={config.env.suite}: leave it at {default}.")
+
+
+def check_race(config: RunConfig) -> None:
+    """Refuse a control rate that the physics cannot step, and starts and misses that cannot be.
+
+    Raises:
+        ValueError: the message names the setting.
+    """
+    for group, check_it in (
+        ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
+        ("env", lambda: GateSweeper(load_track(config.track), miss_radius=config.env.miss_radius)),
+        ("evaluation", lambda: StartSampler(load_track(config.track), start_noise=config.evaluation.start_noise)),
+    ):
+        try:
+            check_it()
+        except TrackError:
+            raise
+        except ValueError as error:
+            raise ValueError(f"{group}.{error}") from error
+
+
+def check_replay(config: DreamerConfig | SACRunConfig) -> None:
+    """Refuse settings with which there would be no update.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    if config.total_env_steps <= config.prefill:
+        raise ValueError(
+            f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
+            "first update: raise the one, or lower the other."
+        )
+    replay = ReplayRatio.of(config)
+    if not replay.updates(config.total_env_steps):
+        raise ValueError(
+            f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
+            f"prefill={config.prefill:,} asks for no whole update of {replay.records} records. "
+            "Raise total_env_steps or the ratio, or lower the prefill."
+        )
+
+
+def check_dreamer(config: DreamerConfig) -> None:
+    """Refuse settings with which a world model could not learn.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    check(config)
+    check_replay(config)
+    check_schedule(config)
+    check_imagination(config)
+    check_image_size(config.env.image_size, config.model.size)
+    model = config.model
+    prefilled = config.prefill // config.env.num_envs
+    if prefilled < model.batch_length:
+        raise ValueError(
+            f"prefill={config.prefill} gives each of env.num_envs={config.env.num_envs} worlds {prefilled} records, "
+            f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
+            f"{config.env.num_envs * model.batch_length}."
+        )
+    if config.collection is Collection.overlapped and not is_race(config):
+        raise ValueError(
+            f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
+            "thread that made them. Use collection=sync."
+        )
+    if config.collection is Collection.overlapped and config.env.device != "cpu":
+        raise ValueError(
+            "collection=overlapped steps worlds in a thread, and evaluation steps others on cpu meanwhile, which warp "
+            "cannot do on two devices: use env.device=cpu, or collection=sync."
+        )
+    if config.collection is Collection.overlapped and model.cuda_graph:
+        raise ValueError(
+            "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
+            "refuses: choose one of them."
+        )
+
+
+def check_imagination(config: DreamerConfig) -> None:
+    """Refuse to imagine from the newest windows where there are none, or from all records anyway.
+
+    Raises:
+        ValueError: the message names the settings.
+    """
+    model, share = config.model, config.replay.recent_share
+    if not model.imagine_recent:
+        return
+    if not round(share * model.batch_size):
+        raise ValueError(
+            f"model.imagine_recent=true, and replay.recent_share={share:g} draws none of model.batch_size="
+            f"{model.batch_size} windows from the newest records: raise the share, or set model.imagine_recent=false."
+        )
+    if model.imagination_starts is None:
+        raise ValueError(
+            "model.imagine_recent=true, and model.imagination_starts=null begins from all records of a batch: give a "
+            "number of them, or set model.imagine_recent=false."
+        )
+
+
+def check_schedule(config: DreamerConfig) -> None:
+    """Refuse ramps that end before they begin, or lead where the setting itself could not be.
+
+    Raises:
+        ValueError: the message names the ramp.
+    """
+    targets = {
+        "learning_rates": POSITIVE,
+        "discount": RANGES["loss.discount"],
+        "entropy_scale": RANGES["loss.entropy_scale"],
+        "min_std": RANGES["loss.min_std"],
+        "start_on_line": RANGES["env.start_on_line"],
+    }
+    for name, allowed in targets.items():
+        ramp = getattr(config.schedule, name)
+        ramp.check(f"schedule.{name}")
+        if ramp.to is not None and ramp.to not in allowed:
+            raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
+    if config.schedule.wait_for_model is not None:
+        check_wait(config)
+    check_kl(config.loss.ppo)
+    to = config.schedule.start_on_line.to
+    if to is not None and not is_race(config):
+        raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
+    if to is not None and not config.env.start_on_line:
+        raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
+
+
+def check_kl(ppo: ImaginedPPOConfig) -> None:
+    """Refuse a target for the divergence that a stop below it would keep from ever being reached.
+
+    Raises:
+        ValueError: the message names both settings.
+    """
+    if ppo.kl_target is not None and ppo.kl_stop < KL_TOLERANCE * ppo.kl_target:
+        raise ValueError(
+            f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before loss.ppo.kl_target={ppo.kl_target} is seen to be "
+            f"exceeded: the stop must be at least {KL_TOLERANCE} times the target."
+        )
+
+
+def check_wait(config: DreamerConfig) -> None:
+    """Refuse a limit that cannot be kept, and one for an actor that cannot wait.
+
+    Raises:
+        ValueError: the message names the setting to change.
+    """
+    limit = config.schedule.wait_for_model
+    if limit is not None and limit <= 1:
+        raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
+    if config.loss.actor != "ppo":
+        raise ValueError(
+            f"schedule.wait_for_model={limit} is for loss.actor=ppo, whose actor has an optimiser of its own; with "
+            f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
+        )
+    if not config.replay.held_out:
+        raise ValueError(f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0.")
+
+
+def check_image_size(image_size: int, size: str) -> None:
+    """Refuse images that networks of that size cannot halve.
+
+    Raises:
+        ValueError: the message says which they can.
+    """
+    shape = get_size(size)
+    try:
+        smallest_map(image_size, shape.cnn_patch, len(shape.cnn_multipliers))
+    except ValueError as error:
+        raise ValueError(f"env.{error}") from error
+
+
+def check_variant(config: ExperimentConfig) -> None:
+    """Refuse a run of an experiment that names nothing.
+
+    Raises:
+        ValueError: the message lists what there is.
+    """
+    for name, value, allowed in (
+        ("algorithm", config.algorithm, tuple(RECIPES)),
+        ("variant", config.variant, tuple(config.variants)),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")

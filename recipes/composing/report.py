@@ -1,0 +1,33 @@
+"""What is made of an experiment at its end: hydra calls this after a multirun."""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+FAILURES = "failures"  # folder of an experiment: a file for every run that failed
+QUANTITIES = ("return", "success_rate", "gates", "lap_time")
+
+
+class DrawFigures(Callback):
+    """Draws what `recipes/plot.py` draws, into `figures/` of the experiment, also when a run of it has failed."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Draw everything for which there is something to draw; end with status 1 if a run has failed."""
+        # Here, because hydra makes this object at the start of every job, and drawing is for the end.
+        from plot import draw
+
+        from composing.schema import PlotConfig
+
+        place = Path(config.hydra.sweep.dir)
+        print(f"figures: {place}/figures")
+        try:
+            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(QUANTITIES)))
+        except ValueError as error:
+            print(f"figures: none, {error}")
+        notes = sorted((place / FAILURES).glob("*.txt"))
+        for note in notes:
+            print(f"failed: {note.stem}: {note.read_text(encoding='utf-8').strip()}")
+        if notes:
+            raise SystemExit(1)

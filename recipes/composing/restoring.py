@@ -1,0 +1,159 @@
+"""What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from composing.arena import is_race, restore_learner, restore_shipped, trained_config
+from composing.command_line import choose_device
+from composing.schema import EvaluateConfig, PerceptionConfig, RunConfig
+from dreamer_racing.export.actor_step import ActorStep
+from dreamer_racing.export.contract import hash_weights
+from dreamer_racing.export.shipped_agent import AVERAGED, TRAINED, ShippedAgent, agents_in, choose_weights, is_agent
+from dreamer_racing.learners.dreamer import DreamerLearner, Flyer
+from dreamer_racing.provenance import command_line, provenance
+from dreamer_racing.training.checkpoint import ensure_writable, latest_checkpoint
+
+AGENTS = Path(__file__).parents[2] / "agents"
+"""Where the agents that ship lie, each in a folder of its name."""
+
+
+@dataclass
+class Restored:
+    """A trained agent, and the race that it is to fly."""
+
+    checkpoint: Path  # or the folder of an agent
+    trained: RunConfig  # configuration of its run, with the race asked for in place of the one trained on
+    trained_on: str  # track
+    flyer: Flyer
+    weights: str  # which of them fly: averaged | trained
+    env_steps: int
+    machine: dict[str, Any]  # versions and commit too, as they were at the start
+
+    @property
+    def run_dir(self) -> Path:
+        """Where to write beside the run that left the checkpoint; agents that ship are left as they are."""
+        return results_of(self.checkpoint)
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Of all that flies, as in an export's contract; None of the baselines."""
+        if isinstance(self.flyer, DreamerLearner):
+            return hash_weights(ActorStep(self.flyer.flying_agent))
+        return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
+
+    def provenance(self, config: EvaluateConfig | PerceptionConfig, seconds: float) -> dict[str, Any]:
+        """Say how the numbers of an evaluation of so many seconds came about."""
+        return {
+            "command": command_line(),
+            "checkpoint": config.checkpoint,
+            "algorithm": self.trained.algorithm,
+            "weights": self.weights,
+            "weights_sha256": self.weights_sha256,
+            "env_steps": self.env_steps,
+            "trained_on": self.trained_on,
+            "track": self.trained.track,
+            "decoys": self.trained.decoys,
+            "preset": self.trained.env.preset,
+            "control_rate": self.trained.env.control_rate,
+            "episodes": config.episodes,
+            "seed": config.seed,
+            "wall_clock_seconds": round(seconds, 1),
+            "date": f"{datetime.now(UTC):%Y-%m-%d}",
+            **self.machine,
+        }
+
+
+def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
+    """Bring back the policy of a checkpoint, for the race that the configuration names.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint or agent; the message names the agents that ship.
+        ValueError: it was not trained to race, lacks the weights asked for, or the device is not there.
+        TrackError: there is no such track, or no such decoys on it.
+    """
+    machine = provenance()
+    device = choose_device(config.device)
+    checkpoint = find_trained(config.checkpoint)
+    trained = trained_config(config_folder(checkpoint))
+    torch.manual_seed(config.seed)
+    if not is_race(trained):
+        raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
+    trained_on = trained.track
+    if config.track:
+        trained.track, trained.decoys = config.track, None
+    trained.decoys = config.decoys or trained.decoys
+    trained.env.preset = config.preset or trained.env.preset
+    trained.env.renderer = config.renderer
+    flyer: Flyer
+    if is_agent(checkpoint):
+        flyer = shipped = restore_shipped(trained, checkpoint, device)
+        weights = choose_weights(config.weights, shipped.about["weights"], checkpoint)
+        env_steps = shipped.about["env_steps"]
+    else:
+        flyer, counters = restore_learner(trained, checkpoint, device, config.weights)
+        weights = TRAINED if getattr(flyer, "averaged", None) is None else AVERAGED
+        env_steps = counters["env_steps"]
+    print(f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {env_steps:,} env_steps)")
+    print(f"weights: {weights}{' (weights=auto)' if config.weights == 'auto' else ''}")
+    return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine)
+
+
+def find_trained(name: str) -> Path:
+    """Find what `checkpoint=` and `agent=` name: an agent that ships, by its name, or a path.
+
+    Args:
+        name: of an agent in `AGENTS`; or path of an agent's folder, a run directory, or a checkpoint.
+
+    Returns:
+        The folder of the agent, or the newest checkpoint there.
+
+    Raises:
+        FileNotFoundError: there is neither; the message names the agents that ship.
+    """
+    named = AGENTS / name
+    if Path(name).name == name and is_agent(named):
+        return named
+    if is_agent(name):
+        return Path(name).absolute()
+    try:
+        return latest_checkpoint(name)
+    except FileNotFoundError as error:
+        there = ", ".join(agents_in(AGENTS)) or "none"
+        raise FileNotFoundError(f"{error} Agents that ship, to be given by name: {there}.") from error
+
+
+def config_folder(checkpoint: Path) -> Path:
+    """Where the configuration of a checkpoint or an agent lies."""
+    return checkpoint if is_agent(checkpoint) else checkpoint.parent.parent
+
+
+def results_of(checkpoint: Path) -> Path:
+    """Where results of a checkpoint or an agent go."""
+    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else checkpoint.parent.parent
+
+
+def fresh_directory(path: str | Path, result: str) -> Path:
+    """Return a folder to write to: the one asked for, or if it holds a result already, the first free `<name>_2`, ...
+
+    Args:
+        path: the folder asked for.
+        result: name of the file that is written last.
+    """
+    directory, number = Path(path), 1
+    while (directory / result).exists():
+        number += 1
+        directory = Path(f"{path}_{number}")
+    if number > 1:
+        print(f"{path} holds an earlier {result}, which is kept: writing to {directory}")
+    return ensure_writable(directory)
+
+
+def heading(title: str, provenance: dict[str, Any]) -> str:
+    """Return the head of a Markdown report: the title, the command, and where the numbers come from."""
+    facts = {name: value for name, value in provenance.items() if name != "command" and value is not None}
+    text = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
+    return f"# {title}\n\n```bash\n{provenance['command']}\n```\n\n{text}.\n"

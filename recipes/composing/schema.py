@@ -1,0 +1,349 @@
+"""Typed configuration of the recipes: hydra refuses a value of the wrong type, naming the field."""
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from dreamer_racing.learners import PPOConfig, SACConfig
+from dreamer_racing.losses import ImaginedPPOConfig
+from dreamer_racing.training.schedule import Ramp
+
+
+@dataclass
+class EnvConfig:
+    """Where the agent acts: the race, or a task of the DeepMind Control Suite to compare with published curves."""
+
+    suite: str = "race"  # race | dmc
+    preset: str = "easy"  # physics: easy | faithful
+    num_envs: int = MISSING  # worlds flown side by side; missing: the recipe's own number
+    control_rate: float = 50.0  # actions a second, Hz
+    episode_steps: int | None = None  # control steps of a training episode; null: those of 20 s
+    start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
+    start_on_line: float = 0.0  # share of training episodes that begin in flight on a planned racing line
+    miss_radius: float = 0.0  # m; training episodes end where a gate is missed by less than this; 0: they go on
+    device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
+    renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
+    looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
+    from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
+    image_size: int = 64  # pixels, side of the images: a multiple of 16, by which the networks divide it
+    camera_tilt: float = 25.0  # degrees upwards
+
+
+@dataclass
+class ModelConfig:
+    """Size of the networks and the numbers that go with it: `auto` chooses by device, what is missing by size."""
+
+    size: str = MISSING
+    sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
+    batch_size: int = MISSING  # windows in a batch
+    batch_length: int = MISSING  # records in a window
+    replay_ratio: float = MISSING  # records trained on per environment step
+    learning_rate: float = MISSING
+    behavior_learning_rate: float | None = None  # of actor and critic; null: the same
+    mixed_precision: bool | None = None  # bfloat16 where it does not matter; null: if the device computes in it
+    compile: bool = False  # torch.compile of the losses
+    cuda_graph: bool = False  # forward and backward as one CUDA graph
+    warmup_updates: int = MISSING  # over which the learning rate rises from zero
+    average_rate: float | None = None  # of the averaged weights, which fly evaluations and exports; null: none
+    imagination_horizon: int = MISSING
+    imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
+    imagine_recent: bool = False  # from those of its newest windows only (replay.recent_share)
+
+
+@dataclass
+class LossConfig:
+    """Losses by the names of their registries in `dreamer_racing.losses`, and their weights."""
+
+    world_model: str = "reconstruction"
+    actor: str = "reinforce"  # reinforce | dynamics | ppo
+    critic: str = "two_hot"
+    discount: float = 0.997
+    lambda_: float = 0.95
+    entropy_scale: float = 3e-4
+    min_std: float = 0.1  # smallest standard deviation of actions
+    dynamics_scale: float = 1.0
+    representation_scale: float = 0.1
+    free_nats: float = 1.0
+    kl_mode: str = "separate"  # separate | per_latent
+    privileged_scale: float = 1.0  # of decoding the privileged state: losses informed and privileged
+    barlow_scale: float = 0.05  # of the redundancy reduction: loss decoder_free
+    continuation: bool = True  # predicted ends of episodes cut imagined returns
+    replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off
+    replay_value_gradient: bool = True  # whether that loss also trains the world model
+    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)  # numbers of actor=ppo
+
+
+@dataclass
+class CurriculumConfig:
+    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1."""
+
+    threshold: float = 50.0  # mean return above which b₂ grows
+    increment: float = 0.001
+    maximum: float = 0.01
+    window: int = 100  # episodes
+    cooldown: int = 100  # episodes
+    relabel: bool = True  # recompute rewards of replayed steps with today's b₂
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides metrics.csv."""
+
+    tensorboard: bool = True
+    every: int = 2_000  # env_steps between rows
+
+
+class Storage(Enum):
+    """Where replay records live."""
+
+    tensor = "tensor"
+    memmap = "memmap"
+
+
+@dataclass
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = 250_000  # records, 12.3 KB each at image_size 64
+    storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
+    device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
+
+
+@dataclass
+class SequenceReplayConfig(ReplayConfig):
+    """The replay buffer of a world model."""
+
+    held_out: int = 1  # worlds whose records are never trained on, to measure the model; 0 of a single world
+    recent_share: float = 0.0  # of a batch's windows, drawn from the newest records
+    recent_records: int = 20_000  # how many those are
+    context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
+
+
+@dataclass
+class EvaluationConfig:
+    """Evaluation during training."""
+
+    every: int = 25_000  # env_steps; 0 never
+    episodes: int = 8
+    stochastic: bool = False  # also fly the sampling policy
+    start_noise: float = 0.0  # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    video_steps: int = 500  # control steps in the video
+
+
+@dataclass
+class CheckpointConfig:
+    """Checkpoints during training."""
+
+    every: int = 50_000  # env_steps
+    keep: int = 2
+
+
+@dataclass
+class ScheduleConfig:
+    """Settings that move over a run, each from its own value `to` another between two shares of total_env_steps."""
+
+    learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
+    discount: Ramp = field(default_factory=Ramp)  # loss.discount
+    entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
+    min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
+    start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
+    # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
+    wait_for_model: float | None = None
+    wait_every: int = 5_000  # env_steps between two looks at those errors
+
+
+class Collection(Enum):
+    """How acting and learning share time."""
+
+    sync = "sync"
+    overlapped = "overlapped"
+
+
+@dataclass
+class RunConfig:
+    """What all training recipes have in common."""
+
+    algorithm: str = MISSING  # the recipe
+    track: str = "kidney"  # name of a built-in track, or path to a YAML file
+    decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
+    task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
+    budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
+    total_env_steps: int = 1_000_000  # control steps summed over environments
+    rollout_steps: int = MISSING  # control steps of every environment between updates
+    seed: int = 0
+    device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
+    run_dir: str | None = None  # null: runs/<algorithm>_<track>_<time>
+    resume: str | None = None  # run directory or checkpoint to continue
+    env: EnvConfig = field(default_factory=EnvConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+
+@dataclass
+class DreamerConfig(RunConfig):
+    """`recipes/dreamer_v3.py`."""
+
+    algorithm: str = "dreamer_v3"
+    tuned: str = "auto"  # none: DreamerV3 as published | race: what races on a CPU | auto chooses, and says so
+    prefill: int = 4_000  # env_steps collected before the first update
+    rollout_steps: int = 8
+    collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+
+@dataclass
+class NetworkConfig:
+    """Hidden layers of the baselines' actor and critic: `auto` chooses by what they see."""
+
+    size: str = MISSING  # auto | paper | small
+    layers: int = MISSING
+    units: int = MISSING
+
+
+@dataclass
+class PPORunConfig(RunConfig):
+    """`recipes/ppo.py`."""
+
+    algorithm: str = "ppo"
+    rollout_steps: int = 32
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+
+
+@dataclass
+class SACRunConfig(RunConfig):
+    """`recipes/sac.py`."""
+
+    algorithm: str = "sac"
+    prefill: int = 10_000  # env_steps collected before the first update
+    rollout_steps: int = 1
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+RECIPES: dict[str, type[RunConfig]] = {
+    schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)
+}
+"""The training recipes by algorithm."""
+
+
+@dataclass
+class ExperimentConfig(RunConfig):
+    """`recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.
+
+    What all recipes have in common is set as with them: `track=`, `seed=`, `budget=`, `env.from_pixels=` ...
+    """
+
+    name: str = MISSING  # of the experiment
+    algorithm: str = "dreamer_v3"  # dreamer_v3 | ppo | sac
+    variant: str = "default"  # one of the following
+    variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the algorithm's recipe by name
+    overrides: list[str] = field(default_factory=list)  # of every run, e.g. "overrides=['loss.entropy_scale=1e-4']"
+    directory: str = "runs"
+
+
+@dataclass
+class EvaluateConfig:
+    """`recipes/evaluate.py`."""
+
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
+    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    start_noise: float = 0.0  # with protocol=nominal: of starts, as a multiple of the noise of training
+    episodes: int = 100  # of each condition
+    num_envs: int = 20
+    track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper | none; null: as it was trained
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
+    video_steps: int = 500
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = 0
+
+
+@dataclass
+class PerceptionConfig:
+    """`recipes/perception.py`."""
+
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
+    episodes: int = 100  # of each kind of flight
+    num_envs: int = 100  # the first flight in each is looked at
+    track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: <run of the checkpoint>/perception
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = 0
+
+
+@dataclass
+class ExportConfig:
+    """`recipes/export.py`."""
+
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged where they are kept
+    output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
+    agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
+    evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
+    commit: str | None = None  # with agent=: that it was trained at, to be noted
+    latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
+    steps: int = 200  # of a recorded flight, over which the export must fly as the original does
+    renderer: str = "auto"
+    seed: int = 0
+
+
+class Aggregate(Enum):
+    """What stands for the seeds of a learning curve."""
+
+    mean = "mean"
+    iqm = "iqm"
+
+
+@dataclass
+class PlotConfig:
+    """`recipes/plot.py`."""
+
+    runs: Any = "runs"  # run directory, folder of some, pattern, or a list [a,b]; or a learning_curves.csv
+    figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
+    output: str = "figures"  # folder
+    quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
+    aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
+    window: float | None = None  # of the curves' running mean, env_steps; null: 2 % of the longest run
+    flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
+    flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
+    over: str = "distance"  # axis of the speed profile: distance | time
+    dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
+
+
+def register() -> None:
+    """Make the schemas known to hydra."""
+    store = ConfigStore.instance()
+    store.store(name="dreamer_v3_schema", node=DreamerConfig)
+    store.store(name="ppo_schema", node=PPORunConfig)
+    store.store(name="sac_schema", node=SACRunConfig)
+    store.store(name="experiment_schema", node=ExperimentConfig)
+    store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="perception_schema", node=PerceptionConfig)
+    store.store(name="export_schema", node=ExportConfig)
+    store.store(name="plot_schema", node=PlotConfig)
+    for group, node in (
+        ("env", EnvConfig),
+        ("model", ModelConfig),
+        ("loss", LossConfig),
+        ("network", NetworkConfig),
+        ("curriculum", CurriculumConfig),
+        ("logger", LoggerConfig),
+    ):
+        store.store(group=group, name="schema", node=node)

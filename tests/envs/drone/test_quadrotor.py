@@ -1,0 +1,231 @@
+"""The checks an expert makes of the drone's physics, through the simulator that flies it."""
+
+from dataclasses import replace
+
+import mujoco
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dreamer_racing.envs.drone.quadrotor import GRAVITY, PRESETS, Quadrotor, QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.simulator import MujocoSimulator
+from dreamer_racing.envs.simulator.scene import build_drone
+from dreamer_racing.envs.tracks import load_track
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+EASY = PRESETS["easy"]
+
+
+def simulate(
+    actions: torch.Tensor, parameters: QuadrotorParameters = EASY, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> tuple[MujocoSimulator, torch.Tensor]:
+    """Fly actions (T, N, 4) from (0, 0, 3); return the simulator and the positions (T·P + 1, N, 3)."""
+    num_envs = actions.shape[1]
+    simulator = MujocoSimulator(
+        load_track("circle"), parameters, num_envs, renderer=None, generator=torch.Generator().manual_seed(0)
+    )
+    everyone = torch.ones(num_envs, dtype=torch.bool)
+    rows = [torch.tensor(values, dtype=torch.float64).repeat(num_envs, 1) for values in ((0, 0, 3), LEVEL, velocity)]
+    simulator.reset(everyone, *rows)
+    paths = [simulator.step(action) for action in actions]
+    return simulator, torch.cat([paths[0][:1]] + [path[1:] for path in paths])
+
+
+def repeat(action: tuple[float, ...], seconds: float) -> torch.Tensor:
+    """One drone's constant action over a time (T, 1, 4)."""
+    return torch.tensor(action, dtype=torch.float64).repeat(round(seconds / EASY.control_dt), 1, 1)
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_hover_thrust_holds_altitude_for_ten_seconds_within_a_centimetre(preset: str) -> None:
+    parameters = replace(PRESETS[preset], randomisation=None)
+    _, path = simulate(repeat((GRAVITY / 13.33 - 1.0, 0.0, 0.0, 0.0), 10.0), parameters)
+    assert (path[:, 0] - path[0, 0]).abs().max() < 0.01
+
+
+def test_hover_action_is_the_documented_number() -> None:
+    assert QuadrotorParameters().hover_action == pytest.approx(-0.264, abs=1e-3)
+
+
+def test_free_fall_accelerates_with_gravity_once_the_rotors_have_stopped() -> None:
+    simulator, _ = simulate(repeat((-1.0, 0.0, 0.0, 0.0), 0.4))
+    before = simulator.state.linear_velocity[0, 2].item()
+    simulator.step(torch.tensor([[-1.0, 0.0, 0.0, 0.0]]))
+    acceleration = (simulator.state.linear_velocity[0, 2].item() - before) / 0.02
+    assert acceleration == pytest.approx(-9.81, abs=1e-3)
+
+
+def test_full_thrust_gives_the_papers_thrust_to_weight_ratio() -> None:
+    simulator, _ = simulate(repeat((1.0, 0.0, 0.0, 0.0), 0.4))
+    before = simulator.state.linear_velocity[0, 2].item()
+    simulator.step(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+    acceleration = (simulator.state.linear_velocity[0, 2].item() - before) / 0.02
+    assert (acceleration + GRAVITY) / GRAVITY == pytest.approx(16.0 / 0.6 / 9.81, rel=2e-3)
+
+
+@pytest.mark.parametrize(("axis", "authority"), [(0, 242.0), (1, 324.0), (2, 34.0)])
+def test_angular_authority_at_hover(axis: int, authority: float) -> None:
+    drone = Quadrotor(EASY, 1)
+    torque = torch.zeros(1, 3, dtype=torch.float64)
+    torque[0, axis] = 100.0
+    thrusts = drone.mix(torch.tensor([[0.6 * GRAVITY]], dtype=torch.float64), torque)
+    given_torque = (thrusts @ drone._effectiveness)[0, 3 + axis] / EASY.inertia[axis]
+    if axis < 2:  # roll and pitch may take thrust: the hover figure is what is left without adding any
+        assert given_torque >= authority - 1.0
+    else:
+        assert given_torque == pytest.approx(authority, rel=0.02)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rate_step_settles_without_steady_error(axis: int) -> None:
+    action = [GRAVITY / 13.33 - 1.0, 0.0, 0.0, 0.0]
+    action[1 + axis] = 0.2
+    target = 0.2 * EASY.body_rate_max[axis]
+    simulator, _ = simulate(repeat(tuple(action), 0.12))
+    early = simulator.state.body_rates[0, axis].item()
+    for _ in range(20):
+        simulator.step(torch.tensor([action]))
+    assert early > 0.63 * target  # ≈ 3 motor lags
+    assert simulator.state.body_rates[0, axis].item() == pytest.approx(target, rel=0.01)
+
+
+def test_energy_does_not_grow_with_rotors_off() -> None:
+    simulator, _ = simulate(repeat((-1.0, 0.0, 0.0, 0.0), 0.4), replace(PRESETS["faithful"], randomisation=None),
+                            velocity=(5.0, 0.0, 3.0))  # fmt: skip
+
+    def energy() -> float:
+        state = simulator.state
+        kinetic = 0.5 * 0.6 * state.linear_velocity.square().sum()
+        spin = 0.5 * (torch.tensor(EASY.inertia) * state.body_rates.square()).sum()
+        return (kinetic + spin + 0.6 * GRAVITY * state.position[0, 2]).item()
+
+    last = energy()
+    for _ in range(10):
+        simulator.step(torch.tensor([[-1.0, 0.0, 0.0, 0.0]]))
+        assert energy() < last
+        last = energy()
+
+
+def test_nine_metres_per_second_level_turn_has_the_expected_radius() -> None:
+    thrust = 26.66
+    lateral = (thrust**2 - GRAVITY**2) ** 0.5
+    assert 9.0**2 / lateral == pytest.approx(3.3, abs=0.05)
+
+
+finite = st.floats(-5.0, 5.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0.0, 20.0), finite, finite, finite)
+def test_mixer_respects_limits_and_priorities(thrust: float, roll: float, pitch: float, yaw: float) -> None:
+    drone = Quadrotor(EASY, 1)
+    wanted = torch.tensor([[roll, pitch, yaw]], dtype=torch.float64)
+    rotors = drone.mix(torch.tensor([[thrust]], dtype=torch.float64), wanted)
+    given_wrench = (rotors @ drone._effectiveness)[0]
+    assert rotors.min() >= 0.0 and rotors.max() <= 4.0
+    largest = 4.0 * 4.0 / 2 * EASY.arm_length / 2**0.5  # N m: two rotors full, two off, about one axis
+    if abs(roll) + abs(pitch) < largest:  # roll and pitch are given up last: always exact while they can be
+        assert given_wrench[3:5].tolist() == pytest.approx([roll, pitch], abs=1e-9)
+    assert abs(given_wrench[5]) <= abs(yaw) + 1e-9
+    assert given_wrench[5] * yaw >= -1e-12
+
+
+def test_mixer_without_saturation_is_exact() -> None:
+    drone = Quadrotor(EASY, 1)
+    wanted = torch.tensor([[0.05, -0.04, 0.01]], dtype=torch.float64)
+    rotors = drone.mix(torch.tensor([[6.0]], dtype=torch.float64), wanted)
+    assert (rotors @ drone._effectiveness)[0, 2:].tolist() == pytest.approx([6.0, 0.05, -0.04, 0.01])
+
+
+def test_command_delay_holds_a_command_back_by_its_time() -> None:
+    parameters = replace(EASY, command_delay=0.014)  # 7 physics steps of 2 ms
+    still, level = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([LEVEL], dtype=torch.float64)
+    delayed = Quadrotor(parameters, 1)
+    delayed.command(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+    thrusts = [delayed.wrench(step, level, still, still)[0, 2].item() for step in range(10)]
+    hover = 0.6 * GRAVITY
+    assert thrusts[:7] == pytest.approx([hover] * 7)
+    assert thrusts[7] > hover + 0.1
+
+
+def test_randomised_drones_obey_their_own_newton_and_euler_equations() -> None:
+    parameters = replace(PRESETS["faithful"], drag=(0.0, 0.0, 0.0))
+    drone = Quadrotor(parameters, 64, generator=torch.Generator().manual_seed(1))
+    drone.reset(torch.ones(64, dtype=torch.bool))
+    own = drone._drones
+    assert own is not None and own.mass.min() > 0.94 and own.mass.max() < 1.06 and own.mass.std() > 0.01
+    assert own.delay_steps.min() >= 0 and own.delay_steps.max() <= 40
+    rates = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 5
+    level = torch.tensor([LEVEL], dtype=torch.float64).repeat(64, 1)
+    before, decay = drone.rotor_speed.clone(), drone.motor_decay
+    wrench = drone.wrench(0, level, torch.zeros_like(rates), rates)
+    target = (drone.rotor_speed - decay * before) / (1 - decay)
+    rotors = (target + decay**0.5 * (before - target)).square() @ drone._effectiveness  # of the middle of the step
+    nominal = torch.tensor(parameters.inertia, dtype=torch.float64)
+    inertia = own.inertia * nominal
+    torque = own.thrust * rotors[:, 3:]
+    torque[:, 2:] *= own.torque
+    expected = (torque - torch.linalg.cross(rates, inertia * rates)) / inertia
+    simulated = (wrench[:, 3:] - torch.linalg.cross(rates, nominal * rates)) / nominal
+    torch.testing.assert_close(simulated, expected)
+    torch.testing.assert_close(wrench[:, 2] / 0.6, (own.thrust * rotors[:, 2:3] / (0.6 * own.mass))[:, 0])
+
+
+def test_reset_touches_only_masked_drones() -> None:
+    drone = Quadrotor(PRESETS["faithful"], 2, generator=torch.Generator().manual_seed(0))
+    drone.reset(torch.tensor([True, True]))
+    mass = drone._drones.mass.clone()
+    drone.reset(torch.tensor([False, True]))
+    assert drone._drones.mass[0] == mass[0] and drone._drones.mass[1] != mass[1]
+
+
+class Body:
+    """One drone of a preset, thrown with a spin, under given wrenches."""
+
+    def __init__(self, parameters: QuadrotorParameters) -> None:
+        self.model = build_drone(parameters).compile()
+        self.data = mujoco.MjData(self.model)
+        self.data.qvel[:] = (5.0, 0.0, 2.0, 3.0, -2.0, 1.0)
+        arrays = (self.data.qpos, self.data.qvel, self.data.qfrc_applied)
+        views = [torch.from_numpy(array).unsqueeze(0) for array in arrays]
+        self.flight = Flight(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(self.model, self.data))
+
+    def fly(self, wrenches: torch.Tensor, substeps: int) -> torch.Tensor:
+        """Hold each wrench (6,) for so many steps; return the positions (T, 3)."""
+        path = []
+        for wrench in wrenches:
+            for _ in range(substeps):
+                self.flight.apply(wrench.unsqueeze(0))
+            path.append(self.flight.position[0].clone())
+        return torch.stack(path)
+
+
+def test_easy_integrator_stays_within_a_millimetre_of_rk4_over_two_seconds() -> None:
+    time = torch.arange(1000, dtype=torch.float64) * 0.002
+    wrenches = torch.zeros(1000, 6, dtype=torch.float64)
+    wrenches[:, 2] = 8.0 + 5.0 * torch.sin(5.0 * time)  # N
+    wrenches[:, 3:] = 0.02 * torch.stack([torch.cos(rate * time) for rate in (20.0, 23.0, 7.0)], dim=1)  # N m
+    path = Body(EASY).fly(wrenches, substeps=1)
+    reference = Body(replace(EASY, physics_dt=0.001, integrator="RK4")).fly(wrenches, substeps=2)
+    assert (path - reference).norm(dim=-1).max() < 1e-3
+
+
+def test_length_of_the_physics_step_hardly_matters_under_hard_commands() -> None:
+    generator = torch.Generator().manual_seed(3)
+    targets = torch.rand(11, 16, 4, generator=generator, dtype=torch.float64) * 2 - 1
+    actions = targets.repeat_interleave(10, dim=0)[:100] * torch.tensor([0.5, 0.3, 0.3, 1.0])
+    _, path = simulate(actions)
+    _, fine = simulate(actions, replace(EASY, physics_dt=0.001, integrator="RK4"))
+    assert (path - fine[::2]).norm(dim=-1).max() < 0.01
+
+
+def test_unknown_preset_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"'hard'.*easy, faithful"):
+        load_preset("hard")
+
+
+def test_control_step_must_be_a_multiple_of_the_physics_step() -> None:
+    with pytest.raises(ValueError, match="physics_dt=0.003"):
+        QuadrotorParameters(physics_dt=0.003)

@@ -1,0 +1,102 @@
+"""The scripted pilot flies every track, which also shows that every track can be flown."""
+
+import pytest
+import torch
+
+from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot, fly_laps
+from dreamer_racing.envs.race.racing_line import LineLimits, RacingLine, plan_racing_line
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import load_track
+
+ESTIMATED_LAPS = {"circle": 2.7, "kidney": 3.6, "figure8": 4.3, "split_s": 5.8}  # s, at thrust-to-weight ratio 2.7
+
+
+@pytest.fixture(scope="module")
+def circle_line() -> RacingLine:
+    return plan_racing_line(load_track("circle"), PRESETS["easy"], LineLimits())
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+@pytest.mark.parametrize("track", ESTIMATED_LAPS)
+def test_pilot_flies_three_clean_and_fast_laps(track: str, preset: str) -> None:
+    flight = fly_laps(track, preset, num_envs=1 if preset == "easy" else 4)
+    assert flight.crash.tolist() == [CrashCause.NONE] * len(flight.crash)
+    assert flight.finished.all()
+    assert (flight.gates == 3 * load_track(track).num_gates).all()
+    assert flight.lap_times[:, 1:].mean() < 1.3 * ESTIMATED_LAPS[track]
+
+
+def test_pilot_flies_from_the_poses_in_which_training_starts() -> None:
+    flight = fly_laps("circle", "easy", num_envs=16, laps=1, random_starts=True, seed=3)
+    assert flight.finished.all()
+
+
+def test_batched_equals_single() -> None:
+    pilot = ScriptedPilot("circle", dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    count = 5
+    position = torch.randn(count, 3, generator=generator, dtype=torch.float64) + torch.tensor([4.0, -2.0, 1.5])
+    attitude = torch.nn.functional.normalize(
+        torch.randn(count, 4, generator=generator, dtype=torch.float64) * 0.2 + torch.tensor([1.0, 0.0, 0.0, 0.0]),
+        dim=1,
+    )
+    velocity = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    rates = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    gate = torch.tensor([0, 0, 1, 2, 3])
+
+    def two_steps(rows: slice) -> torch.Tensor:
+        pilot.reset()
+        moves = (position, position + 0.02 * velocity)
+        return torch.stack([pilot.act(x[rows], attitude[rows], velocity[rows], rates[rows], gate[rows]) for x in moves])
+
+    together = two_steps(slice(None))
+    alone = torch.cat([two_steps(slice(i, i + 1)) for i in range(count)], dim=1)
+    torch.testing.assert_close(together, alone)
+
+
+def test_a_drone_put_elsewhere_is_flown_as_a_new_one() -> None:
+    pilot = ScriptedPilot("circle", dtype=torch.float64)
+    level, still = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.zeros(1, 3)
+    start, gate = torch.tensor([[4.0, -2.5, 1.35]]), torch.tensor([0])
+    fresh = pilot.act(start, level, still, still, gate)
+    away = torch.tensor([[0.0, 3.0, 2.0]])
+    for _ in range(5):
+        pilot.act(away, level, torch.tensor([[9.0, 0.0, 0.0]]), torch.ones(1, 3), torch.tensor([1]))
+    torch.testing.assert_close(pilot.act(start, level, still, still, gate), fresh)
+
+
+def test_policy_flies_the_torchrl_environment() -> None:
+    env = DroneRacingEnv("circle", num_envs=4, from_pixels=False, seed=0)
+    rollout = env.rollout(150, PilotPolicy(ScriptedPilot(env.track)), break_when_any_done=False)
+    assert not rollout["next", "terminated"].any()
+    assert (rollout["next", "race", "gates_passed"][:, -1] >= 3).all()
+    env.close()
+
+
+def test_line_passes_every_gate_and_keeps_to_the_thrust_limit(circle_line: RacingLine) -> None:
+    track = load_track("circle")
+    reference = circle_line.at(circle_line.gate_times)
+    offset = reference.position - track.gate_positions(dtype=torch.float64)
+    normals = track.gate_normals(dtype=torch.float64)
+    torch.testing.assert_close((offset * normals).sum(-1), torch.zeros(4, dtype=torch.float64), atol=0.02, rtol=0.0)
+    assert offset.abs().max() < 0.3
+    assert ((reference.velocity * normals).sum(-1) > 0.7 * reference.velocity.norm(dim=-1)).all()
+    everywhere = circle_line.at(torch.arange(0.0, circle_line.lap_time, 0.01, dtype=torch.float64))
+    thrust = (everywhere.acceleration + torch.tensor([0.0, 0.0, 9.81])).norm(dim=-1)
+    assert thrust.max() < 1.03 * LineLimits().speed * 26.66
+
+
+def test_line_is_the_integral_of_its_velocity_and_repeats_every_lap(circle_line: RacingLine) -> None:
+    time = torch.linspace(0.0, circle_line.lap_time, 400, dtype=torch.float64)
+    reference = circle_line.at(time)
+    travelled = torch.cumulative_trapezoid(reference.velocity, time, dim=0)
+    torch.testing.assert_close(reference.position[1:] - reference.position[0], travelled, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(circle_line.at(time - circle_line.lap_time).position, reference.position)
+
+
+def test_planning_again_gives_the_same_line_so_that_a_resumed_run_starts_alike():
+    arguments = (load_track("circle"), PRESETS["easy"], LineLimits(speed=0.7))
+    first, second = (plan_racing_line.__wrapped__(*arguments) for _ in range(2))
+    assert torch.equal(first.samples, second.samples) and torch.equal(first.gate_times, second.gate_times)

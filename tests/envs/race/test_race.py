@@ -1,0 +1,563 @@
+"""Episodes by hand: laps, times, ends, crashes; and where episodes start."""
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from dreamer_racing.envs.drone.quadrotor import GRAVITY, load_preset, without_randomisation
+from dreamer_racing.envs.drone.rotation import rotate
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.race.race import Race, RaceStep
+from dreamer_racing.envs.race.racing_line import plan_racing_line
+from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
+from dreamer_racing.envs.worlds import START_LINE, RaceWorlds
+
+CIRCLE = load_track("circle")
+CENTRES = CIRCLE.gate_positions(dtype=torch.float64)
+NORMALS = CIRCLE.gate_normals(dtype=torch.float64)
+HOVER = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)  # in the middle of the circle, above all frames
+
+
+def begin(num_envs: int = 1, target: int = 0, **arguments) -> Race:
+    """Begin an episode of each drone on the circle, hovering in its middle."""
+    race = Race(CIRCLE, num_envs, dtype=torch.float64, **arguments)
+    race.begin(torch.ones(num_envs, dtype=torch.bool), HOVER.repeat(num_envs, 1), torch.full((num_envs,), target))
+    return race
+
+
+def fly(race: Race, *points, rates=(0.0, 0.0, 0.0), invalid: bool = False) -> RaceStep:
+    """Take every drone along the same points in one control step."""
+    num_envs = len(race.target_gate)
+    path = torch.stack([torch.as_tensor(point, dtype=torch.float64) for point in points])
+    path = path.unsqueeze(1).repeat(1, num_envs, 1)
+    return race.step(
+        path,
+        torch.tensor(rates, dtype=torch.float64).repeat(num_envs, 1),
+        torch.full((num_envs,), invalid),
+    )
+
+
+def through(gate: int):
+    """Return a path through the centre of a gate."""
+    return CENTRES[gate] - 0.1 * NORMALS[gate], CENTRES[gate] + 0.1 * NORMALS[gate]
+
+
+def hover(race: Race, steps: int = 1) -> RaceStep:
+    """Stay in the middle for some control steps and return the last outcome."""
+    for _ in range(steps):
+        outcome = fly(race, HOVER, HOVER)
+    return outcome
+
+
+# ---------------------------------------------------------------- reward and target
+
+
+def test_progress_and_body_rate():
+    race = begin()
+    # Gate 0 is at (4, 0, 1.35). Along x at its height, from x = 0 (4 m away) to 0.3.
+    race.begin(torch.tensor([True]), torch.tensor([[0.0, 0.0, 1.35]]), torch.tensor([0]))
+    outcome = fly(race, (0, 0, 1.35), (0.3, 0, 1.35), rates=(0.0, 3.0, 4.0))
+    assert outcome.reward_base.item() == pytest.approx(0.3)
+    assert outcome.body_rate_norm.item() == pytest.approx(5.0)
+    assert not (outcome.terminated | outcome.truncated | outcome.passed | outcome.finished).item()
+    assert outcome.crash.item() == CrashCause.NONE
+
+
+def test_progress_adds_up_to_the_distance_covered():
+    race = begin(target=2)
+    points = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + HOVER
+    points[0] = HOVER
+    total = sum(fly(race, a, b).reward_base for a, b in pairwise(points))
+    covered = (CENTRES[2] - HOVER).norm() - (CENTRES[2] - points[-1]).norm()
+    torch.testing.assert_close(total, covered.view(1))
+
+
+def test_a_pass_pays_ten_and_moves_the_target_on():
+    race = begin()
+    outcome = fly(race, *through(0), rates=(1.0, 0.0, 0.0))
+    assert outcome.reward_base.item() == 10.0
+    assert outcome.body_rate_norm.item() == 0.0
+    assert (outcome.gates_passed.item(), outcome.target_gate.item()) == (1, 1)
+    # From (4, 0.1, 1.35) towards gate 1 at (0, 4, 1.35): both distances are to the new gate.
+    outcome = fly(race, (4, 0.1, 1.35), (4, 0.2, 1.35))
+    expected = math.hypot(4, 3.9) - math.hypot(4, 3.8)
+    assert outcome.reward_base.item() == pytest.approx(expected)
+    assert outcome.gate_offset.item() == 0.0
+
+
+def test_gate_offset():
+    race = begin()
+    sideways = torch.tensor([0.3, 0.0, -0.4], dtype=torch.float64)
+    assert fly(race, *(point + sideways for point in through(0))).gate_offset.item() == pytest.approx(0.5)
+
+
+def test_flying_round_a_gate_is_not_the_end():
+    race = begin()
+    beside = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64)
+    outcome = fly(race, *(point + beside for point in through(0)))
+    assert (outcome.target_gate.item(), outcome.gates_passed.item(), outcome.terminated.item()) == (0, 0, False)
+
+
+# ---------------------------------------------------------------- laps and time
+
+
+def test_lap_times():
+    race = begin()
+    hover(race, 5)
+    for gate in range(3):
+        assert fly(race, *through(gate)).lap_time.item() == 0.0
+    outcome = fly(race, *through(3))  # the ninth step of the episode
+    assert outcome.lap_time.item() == pytest.approx(0.18)
+    assert (outcome.target_gate.item(), outcome.gates_passed.item()) == (0, 4)
+    assert hover(race, 2).lap_time.item() == 0.0
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times == [0.0, 0.0, 0.0, pytest.approx(0.12)]  # two hovering and four passing
+
+
+def test_control_dt_scales_lap_times():
+    race = begin(control_dt=0.05)
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times[-1] == pytest.approx(0.2)
+
+
+def test_a_lap_may_begin_at_any_gate():
+    race = begin(target=2)
+    times = [fly(race, *through(gate)).lap_time.item() for gate in (2, 3, 0, 1)]
+    assert times == [0.0, 0.0, 0.0, pytest.approx(0.08)]
+    assert race.target_gate.item() == 2
+
+
+def test_the_last_lap_truncates_as_finished():
+    race = begin(laps=3)
+    for passes in range(1, 13):
+        outcome = fly(race, *through((passes - 1) % 4))
+        assert outcome.finished.item() == outcome.truncated.item() == (passes == 12)
+        assert not outcome.terminated.item()
+    assert outcome.reward_base.item() == 10.0
+
+
+def test_without_laps_an_episode_never_finishes():
+    race = begin()
+    for passes in range(20):
+        outcome = fly(race, *through(passes % 4))
+        assert not (outcome.finished | outcome.truncated).item()
+
+
+def test_time_limit_truncates():
+    race = begin(episode_steps=3)
+    assert not hover(race, 2).truncated.item()
+    outcome = hover(race)
+    assert (outcome.truncated.item(), outcome.terminated.item(), outcome.finished.item()) == (True, False, False)
+
+
+def test_a_crash_in_the_last_step_is_terminated_only():
+    race = begin(episode_steps=1)
+    outcome = fly(race, HOVER, (0, 0, 0.01))
+    assert (outcome.truncated.item(), outcome.terminated.item()) == (False, True)
+    assert (outcome.crash.item(), outcome.reward_base.item()) == (CrashCause.GROUND, -4.0)
+
+
+def test_the_last_lap_in_the_last_step():
+    race = begin(episode_steps=4, laps=1)
+    for gate in range(4):
+        outcome = fly(race, *through(gate))
+    assert (outcome.truncated.item(), outcome.finished.item()) == (True, True)
+
+
+def test_a_crash_behind_the_finish_is_a_crash():
+    race = begin(laps=1)
+    for gate in range(3):
+        fly(race, *through(gate))
+    outcome = fly(race, *through(3), (0, -4, 0.01))
+    assert (outcome.passed.item(), outcome.gates_passed.item()) == (True, 4)
+    assert outcome.lap_time.item() == pytest.approx(0.08)  # the lap was flown
+    assert (outcome.finished.item(), outcome.truncated.item(), outcome.terminated.item()) == (False, False, True)
+    assert (outcome.reward_base.item(), outcome.body_rate_norm.item()) == (-4.0, 0.0)
+
+
+# ---------------------------------------------------------------- broken numbers
+
+
+def test_lost_drones_crash_alone():
+    race = begin(num_envs=4)
+    path = HOVER.repeat(3, 4, 1)
+    path[1, 1, 0] = math.nan
+    path[2, 2] = math.inf
+    rates = torch.zeros(4, 3, dtype=torch.float64)
+    rates[3, 1] = math.nan
+    outcome = race.step(path, rates, torch.zeros(4, dtype=torch.bool))
+    lost = CrashCause.NON_FINITE_STATE
+    assert outcome.crash.tolist() == [CrashCause.NONE, lost, lost, lost]
+    assert outcome.reward_base.tolist() == [0.0, -4.0, -4.0, -4.0]
+    assert outcome.body_rate_norm.tolist() == [0.0] * 4
+    assert outcome.terminated.tolist() == [False, True, True, True]
+
+
+def test_a_lost_drone_can_begin_again():
+    race = begin()
+    fly(race, HOVER, (math.nan, 0, 3))
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([0]))
+    outcome = hover(race)
+    assert (outcome.crash.item(), outcome.reward_base.item()) == (CrashCause.NONE, 0.0)
+
+
+def test_an_invalid_action_voids_the_step():
+    race = begin()
+    outcome = fly(race, *through(0), (4, 0.1, 0.01), invalid=True)
+    assert outcome.crash.item() == CrashCause.INVALID_ACTION
+    assert (outcome.passed.item(), outcome.gates_passed.item(), outcome.gate_offset.item()) == (False, 0, 0.0)
+    assert (outcome.terminated.item(), outcome.reward_base.item()) == (True, -4.0)
+
+
+# ---------------------------------------------------------------- bookkeeping
+
+
+def test_begin_leaves_the_others_alone():
+    race = begin(num_envs=2)
+    fly(race, *through(0))
+    race.begin(
+        torch.tensor([False, True]),
+        torch.full((2, 3), math.nan).index_fill(0, torch.tensor([1]), 2.0),
+        torch.tensor([3, 3]),
+    )
+    assert race.target_gate.tolist() == [1, 3]
+    assert race.gates_passed.tolist() == [1, 0]
+    assert race.step_count.tolist() == [1, 0]
+    assert race.lap_start_step.tolist() == [0, 0]
+    assert race.position.tolist() == [through(0)[1].tolist(), [2.0, 2.0, 2.0]]
+
+
+def test_a_new_episode_forgets_the_old_lap():
+    race = begin()
+    for gate in range(4):
+        fly(race, *through(gate))
+    assert race.lap_start_step.item() == 4
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([0]))
+    times = [fly(race, *through(gate)).lap_time.item() for gate in range(4)]
+    assert times[-1] == pytest.approx(0.08)
+
+
+def test_outcomes_are_not_changed_by_later_steps():
+    race = begin()
+    first = fly(race, *through(0))
+    before = {field.name: getattr(first, field.name).clone() for field in dataclasses.fields(first)}
+    fly(race, *through(1))
+    race.begin(torch.tensor([True]), HOVER.view(1, 3), torch.tensor([2]))
+    for name, value in before.items():
+        assert torch.equal(getattr(first, name), value), name
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=10, deadline=None)
+def test_any_flight_keeps_the_books(seed):
+    """Random flights of many drones: invariants of every outcome, and each drone alone fares the same."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.randint(4, (8,), generator=generator)
+    start = CENTRES[target] - 0.2 * NORMALS[target]
+    moves = 0.3 * torch.randn(15, 3, 8, 3, generator=generator, dtype=torch.float64) / 3
+    points = start + torch.cat((torch.zeros(1, 8, 3), moves.flatten(0, 1))).cumsum(0)
+    paths = [points[3 * k : 3 * k + 4] for k in range(15)]
+
+    def run(drones):
+        race = Race(CIRCLE, len(drones), episode_steps=12, laps=1, dtype=torch.float64)
+        race.begin(torch.ones(len(drones), dtype=torch.bool), start[drones], target[drones])
+        no = torch.zeros(len(drones), dtype=torch.bool)
+        return [race.step(path[:, drones], torch.zeros(len(drones), 3, dtype=torch.float64), no) for path in paths]
+
+    together = run(list(range(8)))
+    alone = [run([n]) for n in range(8)]
+    passes = torch.zeros(8, dtype=torch.int64)
+    for step, outcome in enumerate(together):
+        passes += outcome.passed
+        assert torch.equal(outcome.gates_passed, passes)
+        assert torch.equal(outcome.target_gate, (target + passes) % 4)
+        assert torch.equal(outcome.terminated, outcome.crash != 0)
+        assert not (outcome.terminated & outcome.truncated).any()
+        assert torch.equal(outcome.truncated, ~outcome.terminated & (outcome.finished | (step >= 11)))
+        for field in dataclasses.fields(outcome):
+            single = torch.cat([getattr(steps[step], field.name) for steps in alone])
+            torch.testing.assert_close(getattr(outcome, field.name), single)
+
+
+def test_float32_and_nothing_waits_for_the_host():
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        race = Race(CIRCLE, 4)
+        starts = StartSampler(CIRCLE)
+        pose = starts.sample(4)
+        race.begin(torch.ones(4, dtype=torch.bool), pose.position, pose.target_gate)
+        outcome = race.step(torch.zeros(11, 4, 3), torch.zeros(4, 3), torch.zeros(4, dtype=torch.bool))
+    floats = (outcome.reward_base, outcome.body_rate_norm, outcome.gate_offset, outcome.lap_time)
+    assert {value.dtype for value in floats} == {torch.float32}
+    assert {value.shape for value in vars(outcome).values()} == {(4,)}
+
+
+# ---------------------------------------------------------------- starts
+
+
+def sampler(name: str, seed: int = 0) -> StartSampler:
+    return StartSampler(load_track(name), torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_evaluation_starts_at_rest_at_the_start(name):
+    track = load_track(name)
+    pose = sampler(name).sample(3, evaluation=True)
+    start = torch.tensor(track.start_position, dtype=torch.float64).repeat(3, 1)
+    torch.testing.assert_close(pose.position, start)
+    assert pose.linear_velocity.eq(0).all()
+    assert pose.target_gate.tolist() == [0, 0, 0]
+    heading = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    to_gate = torch.tensor(track.gates[0].position, dtype=torch.float64) - start
+    to_gate[:, 2] = 0  # the start is level
+    torch.testing.assert_close(heading, to_gate / to_gate.norm(dim=-1, keepdim=True))
+
+
+def test_evaluation_starts_with_noise_are_level_poses_moved_by_so_many_times_the_noise_of_training():
+    track = load_track("circle")  # starts at (4, −2.5, 1.35) and heads along y
+    starts = StartSampler(track, torch.Generator().manual_seed(0), dtype=torch.float64, start_noise=2.0)
+    pose = starts.sample(2000, evaluation=True)
+    moved = (pose.position - torch.tensor(track.start_position, dtype=torch.float64)).abs().amax(0)
+    limits = torch.tensor([1.0, 1.0, 0.6], dtype=torch.float64)
+    assert (moved <= limits).all() and (moved > 0.98 * limits).all()
+    nose = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(2000, 3))
+    yaw = torch.rad2deg(torch.atan2(-nose[:, 0], nose[:, 1])).abs().max()
+    pitch = torch.rad2deg(torch.asin(nose[:, 2])).abs().max()
+    assert 19.5 < yaw <= 20.0 and 9.7 < pitch <= 10.0
+    assert pose.linear_velocity.eq(0).all() and pose.target_gate.eq(0).all()
+
+
+def test_worlds_start_with_the_noise_of_evaluation():
+    worlds = RaceWorlds("circle", 50, evaluation=True, from_pixels=False, start_noise=1.0, seed=0)
+    worlds.reset()
+    spread = worlds.privileged()["position"].std(0)
+    torch.testing.assert_close(spread, torch.tensor([0.5, 0.5, 0.3]) / 3**0.5, rtol=0.2, atol=0)
+
+
+@pytest.mark.parametrize("noise", [-1.0, 2.5 / 0.5**0.5, float("nan")])
+def test_start_noise_across_the_first_gate_is_refused(noise):
+    with pytest.raises(ValueError, match=r"start_noise=.*2\.50 m before the plane.*below 3\.54"):
+        StartSampler(load_track("circle"), start_noise=noise)
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_training_starts(name):
+    track = load_track(name)
+    pose = sampler(name).sample(5000)
+    centre = track.gate_positions(dtype=torch.float64)[pose.target_gate]
+    normal = track.gate_normals(dtype=torch.float64)[pose.target_gate]
+    distance = ((centre - pose.position) * normal).sum(-1)  # before the plane
+    assert distance.min() > 0.29
+    low = torch.tensor(track.bounds_low, dtype=torch.float64)
+    low[2] = max(low[2], 0.05)
+    assert (pose.position - low).min() >= 0.3 - 1e-9
+    assert (torch.tensor(track.bounds_high, dtype=torch.float64) - pose.position).min() >= 0.3 - 1e-9
+
+    speed = pose.linear_velocity.norm(dim=-1)
+    at_gate = speed > 0
+    assert at_gate.double().mean() == pytest.approx(0.5, abs=0.03)
+    assert set(pose.target_gate[at_gate].tolist()) == set(range(track.num_gates))
+    assert set(pose.target_gate[~at_gate].tolist()) == {0}
+    assert 1.5 <= speed[at_gate].min() < 1.6
+    assert 2.4 < speed[at_gate].max() <= 2.5
+    # Towards the centre, and before the gate as described.
+    miss = torch.linalg.cross(pose.linear_velocity, centre - pose.position)[at_gate].norm(dim=-1)
+    torch.testing.assert_close(miss, torch.zeros_like(miss))
+    assert distance[at_gate].max() < 3.5
+    start = torch.tensor(track.start_position, dtype=torch.float64)
+    assert (pose.position[~at_gate] - start)[:, :2].norm(dim=-1).max() <= math.hypot(0.5, 0.5)
+
+
+def test_attitude_noise():
+    pose = sampler("circle").sample(5000)
+    forward, left = (
+        rotate(pose.attitude, torch.tensor([axis], dtype=torch.float64)) for axis in ((1.0, 0, 0), (0, 1.0, 0))
+    )
+    yaws = CIRCLE.gate_yaws(dtype=torch.float64)[pose.target_gate]  # the start faces gate 0 along its yaw
+    yaw_error = torch.atan2(forward[:, 1], forward[:, 0]) - yaws
+    yaw_error = torch.atan2(yaw_error.sin(), yaw_error.cos()).abs().rad2deg().max().item()
+    pitch = forward[:, 2].asin().abs().rad2deg().max().item()
+    roll = (left[:, 2] / (1 - forward[:, 2] ** 2).sqrt()).asin().abs().rad2deg().max().item()
+    assert yaw_error == pytest.approx(10, abs=0.1)
+    assert pitch == pytest.approx(5, abs=0.1)
+    assert roll == pytest.approx(5, abs=0.1)
+    torch.testing.assert_close(pose.attitude.norm(dim=-1), torch.ones(5000, dtype=torch.float64))
+
+
+def test_starts_follow_the_generator():
+    first, again, other = (sampler("kidney", seed).sample(16) for seed in (1, 1, 2))
+    assert torch.equal(first.position, again.position)
+    assert torch.equal(first.attitude, again.attitude)
+    assert not torch.equal(first.position, other.position)
+
+
+@given(st.floats(-180, 180), st.integers(0, 100))
+@settings(max_examples=40, deadline=None)
+def test_no_start_is_past_its_gate_however_tight_the_box(yaw, seed):
+    gates = [Gate((0.0, 0.0, 1.35), yaw), Gate((0.0, 0.0, 4.0), yaw)]
+    start = gates[0].position[0] - gates[0].forward[0], -gates[0].forward[1], 1.35  # 1 m before the plane
+    track = make_track("tight", gates, start_position=start, bounds_low=(-1.31,) * 3, bounds_high=(1.31, 1.31, 6.0))
+    validate_track(track, "tight")
+    pose = StartSampler(track, torch.Generator().manual_seed(seed), dtype=torch.float64).sample(500)
+    distance = -(pose.position * track.gate_normals(dtype=torch.float64)[0]).sum(-1)
+    assert distance.min() > 0.29
+    assert pose.position[:, :2].abs().max() <= 1.01 + 1e-9
+
+
+def test_starts_beyond_a_gate_face_the_turn_to_the_next():
+    track = load_track("circle")
+    pose = StartSampler(track, torch.Generator().manual_seed(0), beyond_gate=1.0).sample(2000)
+    gate = (pose.target_gate - 1) % 4
+    normal = track.gate_normals()[gate]
+    behind = ((pose.position - track.gate_positions()[gate]) * normal).sum(-1)
+    assert behind.min() >= 0.1 and behind.max() <= 2.5
+    speed = pose.linear_velocity.norm(dim=-1)
+    assert 1.5 <= speed.min() < 1.6 and 4.9 < speed.max() <= 5.0
+    torch.testing.assert_close(pose.linear_velocity, speed.unsqueeze(-1) * normal)
+    assert pose.target_gate.unique().tolist() == [0, 1, 2, 3]
+
+
+def test_the_share_of_starts_beyond_a_gate_leaves_the_rest_as_it_was():
+    pose = StartSampler(load_track("circle"), torch.Generator().manual_seed(0), beyond_gate=0.4).sample(20_000)
+    at_rest = pose.linear_velocity.norm(dim=-1) == 0
+    fast = pose.linear_velocity.norm(dim=-1) > 2.5
+    assert at_rest.float().mean() == pytest.approx(0.3, abs=0.02)
+    assert fast.float().mean() == pytest.approx(0.4 * 2.5 / 3.5, abs=0.02)
+    with pytest.raises(ValueError, match="beyond_gate=2"):
+        StartSampler(load_track("circle"), beyond_gate=2)
+
+
+N_ON_LINE = 400
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_starts_on_the_line_are_between_the_last_gate_and_the_next(name):
+    worlds = RaceWorlds(name, 2000, from_pixels=False, start_on_line=1.0, seed=0)
+    worlds.reset()
+    gate, centres = worlds.race.target_gate, worlds.track.gate_positions(dtype=torch.float64)
+    assert gate.unique().tolist() == list(range(worlds.track.num_gates))
+    for of, side in ((gate, 1.0), ((gate - 1) % worlds.track.num_gates, -1.0)):
+        ahead = centres[of] - worlds.simulator.state.position
+        near = ahead.norm(dim=-1) < StartSampler.PAST_GATE
+        before = (ahead * worlds.track.gate_normals(dtype=torch.float64)[of]).sum(-1) * side
+        assert near.any() and (before[near] >= 0).all(), "a drone begins on the wrong side of a gate's plane"
+    worlds.close()
+
+
+@pytest.mark.parametrize("name", ["circle", "kidney"])
+def test_starts_on_the_line_can_be_flown_on_from_anywhere_of_a_lap(name):
+    worlds = RaceWorlds(name, N_ON_LINE, from_pixels=False, start_on_line=1.0, seed=0)
+    worlds.reset()
+    pilot = ScriptedPilot(worlds.track, dtype=worlds.dtype)
+    crashed, passed = torch.zeros(N_ON_LINE, dtype=torch.bool), torch.zeros(N_ON_LINE, dtype=torch.int64)
+    for _ in range(100):
+        state = worlds.simulator.state
+        action = pilot.act(
+            state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate
+        )
+        outcome = worlds.step(action)
+        passed = torch.where(crashed, passed, outcome.gates_passed)
+        crashed |= outcome.terminated
+    worlds.close()
+    assert crashed.float().mean() < 0.1
+    assert (passed > 0).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_starts_on_the_line_look_where_it_leads_and_push_along_what_it_asks_for(preset):
+    parameters = without_randomisation(load_preset(preset))
+    line = plan_racing_line(CIRCLE, parameters, START_LINE).to("cpu", torch.float64)
+    starts = StartSampler(CIRCLE, torch.Generator().manual_seed(0), dtype=torch.float64, on_line=1.0, line=line)
+    starts.LINE_NOISE, starts._attitude_noise = 0.0, torch.zeros(3, dtype=torch.float64)
+    pose = starts.sample(500)
+    nearest = torch.cdist(pose.position, line.samples[:, :3]).argmin(-1)
+    reference = line.samples[nearest]
+    pace = pose.linear_velocity.norm(dim=-1) / reference[:, 3:6].norm(dim=-1)
+    assert 0.19 < pace.min() < 0.25 and 0.95 < pace.max() < 1.02
+    drag = sum(parameters.drag[:2]) / 2 / parameters.mass
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    force = pace.square().unsqueeze(-1) * reference[:, 6:9] + drag * pose.linear_velocity + GRAVITY * up
+    axis = rotate(pose.attitude, up.expand(500, 3))
+    assert (axis * force).sum(-1).div(force.norm(dim=-1)).min() > 0.999
+    left = rotate(pose.attitude, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand(500, 3))
+    nose = rotate(pose.attitude, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(500, 3))
+    later = line.at(nearest.double() * line.dt + starts.LOOK_AHEAD).position - pose.position
+    assert (left * later).sum(-1).abs().max() < 0.1 and (nose * later).sum(-1).min() > 0
+
+
+def test_the_share_of_starts_on_the_line_leaves_the_rest_as_it_was():
+    line = plan_racing_line(CIRCLE, load_preset("easy"), START_LINE)
+    mixed = StartSampler(CIRCLE, torch.Generator().manual_seed(0), on_line=0.5, line=line).sample(2000)
+    plain = StartSampler(CIRCLE, torch.Generator().manual_seed(0)).sample(2000)
+    same = (mixed.position == plain.position).all(-1)
+    assert same.float().mean() == pytest.approx(0.5, abs=0.04)
+    assert torch.equal(mixed.target_gate[same], plain.target_gate[same])
+    with pytest.raises(ValueError, match=r"on_line=-0.1"):
+        StartSampler(CIRCLE, on_line=-0.1, line=line)
+    with pytest.raises(ValueError, match="give a line"):
+        StartSampler(CIRCLE, on_line=0.5)
+
+
+def test_evaluation_never_begins_on_the_line():
+    worlds = RaceWorlds("circle", 3, evaluation=True, from_pixels=False, start_on_line=1.0)
+    worlds.reset()
+    assert worlds.simulator.state.linear_velocity.eq(0).all()
+
+
+@pytest.mark.parametrize(("evaluation", "ends"), [(False, True), (True, False)])
+def test_a_missed_gate_ends_training_episodes_only(evaluation, ends):
+    worlds = RaceWorlds("circle", 1, from_pixels=False, evaluation=evaluation, miss_radius=3.0, seed=0)
+    worlds.reset()
+    beside = torch.tensor([4.0, 0.0, 3.35], dtype=worlds.dtype)  # 2 m above gate 0, which is flown along y
+    path = torch.stack([beside - torch.tensor([0, 0.1, 0]), beside + torch.tensor([0, 0.1, 0])]).unsqueeze(1)
+    worlds.race.target_gate.zero_()
+    outcome = worlds.race.step(path, torch.zeros(1, 3), torch.tensor([False]))
+    assert outcome.terminated.item() is ends
+    assert outcome.crash.item() == (CrashCause.GATE_MISSED if ends else CrashCause.NONE)
+    if ends:
+        assert outcome.reward_base.item() == RewardWeights().collision
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_a_good_lap_misses_no_gate(name):
+    worlds = RaceWorlds(name, 4, from_pixels=False, miss_radius=3.0, seed=0)
+    worlds.reset()
+    pilot = ScriptedPilot(worlds.track, dtype=worlds.dtype)
+    for _ in range(450):
+        state = worlds.simulator.state
+        action = pilot.act(
+            state.position, state.attitude, state.linear_velocity, state.body_rates, worlds.race.target_gate
+        )
+        outcome = worlds.step(action)
+        assert not (outcome.crash == CrashCause.GATE_MISSED).any()
+    assert (outcome.gates_passed >= worlds.track.num_gates).all()
+    worlds.close()
+
+
+def test_a_miss_is_beyond_the_frame():
+    with pytest.raises(ValueError, match=r"miss_radius=0.5: .* more than 1.025 m"):
+        RaceWorlds("circle", 1, from_pixels=False, miss_radius=0.5)
+
+
+def test_half_the_control_rate_flies_twice_as_far_a_step_and_ends_after_the_same_time():
+    fast, slow = (RaceWorlds("circle", 1, from_pixels=False, seed=0, control_rate=rate) for rate in (None, 25.0))
+    for worlds, steps in ((fast, 4), (slow, 2)):
+        worlds.reset()
+        for _ in range(steps):
+            worlds.step(torch.full((1, 4), 0.1))
+    torch.testing.assert_close(fast.simulator.state.position, slow.simulator.state.position)
+    assert (fast.race.episode_steps, slow.race.episode_steps) == (1000, 500)
+    with pytest.raises(ValueError, match=r"control_rate=5 Hz: at least 10"):
+        RaceWorlds("circle", 1, from_pixels=False, control_rate=5)
+    with pytest.raises(ValueError, match=r"start_on_line=1.5: a share"):
+        RaceWorlds("circle", 1, from_pixels=False, start_on_line=1.5)
+    with pytest.raises(ValueError, match=r"control_rate=60.* whole number of physics steps of 2 ms"):
+        RaceWorlds("circle", 1, from_pixels=False, control_rate=60)

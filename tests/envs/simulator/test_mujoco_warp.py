@@ -1,0 +1,244 @@
+"""The CUDA backend flies and draws what the CPU backend does; everything here also runs on warp's CPU device."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.simulator import MujocoSimulator, WarpSimulator, mujoco_warp
+from dreamer_racing.envs.simulator.mujoco_warp import memory_of_worlds
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.worlds import RaceWorlds
+
+KIDNEY = load_track("kidney")
+N = 6
+CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+everywhere = pytest.mark.parametrize("device", ["cpu", CUDA])
+
+
+def generator(device: str, seed: int = 0) -> torch.Generator:
+    return torch.Generator(device).manual_seed(seed)
+
+
+def on_warp(device: str, preset: str = "easy", **arguments) -> WarpSimulator:
+    arguments = {"images": False, **arguments}
+    return WarpSimulator(KIDNEY, PRESETS[preset], N, device=device, generator=generator(device), **arguments)
+
+
+def on_mujoco(preset: str = "easy", renderer: str | None = None) -> MujocoSimulator:
+    made = MujocoSimulator(KIDNEY, PRESETS[preset], N, renderer=renderer, generator=generator("cpu"))
+    start = StartSampler(KIDNEY, generator("cpu", 1), dtype=torch.float64).sample(N)
+    made.reset(torch.ones(N, dtype=torch.bool), start.position, start.attitude, start.linear_velocity)
+    return made
+
+
+def smooth_actions(steps: int, device: str = "cpu") -> Tensor:
+    """Actions (T, N, 4) that change every tenth of a second, as hard as a pilot's."""
+    targets = torch.rand(steps // 5 + 1, N, 4, generator=generator("cpu", 2)) * 2 - 1
+    return (targets.repeat_interleave(5, 0)[:steps] * torch.tensor([0.5, 0.3, 0.3, 1.0])).to(device)
+
+
+@everywhere
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_physics_is_that_of_the_c_engine(preset: str, device: str) -> None:
+    ours, reference = on_warp(device, preset), on_mujoco(preset)
+    ours.load_state_dict(reference.state_dict())  # the same drones, where parameters are randomised
+    errors = []
+    for action in smooth_actions(100):
+        path, expected = ours.step(action.to(device)), reference.step(action)
+        errors.append((path.cpu() - expected).norm(dim=-1).amax())
+    assert errors[0] < 1e-5
+    assert max(errors) < 2e-3  # m after 2 s, in float32
+    assert (expected[-1] - expected[0]).norm(dim=-1).min() > 0.01  # they do move
+
+
+@everywhere
+def test_partial_reset_leaves_the_others_untouched(device: str) -> None:
+    made = on_warp(device, "faithful")
+    made.load_state_dict(on_mujoco("faithful").state_dict())
+    for action in smooth_actions(5, device):
+        made.step(action)
+    mask = torch.tensor([False, True, False, True, False, False], device=device)
+    before = torch.cat((made._qpos, made._qvel, made.quadrotor.rotor_speed), 1).clone()
+    start = StartSampler(KIDNEY, generator(device, 3), device, torch.float32).sample(N)
+    made.reset(mask, start.position, start.attitude, start.linear_velocity)
+    after = torch.cat((made._qpos, made._qvel, made.quadrotor.rotor_speed), 1)
+    assert torch.equal(before[~mask], after[~mask])
+    assert torch.equal(made.state.position[mask], start.position[mask])
+    assert (after[mask] != before[mask]).any(1).all()
+
+
+@everywhere
+def test_images_are_those_of_the_cpu_backends_ray_caster(device: str) -> None:
+    camera = Camera(width=48, height=32)
+    reference = MujocoSimulator(KIDNEY, PRESETS["easy"], N, camera, "warp", num_threads=1)
+    reference.load_state_dict(on_mujoco().state_dict())
+    ours = on_warp(device, images=True, camera=camera)
+    ours.load_state_dict(reference.state_dict())
+    images, expected = ours.render(), reference.render()
+    reference.close()
+    assert images.shape == (N, 32, 48, 3)
+    assert images.device.type == device
+    difference = (images.cpu().float() - expected.float()).abs()
+    assert difference.mean() < 0.5  # float32 poses move an edge pixel now and then
+    assert expected.float().std() > 30.0
+    mask = torch.tensor([True, False, False, True, True, False], device=device)
+    assert torch.equal(ours.render(mask), images[mask])
+    ours.close()
+    with pytest.raises(RuntimeError, match="renderer=None"):
+        ours.render()
+
+
+@everywhere
+def test_red_is_the_first_colour(device: str) -> None:
+    ours = on_warp(device, images=True)
+    gate = KIDNEY.gates[0]
+    position = torch.tensor(gate.position) - 2.0 * torch.tensor(gate.forward)
+    half_yaw = torch.tensor(gate.yaw_degrees).deg2rad() / 2
+    attitude = torch.tensor([half_yaw.cos(), 0.0, 0.0, half_yaw.sin()])
+    poses = (value.float().to(device).expand(N, -1) for value in (position, attitude, torch.zeros(3)))
+    ours.reset(torch.ones(N, dtype=torch.bool, device=device), *poses)
+    red, green, blue = ours.render()[0].cpu().float().unbind(-1)
+    assert ((red > 140) & (green < 100) & (blue < 60)).sum() > 300
+
+
+@everywhere
+def test_race_is_the_same_race(device: str) -> None:
+    """The same starts and actions: the same passes, crashes and rewards until float32 matters."""
+    worlds = [RaceWorlds("kidney", N, from_pixels=False, seed=0, device=device, backend="mujoco_warp"),
+              RaceWorlds("kidney", N, from_pixels=False, seed=0)]  # fmt: skip
+    start = StartSampler(KIDNEY, generator("cpu", 1), dtype=torch.float64).sample(N)
+    for each in worlds:
+        mask = torch.ones(N, dtype=torch.bool, device=each.device)
+        poses = (value.to(each.device) for value in (start.position, start.attitude, start.linear_velocity))
+        each.simulator.reset(mask, *poses)
+        each.race.begin(mask, start.position.to(each.device), start.target_gate.to(each.device))
+    ends = torch.zeros(N, dtype=torch.bool)
+    for action in smooth_actions(60):
+        ours, reference = (each.step(action.to(each.device)) for each in worlds)
+        for name in ("reward_base", "gate_offset", "body_rate_norm"):
+            torch.testing.assert_close(getattr(ours, name).cpu(), getattr(reference, name), rtol=0, atol=2e-3)
+        for name in ("terminated", "truncated", "gates_passed", "crash", "target_gate"):
+            assert torch.equal(getattr(ours, name).cpu(), getattr(reference, name)), name
+        ends |= reference.terminated
+        torch.testing.assert_close(worlds[0].vector().cpu(), worlds[1].vector(), rtol=0, atol=1e-3)
+    assert ends.any()
+
+
+@everywhere
+@pytest.mark.parametrize("from_pixels", [True, False])
+def test_torchrl_environment(from_pixels: bool, device: str) -> None:
+    env = DroneRacingEnv("circle", N, device, from_pixels, seed=0, episode_steps=8, backend="mujoco_warp")
+    check_env_specs(env, seed=0)
+    rollout = env.rollout(20, break_when_any_done=False)
+    assert rollout.device.type == device
+    assert rollout["next", "truncated"].any()
+    if from_pixels:
+        assert rollout["pixels"].float().std() > 20.0
+    env.close()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("from_pixels", [True, False])
+def test_a_step_is_one_graph_that_never_waits(from_pixels: bool) -> None:
+    worlds = RaceWorlds("kidney", N, from_pixels=from_pixels, seed=0, device="cuda", preset="faithful")
+    worlds.reset()
+    actions = smooth_actions(20, "cuda")
+    state = worlds.state_dict()
+    eager = [worlds._fly(action) for action in actions]
+    images = worlds.simulator.render() if from_pixels else None
+    worlds.load_state_dict(state)
+    worlds.step(actions[0])  # captures
+    worlds.load_state_dict(state)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        graphed = [worlds.step(action) for action in actions]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for one, other in zip(eager, graphed, strict=True):
+        for name, value in vars(one).items():
+            torch.testing.assert_close(getattr(other, name), value, rtol=0, atol=1e-6)
+    if images is not None:
+        assert (worlds.render().float() - images.float()).abs().mean() < 0.01
+
+
+@pytest.mark.gpu
+def test_memory_is_estimated() -> None:
+    def used() -> int:
+        torch.cuda.synchronize()
+        free, total = torch.cuda.mem_get_info()
+        return total - free
+
+    RaceWorlds("kidney", 4, device="cuda").close()  # what the first simulator of a process loads
+    before = used()
+    worlds = RaceWorlds("kidney", 4096, device="cuda")
+    estimate = memory_of_worlds(KIDNEY, PRESETS["easy"], 4096)
+    assert 0.5 * estimate < used() - before < 2.0 * estimate
+    worlds.close()
+
+
+# --- bad input ---
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+@pytest.mark.parametrize("device", ["cuda", "cuda:1"])
+@pytest.mark.parametrize("make", [RaceWorlds, DroneRacingEnv])
+def test_absent_cuda_is_named(make: type, device: str) -> None:
+    with pytest.raises(ValueError, match=rf"device='{device}': torch .*finds no CUDA device here.*device='cpu'"):
+        make("circle", device=device)
+
+
+def test_other_devices_are_refused() -> None:
+    for device in ("meta", "gpu"):
+        with pytest.raises(ValueError, match=f"device='{device}': worlds live on cpu or cuda"):
+            DroneRacingEnv("circle", device=device)
+
+
+def test_unknown_backend_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match="Unknown backend 'bullet': use auto, mujoco, mujoco_warp"):
+        RaceWorlds("circle", backend="bullet", from_pixels=False)
+
+
+@pytest.mark.parametrize("renderer", ["egl", "osmesa"])
+def test_a_renderer_the_backend_lacks_is_refused_by_name(renderer: str) -> None:
+    with pytest.raises(ValueError, match=rf"renderer='{renderer}'.*'mujoco_warp'.*renderer='auto' or 'warp'"):
+        RaceWorlds("circle", backend="mujoco_warp", renderer=renderer)
+
+
+def test_too_many_worlds_are_refused_before_anything_is_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mujoco_warp, "available_memory", lambda device: 1e9)
+    monkeypatch.setattr(mujoco_warp, "_make_bodies", lambda *arguments: pytest.fail("allocated"))
+    with pytest.raises(ValueError, match=r"num_envs=100,000 needs about 5.0 GB, and cpu has 1.0 GB left: at most"):
+        RaceWorlds("kidney", 100_000, backend="mujoco_warp")
+
+
+def test_memory_grows_with_worlds_and_images() -> None:
+    easy = PRESETS["easy"]
+    one, thousand = (memory_of_worlds(KIDNEY, easy, num) for num in (1, 1000))
+    assert thousand == 1000 * one
+    assert one > 64 * 64 * (4 + 3)  # the frame as it is drawn, and as it is given
+    assert memory_of_worlds(KIDNEY, easy, 1, images=False) < one / 10
+    assert memory_of_worlds(KIDNEY, easy, 1, Camera(width=128, height=128)) > 3 * one
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_the_hybrid_renderer_needs_cuda() -> None:
+    with pytest.raises(RendererUnavailableError, match="warp_cuda needs a CUDA device"):
+        RaceWorlds("circle", renderer="warp_cuda")
+
+
+@pytest.mark.gpu
+def test_the_hybrid_renderer_draws_the_same() -> None:
+    drawn = {}
+    for renderer in ("warp", "warp_cuda"):
+        simulator = on_mujoco(renderer=renderer)
+        drawn[renderer] = simulator.render().float()
+        simulator.close()
+    assert (drawn["warp"] - drawn["warp_cuda"]).abs().mean() < 0.5

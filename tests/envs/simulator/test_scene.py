@@ -1,0 +1,170 @@
+"""The scene: gates where the track says, the drone's exact mass properties, the camera's view."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from dreamer_racing.envs.drone.quadrotor import PRESETS, QuadrotorParameters
+from dreamer_racing.envs.simulator.scene import CAMERA_NAME, DRONE_GROUP, HALL_GROUP, Camera, build_scene
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, Track, load_track
+
+EASY = PRESETS["easy"]
+
+
+def compiled(
+    track: str | Track = "kidney", parameters: QuadrotorParameters = EASY, camera: Camera | None = None
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = build_scene(load_track(track), parameters, camera).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def first_hit(model: mujoco.MjModel, data: mujoco.MjData, origin, direction) -> tuple[str, float]:
+    """Name of the first geom of the hall along a ray, and its distance in m."""
+    groups, geom = np.zeros(6, np.uint8), np.zeros(1, np.int32)
+    groups[HALL_GROUP] = 1
+    origin, direction = np.asarray(origin, float), np.asarray(direction, float)
+    distance = mujoco.mj_ray(model, data, origin, direction, groups, 1, -1, geom)
+    return model.geom(geom[0]).name, distance
+
+
+def gate_point(gate: Gate, forward: float, left: float, up: float) -> np.ndarray:
+    """The point (3,) at an offset in a gate's own axes, m."""
+    return np.asarray(gate.position) + forward * np.array(gate.forward) + left * np.array(gate.left) + [0, 0, up]
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_gates_stand_where_the_track_says(name: str) -> None:
+    track = load_track(name)
+    model, data = compiled(name)
+    opening, outer, depth = track.shape.opening / 2, track.shape.outer / 2, track.shape.depth / 2
+    named = [(f"gate_{index}", gate) for index, gate in enumerate(track.gates)]
+    named += [(f"decoy_{index}", gate) for index, gate in enumerate(track.decoys)]
+    for geom, gate in named:
+        for side in (-1.0, 1.0):
+            for middle in ((0.0, side), (side, 0.0), (side, side)):
+                left, up = ((opening + outer) / 2 * offset for offset in middle)
+                hit, distance = first_hit(model, data, gate_point(gate, -0.3, left, up), gate.forward)
+                assert hit == geom
+                assert distance == pytest.approx(0.3 - depth, abs=1e-5)
+            for inside in (0.0, opening - 0.01):  # nothing of the gate stands in its opening
+                hit, distance = first_hit(model, data, gate_point(gate, -0.2, side * inside, inside), gate.forward)
+                assert hit != geom or distance > 0.4
+            start = gate_point(gate, -0.2, side * (outer + 0.005), 0.0)  # just past the frame
+            hit, distance = first_hit(model, data, start, gate.forward)
+            assert hit != geom or distance > 0.4
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_hall_is_the_bounding_box(name: str) -> None:
+    track = load_track(name)
+    model, data = compiled(name)
+    (x0, y0, _), (x1, y1, z1) = track.bounds_low, track.bounds_high
+    corner = np.array([x0 + 0.2, y0 + 0.3, z1 - 0.2])  # above the gates, clear of the yellow lines
+    expected = {
+        (1, 0, 0): ("wall_x+", x1 - corner[0]),
+        (-1, 0, 0): ("wall_x-", 0.2),
+        (0, 1, 0): ("wall_y+", y1 - corner[1]),
+        (0, -1, 0): ("wall_y-", 0.3),
+        (0, 0, 1): ("ceiling", 0.2),
+        (0, 0, -1): ("floor", corner[2]),
+    }
+    for direction, (geom, distance) in expected.items():
+        hit, measured = first_hit(model, data, corner, direction)
+        assert (hit, measured) == (geom, pytest.approx(distance, abs=1e-9))
+
+
+def test_lines_lie_on_the_floor() -> None:
+    track = load_track("circle")
+    model, data = compiled(track)
+    middle = (np.array(track.bounds_low) + np.array(track.bounds_high)) / 2
+    heights = []
+    for offset in np.arange(0.0, 3.0, 0.05):  # one spacing, in y, half a spacing from lines in x
+        origin = middle + np.array([0.75, offset, 0.0])
+        hit, distance = first_hit(model, data, origin, (0, 0, -1))
+        heights.append((hit, round(origin[2] - distance, 6)))
+    assert set(heights) == {("floor", 0.0), ("floor_lines", 0.02)}
+
+
+def test_mass_properties_are_exact() -> None:
+    parameters = dataclasses.replace(EASY, mass=0.7, inertia=(0.003, 0.002, 0.004))
+    model, _ = compiled("kidney", parameters)
+    drone = model.body("drone")
+    np.testing.assert_array_equal(drone.ipos, np.zeros(3))
+    np.testing.assert_array_equal(drone.iquat, [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(drone.inertia, parameters.inertia)
+    assert drone.mass.item() == 0.7
+    assert model.body_mass.sum() == 0.7  # nothing else moves or weighs
+    assert model.nv == 6
+
+
+def test_applied_forces_are_of_the_world_and_torques_of_the_body() -> None:
+    model, data = compiled()
+    rotated = np.array([0.5, 0.5, 0.5, 0.5])  # body x → world y → z → x
+    data.qpos[3:] = rotated
+    data.qfrc_applied[:] = (0.3, 0.2, 0.1 + 9.81 * EASY.mass, 0.01, 0.02, 0.03)
+    mujoco.mj_forward(model, data)
+    expected = np.concatenate((np.array((0.3, 0.2, 0.1)) / EASY.mass, np.array((0.01, 0.02, 0.03)) / EASY.inertia))
+    np.testing.assert_allclose(data.qacc, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_physics_options_are_those_of_the_parameters() -> None:
+    for preset, integrator in (
+        ("easy", mujoco.mjtIntegrator.mjINT_EULER),
+        ("faithful", mujoco.mjtIntegrator.mjINT_RK4),
+    ):
+        model, _ = compiled("kidney", PRESETS[preset])
+        assert model.opt.timestep == PRESETS[preset].physics_dt
+        assert model.opt.integrator == integrator
+        np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, -9.81])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 25.0])
+def test_camera_looks_along_body_x_tilted_up(tilt: float) -> None:
+    camera = Camera(tilt=tilt, field_of_view=80.0)
+    model, data = compiled("kidney", camera=camera)
+    data.qpos[:] = (1.0, 2.0, 1.5, 1.0, 0.0, 0.0, 0.0)
+    mujoco.mj_forward(model, data)
+    view = data.camera(CAMERA_NAME)
+    right, up, backwards = view.xmat.reshape(3, 3).T
+    angle = math.radians(tilt)
+    np.testing.assert_allclose(-backwards, [math.cos(angle), 0.0, math.sin(angle)], atol=1e-12)
+    np.testing.assert_allclose(right, [0.0, -1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(up, [-math.sin(angle), 0.0, math.cos(angle)], atol=1e-12)
+    np.testing.assert_allclose(view.xpos, np.array([1.0, 2.0, 1.5]) + camera.position, atol=1e-12)
+    assert model.camera(CAMERA_NAME).fovy.item() == 80.0
+
+
+def test_default_camera_is_tilted_by_25_degrees() -> None:
+    assert (Camera().tilt, Camera().width, Camera().height) == (25.0, 64, 64)
+
+
+def test_drone_is_drawn_in_a_group_of_its_own_and_touches_nothing() -> None:
+    model, _ = compiled()
+    drone = model.body("drone").id
+    assert set(model.geom_group[model.geom_bodyid == drone]) == {DRONE_GROUP}
+    assert set(model.geom_group[model.geom_bodyid != drone]) == {HALL_GROUP}
+    assert not model.geom_contype.any()
+    assert not model.geom_conaffinity.any()
+
+
+def test_gate_colours() -> None:
+    decoys = load_track("figure8_decoys")
+    painted = dataclasses.replace(decoys.gates[0], color=(0.0, 1.0, 0.0))
+    model, _ = compiled(dataclasses.replace(decoys, gates=(painted, *decoys.gates[1:])))
+
+    def color(name: str) -> np.ndarray:
+        return model.mat_rgba[model.geom(name).matid.item(), :3]
+
+    np.testing.assert_allclose(color("gate_0"), [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(color("decoy_0"), decoys.decoys[0].color, atol=1e-6)
+    assert not np.allclose(color("gate_1"), color("decoy_0"))
+
+
+def test_same_track_gives_the_same_scene() -> None:
+    one, other = (build_scene(load_track("kidney"), EASY).to_xml() for _ in range(2))
+    assert one == other

@@ -1,0 +1,373 @@
+"""The batched simulator: drones that do not know of each other, and renderers that agree."""
+
+import ctypes
+import logging
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
+from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
+from dreamer_racing.envs.simulator import MujocoSimulator, rendering
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.scene import DRONE_GROUP, Camera, build_scene
+from dreamer_racing.envs.tracks import load_track
+
+EASY = PRESETS["easy"]
+KIDNEY = load_track("kidney")
+
+
+def renderer_or_skip(name: str) -> str:
+    """The name, if the OpenGL library behind it loads here."""
+    libraries = rendering.GL_LIBRARIES.get(name, ())
+    for library in libraries:
+        try:
+            ctypes.CDLL(library)
+            return name
+        except OSError:
+            continue
+    if libraries:
+        pytest.skip(f"{name}: none of {', '.join(libraries)} on this machine")
+    return name
+
+
+def poses(num_envs: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (N, 3) in the hall, attitudes (N, 4), velocities (N, 3)."""
+    draw = torch.rand(num_envs, 9, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
+    position = draw[:, :3] * torch.tensor([6.0, 4.0, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
+    roll, pitch, yaw = (draw[:, 3:6] * torch.tensor([0.4, 0.4, math.pi])).unbind(1)
+    return position, from_roll_pitch_yaw(roll, pitch, yaw), draw[:, 6:] * 3
+
+
+def everyone(num_envs: int) -> Tensor:
+    return torch.ones(num_envs, dtype=torch.bool)
+
+
+def simulator(
+    num_envs: int, renderer: str | None = None, preset: str = "easy", seed: int = 0, **arguments
+) -> MujocoSimulator:
+    generator = torch.Generator().manual_seed(seed)
+    made = MujocoSimulator(KIDNEY, PRESETS[preset], num_envs, renderer=renderer, generator=generator, **arguments)
+    made.reset(everyone(num_envs), *poses(num_envs))
+    return made
+
+
+def actions(steps: int, num_envs: int, seed: int = 1) -> Tensor:
+    return torch.rand(steps, num_envs, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
+
+
+def snapshot(made: MujocoSimulator) -> Tensor:
+    state = made.state
+    return torch.cat((state.position, state.attitude, state.linear_velocity, state.body_rates), dim=1).clone()
+
+
+@pytest.mark.parametrize("num_threads", [1, 3])
+def test_drones_together_fly_as_each_alone(num_threads: int) -> None:
+    together = simulator(5, num_threads=num_threads)
+    commands = actions(20, 5)
+    paths = torch.stack([together.step(action) for action in commands])
+    for index in range(5):
+        alone = simulator(1)
+        alone.reset(everyone(1), *(values[index : index + 1] for values in poses(5)))
+        path = torch.stack([alone.step(action[index : index + 1]) for action in commands])
+        torch.testing.assert_close(path[:, :, 0], paths[:, :, index], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_path_holds_every_physics_step(preset: str) -> None:
+    made = simulator(3, preset=preset)
+    steps = PRESETS[preset].physics_steps
+    before = made.state.position.clone()
+    first = made.step(actions(1, 3)[0])
+    assert first.shape == (steps + 1, 3, 3)
+    torch.testing.assert_close(first[0], before, rtol=0, atol=0)
+    torch.testing.assert_close(first[-1], made.state.position, rtol=0, atol=0)
+    kept = first.clone()
+    second = made.step(actions(1, 3)[0])
+    torch.testing.assert_close(second[0], kept[-1], rtol=0, atol=0)
+    torch.testing.assert_close(first, kept, rtol=0, atol=0)  # a path is not overwritten by the next
+    assert (second.diff(dim=0).norm(dim=-1) > 0).all()
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_kernels_fly_what_torch_and_mujocos_own_step_fly(preset: str) -> None:
+    made = simulator(1, preset=preset)
+    parameters = PRESETS[preset]
+    model = build_scene(KIDNEY, parameters).compile()
+    data = mujoco.MjData(model)
+    position, attitude, velocity = poses(1)
+    data.qpos[:3], data.qpos[3:], data.qvel[:3] = position[0], attitude[0], velocity[0]
+    quadrotor = Quadrotor(parameters, 1, generator=torch.Generator().manual_seed(0))
+    quadrotor.reset(everyone(1))
+    views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.qfrc_applied)]
+    flight = Flight(quadrotor, *views, lambda: mujoco.mj_step(model, data))
+    for action in actions(10, 1):
+        path = made.step(action)
+        quadrotor.command(action)
+        for index in range(parameters.physics_steps):
+            flight.step(index)
+        np.testing.assert_allclose(path[-1, 0].numpy(), data.qpos[:3], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(made.quadrotor.rotor_speed, quadrotor.rotor_speed, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_partial_reset_leaves_the_others_untouched(preset: str) -> None:
+    mask = torch.tensor([False, True, False])
+    commands = actions(20, 3)
+    ends = []
+    for reset in (False, True):
+        made = simulator(3, preset=preset)
+        for action in commands[:10]:
+            made.step(action)
+        if reset:
+            made.reset(mask, *poses(3, seed=9))
+            torch.testing.assert_close(made.state.position[1], poses(3, seed=9)[0][1], rtol=0, atol=0)
+            assert not made.state.body_rates[1].any()
+        for action in commands[10:]:
+            made.step(action)
+        ends.append(snapshot(made))
+    assert torch.equal(ends[0][~mask], ends[1][~mask])
+    assert not torch.allclose(ends[0][mask], ends[1][mask])
+
+
+def test_reset_begins_the_same_flight_again() -> None:
+    made = simulator(2)
+    flights = []
+    for _ in range(2):
+        made.reset(everyone(2), *poses(2))
+        flights.append(torch.stack([made.step(action) for action in actions(10, 2)]))
+    assert torch.equal(*flights)
+
+
+def test_broken_state_of_one_drone_stays_its_own() -> None:
+    ends = []
+    for broken in (False, True):
+        made = simulator(3)
+        if broken:
+            made.state.body_rates[1] = 1e200
+        for action in actions(5, 3):
+            path = made.step(action)
+        ends.append(snapshot(made))
+    assert not path[:, 1].isfinite().all()  # seen by the race, not repaired by MuJoCo
+    assert torch.equal(ends[0][::2], ends[1][::2])
+    made.reset(torch.tensor([False, True, False]), *poses(3))
+    assert made.step(actions(1, 3)[0]).isfinite().all()
+
+
+# --- images ---
+
+
+def level(*yaws_degrees: float, position: tuple[float, float, float] = (0.0, -1.0, 1.35)) -> tuple[Tensor, ...]:
+    """Level drones at one place, at rest."""
+    yaw = torch.tensor(yaws_degrees, dtype=torch.float64).deg2rad()
+    zero = torch.zeros_like(yaw)
+    place = torch.tensor(position, dtype=torch.float64).repeat(len(yaw), 1)
+    return place, from_roll_pitch_yaw(zero, zero, yaw), torch.zeros_like(place)
+
+
+def images(renderer: str, start: tuple[Tensor, ...], **arguments) -> Tensor:
+    made = simulator(len(start[0]), renderer_or_skip(renderer), **arguments)
+    made.reset(everyone(len(start[0])), *start)
+    drawn = made.render()
+    made.close()
+    return drawn
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_images_are_upright(renderer: str) -> None:
+    drawn = images(renderer, level(0.0, 90.0, 180.0))
+    assert (drawn.shape, drawn.dtype) == ((3, 64, 64, 3), torch.uint8)
+    brightness = drawn.float().mean(-1)  # (N, rows, columns)
+    assert (brightness[:, :4].mean((1, 2)) > 170).all()  # the ceiling is bright
+    assert (brightness[:, -4:].mean((1, 2)) < 130).all()  # the floor is dark, but for its lines
+    assert (brightness[:, -12:].amin((1, 2)) < 60).all()
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_image_sizes_show_the_same(renderer: str) -> None:
+    """Every third pixel of a side three times as long looks along the same ray."""
+    start = poses(6, seed=3)
+    small, large = (images(renderer, start, camera=Camera(size, size)) for size in (32, 96))
+    assert (small.shape, large.shape) == ((6, 32, 32, 3), (6, 96, 96, 3))
+    same = (small.int() - large[:, 1::3, 1::3]).abs().amax(-1) <= 2
+    assert same.float().mean() > 0.97  # pixels on an edge may go either way
+    assert (small.int() - large[:, ::3, ::3]).abs().amax(-1).gt(2).float().mean() > 0.03
+
+
+def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
+    renderer_or_skip("osmesa")
+    poses = level(0.0, 90.0, 180.0)
+    torch.save(poses[:2], tmp_path / "poses.pt")
+    script = (  # PyOpenGL is bound to one platform for the life of a process, and this one may have taken EGL
+        "import sys, torch\n"
+        "from dreamer_racing.envs.simulator.scene import Camera, build_scene\n"
+        "from dreamer_racing.envs.simulator.rendering import make_renderer\n"
+        "from dreamer_racing.envs.drone.quadrotor import PRESETS\n"
+        "from dreamer_racing.envs.tracks import load_track\n"
+        "for size in (32, 64, 96):\n"
+        "    camera = Camera(size, size)\n"
+        "    model = build_scene(load_track('kidney'), PRESETS['easy'], camera).compile()\n"
+        "    renderer = make_renderer('osmesa', model, camera, 3, 2)\n"
+        "    torch.save(renderer.render(*torch.load('poses.pt')), f'images_{size}.pt')\n"
+        "    renderer.close()\n"
+    )
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYOPENGL_PLATFORM", "MUJOCO_GL")}
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, check=True, timeout=120)
+    for size in (32, 64, 96):
+        drawn, expected = torch.load(tmp_path / f"images_{size}.pt"), images("warp", poses, camera=Camera(size, size))
+        assert (drawn.float() - expected.float()).abs().mean() < 3.0
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_images_are_not_mirrored(renderer: str) -> None:
+    # level, in front of the first gate but to its right: the gate is in the image's left half
+    gate = KIDNEY.gates[0]
+    place = np.array(gate.position) - 3.0 * np.array(gate.forward) - 1.5 * np.array(gate.left)
+    (drawn,) = images(renderer, level(gate.yaw_degrees, position=tuple(place)))
+    red, green, blue = drawn.float().unbind(-1)
+    orange = ((red > 140) & (green < 100) & (blue < 60)).float()
+    assert orange[:, :32].sum() > 100
+    assert orange[:, :32].sum() > 3 * orange[:, 32:].sum()
+
+
+def test_image_shows_what_rays_hit() -> None:
+    """An oracle of its own: colours along rays cast by MuJoCo's C engine."""
+    camera = Camera()
+    made = simulator(1, renderer_or_skip("egl"))
+    (image,) = made.render().numpy()
+    made.close()
+    model = build_scene(KIDNEY, EASY, camera).compile()
+    data = mujoco.MjData(model)
+    position, attitude, _ = poses(1)
+    data.qpos[:3], data.qpos[3:] = position[0], attitude[0]
+    mujoco.mj_forward(model, data)
+    right, up, backwards = data.camera("nose").xmat.reshape(3, 3).T
+    hall = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+    agree = []
+    for row in range(2, 64, 6):
+        for column in range(2, 64, 6):
+            x, y = (column + 0.5) / 32 - 1, 1 - (row + 0.5) / 32  # 90° of view: tangents from -1 to 1
+            geom = np.zeros(1, np.int32)
+            mujoco.mj_ray(model, data, data.camera("nose").xpos, x * right + y * up - backwards, hall, 1, -1, geom)
+            color = model.mat_rgba[model.geom_matid[geom[0]], :3]
+            seen = image[row, column] / 255.0
+            # light scales a colour, so compare directions
+            agree.append(seen @ color / (np.linalg.norm(seen) * np.linalg.norm(color)) > 0.99)
+    assert np.mean(agree) > 0.9  # pixels on an edge may go either way
+
+
+def test_renderers_agree() -> None:
+    start = poses(6, seed=3)
+    opengl, cast = (images(renderer, start).float() for renderer in ("egl", "warp"))
+    difference = (opengl - cast).abs().mean((1, 2, 3))
+    assert difference.max() < 6.0, difference
+    assert (opengl[0] - cast[1]).abs().mean() > 20.0  # as far apart as images of different places are
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_drone_does_not_see_itself(renderer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(tilt=-60.0)  # down at its own arms
+    start = level(0.0, 120.0)
+    drawn = images(renderer, start, camera=camera)
+    bare = build_scene(KIDNEY, EASY, camera)
+    for geom in list(bare.body("drone").geoms):
+        assert geom.group == DRONE_GROUP
+        bare.delete(geom)
+    monkeypatch.setattr("dreamer_racing.envs.simulator.mujoco_cpu.build_scene", lambda *arguments: bare)
+    assert torch.equal(drawn, images(renderer, start, camera=camera))
+
+
+def test_nothing_hangs_in_mid_air() -> None:
+    """OpenGL draws the hall and nothing else: no sites, frames or cameras."""
+    renderer_or_skip("egl")
+    model = build_scene(KIDNEY, EASY).compile()
+    worker = rendering.OpenGLWorker("egl", model, Camera())
+    kinds = {worker._scene.geoms[index].objtype for index in range(worker._scene.ngeom)}
+    worker.close()
+    assert kinds == {int(mujoco.mjtObj.mjOBJ_GEOM)}
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -> None:
+    made = simulator(5, renderer_or_skip(renderer), num_threads=num_threads)
+    whole = made.render()
+    for mask in ([1, 0, 1, 1, 0], [0, 0, 0, 0, 1], [1] * 5, [0] * 5):
+        rows = torch.tensor(mask, dtype=torch.bool)
+        assert torch.equal(made.render(rows), whole[rows])
+    assert len({image.numpy().tobytes() for image in whole}) == 5
+    made.step(actions(1, 5)[0])
+    assert not torch.equal(made.render(), whole)  # and the first images were not overwritten in place
+    made.close()
+
+
+@pytest.mark.parametrize("renderer", ["egl", "warp"])
+def test_camera_size(renderer: str) -> None:
+    assert images(renderer, level(0.0), camera=Camera(width=40, height=24)).shape == (1, 24, 40, 3)
+
+
+def without(*libraries: str):
+    """A `ctypes.CDLL` that cannot find these."""
+    original = ctypes.CDLL
+
+    def load(name, *arguments, **keywords):
+        if name is not None and any(library in str(name) for library in libraries):
+            raise OSError(f"{name}: cannot open shared object file")
+        return original(name, *arguments, **keywords)
+
+    return load
+
+
+def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(rendering.ctypes, "CDLL", without("libEGL", "libOSMesa"))
+    with caplog.at_level(logging.INFO, logger=rendering.__name__):
+        made = simulator(2, "auto")
+    assert made.renderer is not None
+    assert made.renderer.name == "warp"
+    assert made.render().shape == (2, 64, 64, 3)
+    made.close()
+    assert "renderer: warp" in caplog.text
+    assert "egl needs libEGL.so.1, which is not installed (Debian: apt-get install libegl1" in caplog.text
+
+
+def test_renderer_that_was_asked_for_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering.ctypes, "CDLL", without("libEGL"))
+    with pytest.raises(RendererUnavailableError, match="egl needs libEGL.so.1"):
+        simulator(1, "egl")
+
+
+def test_opengl_that_does_not_start_is_a_reason_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: object) -> None:
+        raise RuntimeError("no device")
+
+    renderer_or_skip("egl")
+    monkeypatch.setattr(rendering, "OpenGLWorker", broken)
+    with pytest.raises(RendererUnavailableError, match=r"egl did not start \(RuntimeError: no device\)"):
+        simulator(1, "egl")
+
+
+def test_unknown_renderer_is_refused() -> None:
+    with pytest.raises(ValueError, match="Unknown renderer 'vulkan': use auto, egl, osmesa, warp, warp_cuda, or None"):
+        simulator(1, "vulkan")
+
+
+def test_without_a_renderer_there_are_no_images() -> None:
+    with pytest.raises(RuntimeError, match="renderer=None"):
+        simulator(1).render()
+
+
+def test_closing_twice_is_safe() -> None:
+    made = simulator(2, "auto")
+    made.close()
+    made.close()
+    with pytest.raises(RuntimeError):
+        made.render()

@@ -1,0 +1,412 @@
+"""The dm_control task: the same flights as the batched worlds, bit for bit, and the manners of the Control Suite."""
+
+import ctypes
+import gc
+import os
+import unittest
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from dm_env import StepType, test_utils
+from torchrl.envs import DMControlWrapper
+from torchrl.envs.utils import check_env_specs
+
+from dreamer_racing.envs import dm_control_env as task_module
+from dreamer_racing.envs import viewer
+from dreamer_racing.envs.dm_control_env import NoseCamera, load
+from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import Gate, Track, load_track, make_track
+from dreamer_racing.envs.worlds import RaceWorlds
+
+HOVER = np.array([-0.26407, 0.0, 0.0, 0.0], np.float32)
+STATE = ("position", "attitude", "linear_velocity", "body_rates")
+Policy = Callable[[int, dict[str, np.ndarray]], np.ndarray]
+
+STRAIGHT = make_track("straight", [Gate((0.0, 0.0, 1.35), 0.0), Gate((2.0, 0.0, 1.35), 0.0)], laps=1)
+
+
+def egl_or_skip() -> None:
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError as error:
+        pytest.skip(f"no EGL on this machine: {error}")
+
+
+def pilot(track: Track, speed: float = 2.5) -> Policy:
+    """A plain controller: velocity towards the target gate's centre, thrust vector by attitude, yaw as it comes."""
+    gates = track.gate_positions(dtype=torch.float64)
+
+    def act(step: int, observation: dict[str, np.ndarray]) -> np.ndarray:
+        position, attitude, velocity, _ = (torch.from_numpy(observation[name]) for name in STATE)
+        to_gate = gates[int(observation["target_gate"][0])] - position
+        thrust = 3.0 * (speed * to_gate / to_gate.norm() - velocity) + torch.tensor([0.0, 0.0, 9.81])
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        rates = 8.0 * torch.linalg.cross(up, rotate_inverse(attitude, thrust / thrust.norm()))
+        collective = thrust @ rotate(attitude, up)
+        return torch.tensor([collective / 13.33 - 1.0, rates[0] / 10, rates[1] / 10, 0.0]).float().numpy()
+
+    return act
+
+
+@pytest.fixture(autouse=True)
+def free_contexts() -> Iterator[None]:
+    """Free dm_control's OpenGL contexts here: their finalisers raise, which Python 3.11 cannot bear amid parsing."""
+    yield
+    gc.collect()
+
+
+def wild(step: int, observation: dict[str, np.ndarray]) -> np.ndarray:
+    return np.random.RandomState(step).uniform(-1.2, 1.2, 4).astype(np.float32)
+
+
+def fall(step: int, observation: dict[str, np.ndarray]) -> np.ndarray:
+    return np.array([-1.0, 0.1, 0.0, 0.0], np.float32)
+
+
+def compare(env, worlds: RaceWorlds, time_step, policy: Policy, steps: int) -> list:
+    """Fly both from where they are; every state, reward and ending must agree. Returns the worlds' outcomes."""
+    outcomes = []
+    for step in range(steps):
+        action = policy(step, time_step.observation)
+        time_step = env.step(action)
+        rows = np.stack([action] + [-action] * (worlds.num_envs - 1))
+        outcome = worlds.step(torch.from_numpy(rows))
+        outcomes.append(outcome)
+        for name in STATE:
+            expected = getattr(worlds.simulator.state, name)[0].numpy()
+            np.testing.assert_allclose(time_step.observation[name], expected, rtol=0, atol=1e-9)
+        assert time_step.observation["target_gate"].item() == outcome.target_gate[0].item()
+        weight = env.task.body_rate_weight
+        reward = (outcome.reward_base - weight * outcome.body_rate_norm)[0].item()
+        assert time_step.reward == pytest.approx(reward, abs=1e-9)
+        ended = outcome.terminated[0].item() or outcome.truncated[0].item()
+        assert time_step.last() == ended
+        assert time_step.discount == (0.0 if outcome.terminated[0] else 1.0)
+        if ended:
+            break
+    return outcomes
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+@pytest.mark.parametrize("policy", [wild, fall], ids=["wild", "fall"])
+def test_flies_as_the_batched_worlds_episode_after_episode(preset: str, policy: Policy) -> None:
+    weights = RewardWeights(body_rate=0.01)
+    env = load("kidney", preset, random=7, time_limit=1.0, weights=weights)
+    worlds = RaceWorlds("kidney", 1, preset, from_pixels=False, episode_steps=50, weights=weights)
+    random = np.random.RandomState(7)
+    endings = set()
+    for _ in range(3):
+        worlds.seed(int(random.randint(2**31)))  # what the task does in each episode
+        worlds.reset()
+        time_step = env.reset()
+        np.testing.assert_array_equal(time_step.observation["position"], worlds.simulator.state.position[0].numpy())
+        outcomes = compare(env, worlds, time_step, policy, 60)
+        endings.add((outcomes[-1].terminated.item(), outcomes[-1].truncated.item()))
+    assert endings <= {(True, False), (False, True)}
+    if policy is fall:
+        assert endings == {(True, False)}
+
+
+def test_flies_gates_as_the_batched_worlds() -> None:
+    track = load_track("circle")
+    env = load(track, evaluation=True)
+    worlds = RaceWorlds(track, 1, evaluation=True, from_pixels=False)
+    worlds.reset()
+    outcomes = compare(env, worlds, env.reset(), pilot(track), 300)
+    assert outcomes[-1].gates_passed.item() >= 2
+    assert len(outcomes) == 300  # no crash
+
+
+def test_flies_as_one_of_several_worlds() -> None:
+    env = load("figure8", random=3)
+    worlds = RaceWorlds("figure8", 3, from_pixels=False)
+    time_step = env.reset()
+    start = [torch.from_numpy(time_step.observation[name]).repeat(3, 1) for name in STATE[:3]]
+    everyone = torch.ones(3, dtype=torch.bool)
+    worlds.simulator.reset(everyone, *start)
+    worlds.race.begin(everyone, start[0], torch.from_numpy(time_step.observation["target_gate"]).repeat(3))
+    assert len(compare(env, worlds, time_step, wild, 25)) > 5
+
+
+def test_finishing_the_last_lap_truncates() -> None:
+    env = load(STRAIGHT, evaluation=True)
+    time_step, fly = env.reset(), pilot(STRAIGHT)
+    for step in range(300):
+        time_step = env.step(fly(step, time_step.observation))
+        if time_step.last():
+            break
+    assert time_step.last()
+    assert time_step.discount == 1.0
+    assert time_step.reward == 10.0
+    assert env.task.outcome.finished.item()
+    assert env.task.outcome.lap_time.item() == pytest.approx((step + 1) * 0.02)
+
+
+def test_time_limit_truncates_and_the_next_step_begins_an_episode() -> None:
+    env = load("circle", evaluation=True, time_limit=0.1)
+    env.reset()
+    steps = [env.step(HOVER) for _ in range(6)]
+    assert [step.step_type for step in steps] == [StepType.MID] * 4 + [StepType.LAST, StepType.FIRST]
+    assert steps[4].discount == 1.0
+    assert env.control_timestep() == pytest.approx(0.02)
+    assert env.physics.time() == 0.0
+
+
+def test_crash_in_the_last_step_is_a_crash() -> None:
+    env = load("circle", evaluation=True, time_limit=0.02)
+    env.reset()
+    time_step = env.step(np.full(4, np.nan))
+    assert time_step.last()
+    assert time_step.discount == 0.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_action_that_is_not_finite_is_a_crash(value: float) -> None:
+    env = load("circle", random=0)
+    env.reset()
+    time_step = env.step(np.array([0.0, value, 0.0, 0.0]))
+    assert time_step.last()
+    assert (time_step.discount, time_step.reward) == (0.0, -4.0)
+    assert env.task.outcome.crash.item() == CrashCause.INVALID_ACTION
+    assert all(np.isfinite(values).all() for values in time_step.observation.values())
+    assert not env.reset().last()
+
+
+def test_diverged_physics_is_a_crash_and_not_an_exception() -> None:
+    env = load("circle", random=0)
+    env.reset()
+    env.physics.data.qvel[3:] = 1e200
+    time_step = env.step(HOVER)
+    assert (time_step.last(), time_step.discount, time_step.reward) == (True, 0.0, -4.0)
+    assert env.task.outcome.crash.item() == CrashCause.NON_FINITE_STATE
+    assert np.isfinite(env.reset().observation["position"]).all()
+    assert not env.step(HOVER).last()
+
+
+def test_actions_beyond_the_bounds_are_clipped() -> None:
+    env = load("circle", evaluation=True)
+    ends = []
+    for scale in (1.0, 5.0):
+        env.reset()
+        ends.append(env.step(scale * np.array([1.0, -1.0, 1.0, 1.0])).observation["attitude"])
+    np.testing.assert_array_equal(*ends)
+
+
+def test_wrong_action_shape_is_explained() -> None:
+    env = load("circle")
+    env.reset()
+    with pytest.raises(
+        ValueError, match=r"shape \(3,\): this environment takes one of shape \(4,\): collective thrust"
+    ):
+        env.step(np.zeros(3))
+
+
+def test_time_limit_of_less_than_a_step_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"time_limit=0\.001 s"):
+        load("circle", time_limit=0.001)
+
+
+def test_seeds_reproduce_and_differ() -> None:
+    def starts(seed: int) -> np.ndarray:
+        env = load("split_s", "faithful", random=seed)
+        rows = []
+        for _ in range(2):
+            env.reset()
+            rows.append(env.step(HOVER).observation["linear_velocity"])  # depends on the drawn mass too
+        return np.stack(rows)
+
+    first = starts(0)
+    np.testing.assert_array_equal(first, starts(0))
+    assert not np.allclose(first, starts(1))
+    assert not np.allclose(first[0], first[1])
+
+
+def test_episodes_of_the_faithful_preset_have_drones_of_their_own() -> None:
+    env = load("circle", "faithful", random=0)
+    masses = set()
+    for _ in range(3):
+        env.reset()
+        masses.add(env.physics.quadrotor._drones.mass.item())
+    assert len(masses) == 3
+
+
+def test_rotors_start_at_hover_in_every_episode() -> None:
+    env = load("circle", evaluation=True)
+    env.reset()
+    for _ in range(10):
+        env.step(np.ones(4))
+    env.reset()
+    height = env.physics.position()[2]
+    for _ in range(50):
+        time_step = env.step(HOVER)
+    assert time_step.observation["position"][2] == pytest.approx(height, abs=1e-3)
+
+
+class TestSuiteManners(test_utils.EnvironmentTestMixin, unittest.TestCase):
+    """dm_env's own conformance tests."""
+
+    def make_object_under_test(self):
+        return load("kidney", random=0, time_limit=1.0)
+
+    def make_action_sequence(self):
+        return [HOVER] * 120
+
+
+def test_observations_match_their_specs() -> None:
+    env = load("kidney", random=0)
+    spec, observation = env.observation_spec(), env.reset().observation
+    assert list(spec) == list(observation) == [*STATE, "target_gate"]
+    for name, values in observation.items():
+        spec[name].validate(values)
+    action = env.action_spec()
+    assert (action.shape, action.dtype) == ((4,), np.float32)
+    assert (action.minimum.min(), action.maximum.max()) == (-1.0, 1.0)
+    flat = load("kidney", random=0, environment_kwargs={"flat_observation": True})
+    assert flat.reset().observation["observations"].shape == (14,)
+
+
+def test_observations_are_copies() -> None:
+    env = load("kidney", random=0)
+    before = env.reset().observation
+    kept = {name: values.copy() for name, values in before.items()}
+    env.step(np.ones(4))
+    for name, values in kept.items():
+        np.testing.assert_array_equal(before[name], values)
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    error = np.square(one.astype(float) - other.astype(float)).mean()
+    return 10 * np.log10(255**2 / max(error, 1e-9))
+
+
+@pytest.mark.parametrize(("renderer", "least"), [("egl", 45.0), ("warp", 26.0)])
+def test_pixels_are_those_of_the_batched_renderer(renderer: str, least: float) -> None:
+    egl_or_skip()
+    env = load("kidney", random=0, from_pixels=True)
+    worlds = RaceWorlds("kidney", 1, renderer=renderer)
+    random = np.random.RandomState(0)
+    for _ in range(3):
+        worlds.seed(int(random.randint(2**31)))
+        worlds.reset()
+        pixels = env.reset().observation["pixels"]
+        assert (pixels.shape, pixels.dtype) == ((64, 64, 3), np.uint8)
+        assert psnr(pixels, worlds.render()[0].numpy()) > least
+    action = np.array([0.2, 0.3, -0.2, 0.5], np.float32)
+    for _ in range(5):
+        flown = env.step(action).observation["pixels"]
+        worlds.step(torch.from_numpy(action).unsqueeze(0))
+    assert psnr(flown, worlds.render()[0].numpy()) > least
+    assert psnr(flown, pixels) < 25.0  # the camera did move, and the first image was not overwritten
+    worlds.close()
+
+
+def test_viewer_style_loop_renders_any_size_and_the_drone_from_outside() -> None:
+    egl_or_skip()
+    env = load("kidney", random=0, from_pixels=True)
+    env.reset()
+    nose = env.step(HOVER).observation["pixels"]
+    assert env.physics.render(480, 640, camera_id="nose").shape == (480, 640, 3)
+    assert env.physics.render(camera_id=-1).std() > 1.0
+    segments = env.physics.render(480, 640, camera_id="spectator", segmentation=True)[..., 0]
+    drone = np.flatnonzero(env.physics.model.geom_bodyid == env.physics.model.name2id("drone", "body"))
+    rows, columns = np.isin(segments, drone).nonzero()
+    assert len(rows) >= 3
+    assert abs(rows.mean() - 240) < 10  # the spectator looks at the drone
+    assert abs(columns.mean() - 320) < 10
+    np.testing.assert_array_equal(env.task._view.image(), nose)  # whose own view other cameras leave alone
+
+
+def test_missing_opengl_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: object) -> None:
+        raise RuntimeError("No OpenGL rendering backend is available.")
+
+    monkeypatch.setattr(task_module.mujoco, "Camera", broken)
+    with pytest.raises(RendererUnavailableError, match="No OpenGL rendering backend.*libegl1.*MUJOCO_GL=egl"):
+        NoseCamera(load("circle").physics, Camera())
+
+
+@pytest.mark.parametrize(
+    ("environment", "libraries", "chosen"),
+    [
+        ({}, ("libEGL.so.1",), "egl"),
+        ({}, ("libOSMesa.so.6",), "osmesa"),
+        ({}, (), "disable"),
+        ({"DISPLAY": ":0"}, ("libEGL.so.1",), None),
+        ({"MUJOCO_GL": "osmesa"}, ("libEGL.so.1",), "osmesa"),
+    ],
+)
+def test_headless_backend_choice(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], libraries: tuple[str, ...], chosen: str | None
+) -> None:
+    def open_library(name: str) -> None:
+        if name not in libraries:
+            raise OSError(name)
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.setenv(name, "")  # remembers what was there, or that nothing was
+        monkeypatch.delenv(name)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(task_module.sys, "platform", "linux")
+    monkeypatch.setattr(task_module.ctypes, "CDLL", open_library)
+    task_module._choose_gl_backend()
+    assert os.environ.get("MUJOCO_GL") == chosen
+
+
+@pytest.mark.parametrize("from_pixels", [False, True])
+def test_torchrl_wraps_it(from_pixels: bool) -> None:
+    if from_pixels:
+        egl_or_skip()
+    env = DMControlWrapper(load("circle", random=0, time_limit=0.2, from_pixels=from_pixels))
+    check_env_specs(env, seed=0)
+    env.set_seed(5)
+    first = env.rollout(5)
+    env.set_seed(5)
+    again = env.reset()
+    torch.testing.assert_close(first["position"][0], again["position"])
+    long = env.rollout(15, policy=lambda *observation: torch.from_numpy(HOVER))
+    assert len(long) == 10
+    assert long["next", "truncated"][-1].item()
+    assert not long["next", "terminated"].any()
+
+
+def test_viewer_without_display_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    with pytest.raises(viewer.ViewerUnavailableError, match="no display.*ssh -X") as caught:
+        viewer.check_viewer({})
+    assert "\n" not in str(caught.value)
+    with pytest.raises(viewer.ViewerUnavailableError, match="MUJOCO_GL=egl chooses drawing without a window"):
+        viewer.check_viewer({"DISPLAY": ":0", "MUJOCO_GL": "egl"})
+
+
+def test_viewer_without_opengl_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.setattr(viewer, "_loads", lambda library: False)
+    with pytest.raises(viewer.ViewerUnavailableError, match="no OpenGL library libGL"):
+        viewer.check_viewer({"DISPLAY": ":0"})
+
+
+def test_viewer_gets_the_environment_and_a_hovering_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    launched = []
+    monkeypatch.setattr(viewer, "check_viewer", lambda: None)
+    monkeypatch.setattr("dm_control.viewer.launch", lambda env, policy: launched.append((env, policy)))
+    viewer.view("circle", replace(PRESETS["easy"], physics_dt=0.004), random=0)
+    env, policy = launched[0]
+    time_step = env.reset()
+    for _ in range(3):
+        time_step = env.step(policy(time_step))
+    assert not time_step.last()
+
+
+def test_another_control_rate() -> None:
+    env = load("circle", random=0, control_rate=25)
+    assert env.control_timestep() == pytest.approx(0.04)
+    assert env.task.race.episode_steps == 500

@@ -1,0 +1,132 @@
+"""The evaluation protocol: conditions change the race as they say, and every episode is counted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from PIL import Image
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.evaluation.evaluate import CRASHES
+from dreamer_racing.evaluation.lesions import Intact, LesionedPolicy
+from dreamer_racing.evaluation.protocol import (
+    CONDITIONS,
+    MODES,
+    PRESETS,
+    Condition,
+    crashes_in_words,
+    fly,
+    results_table,
+    run_protocol,
+)
+from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
+from dreamer_racing.provenance import command_line, git_commit, provenance
+
+WORLDS = {"track": "circle", "from_pixels": False, "num_threads": 1}
+
+
+class Falling(torch.nn.Module):
+    """Cuts the motors when deterministic; sideways otherwise."""
+
+    deterministic = True
+
+    def make_primer(self) -> TensorDictPrimer:
+        return TensorDictPrimer({"memory": Unbounded(shape=(1,))}, default_value=0.0, expand_specs=True)
+
+    def forward(self, tensordict):
+        action = torch.zeros(*tensordict.batch_size, 4)
+        action[:, 0] = -1.0 if self.deterministic else 1.0
+        return tensordict.set("action", action).set(("next", "memory"), tensordict["memory"])
+
+
+def by_name(name: str) -> Condition:
+    return next(condition for condition in CONDITIONS if condition.name == name)
+
+
+def test_the_conditions_of_the_protocol():
+    assert [condition.name for condition in CONDITIONS] == [
+        "nominal",
+        "start_noise",
+        "camera_tilt",
+        "gate_displacement",
+    ]
+    (nominal,) = by_name("nominal").races(load_track("circle"), seed=3)
+    assert nominal == {"track": load_track("circle"), "start_noise": 0.0, "looks": None, "seed": 3}
+
+
+def test_displaced_tracks_are_all_different_and_follow_the_seed():
+    condition, track = by_name("gate_displacement"), load_track("circle")
+    races = [race["track"] for race in condition.races(track, seed=0)]
+    assert len(races) == condition.num_tracks == len({race.gates for race in races})
+    assert races == [race["track"] for race in condition.races(track, seed=0)]
+
+
+def test_camera_tilt_varies_and_no_other_look_does():
+    (race,) = by_name("camera_tilt").races(load_track("circle"), seed=0)
+    env = DroneRacingEnv(num_envs=100, evaluation=True, num_threads=1, renderer="warp", **race)
+    env.reset()
+    looks = env.worlds.simulator.looks.looks
+    tilt = looks.camera_tilt
+    assert 20.0 <= tilt.min() < 20.6 and 29.4 < tilt.max() <= 30.0
+    assert (looks.field_of_view == 90.0).all() and (looks.colors == looks.colors[0]).all()
+    env.close()
+
+
+def test_every_condition_is_flown_by_both_policies():
+    displaced = dataclasses.replace(by_name("gate_displacement"), num_tracks=3)
+    conditions = (by_name("nominal"), by_name("camera_tilt"), displaced)
+    results = list(run_protocol(Falling(), WORLDS, episodes=5, conditions=conditions, num_envs=5))
+    flown = [(result.preset, result.condition, result.mode) for result in results]
+    blind = ("nominal", "gate_displacement")  # there is no camera here
+    assert flown == [(preset, name, mode) for preset in PRESETS for name in blind for mode in MODES]
+    for result in results:
+        record = result.to_dict()
+        assert "episodes" not in record and record["num_episodes"] == len(result.evaluation.episodes) == 5
+        outcome = "ground" if result.mode == "deterministic" else "out_of_bounds"
+        assert record["crashes"] == dict.fromkeys(CRASHES, 0) | {outcome: 5}
+        assert record["crashes_by_gate"][outcome] == [5, 0, 0, 0]
+
+
+def test_both_policies_meet_the_same_starts():
+    (race,) = by_name("start_noise").races(load_track("circle"), seed=1)
+    first, second = (
+        fly(Falling(), WORLDS | race, 5, deterministic, num_envs=5, num_trajectories=5)
+        for deterministic in (True, False)
+    )
+    starts = torch.stack([flight.position[0] for flight in first.trajectories])
+    assert torch.equal(starts, torch.stack([flight.position[0] for flight in second.trajectories]))
+    assert starts.std(0).min() > 0.1
+
+
+def test_table_and_plots(tmp_path):
+    results = list(run_protocol(Falling(), WORLDS, episodes=2, conditions=CONDITIONS[:1], num_envs=2))
+    table = results_table(results).splitlines()
+    assert table[0].startswith("| physics | condition | policy | success | gates | best lap (s) ")
+    assert len(table) == 2 + 4 and table[2].startswith("| easy | nominal | deterministic | 0% | 0.00 | – | – |")
+    assert crashes_in_words(results[0].evaluation) == "ground: 2 at gate 1"
+    assert results_table(results, "images").splitlines()[0].startswith("| physics | images |")
+    plot_conditions(results, tmp_path / "conditions.png", "title")
+    plot_crashes({"a": results[0].evaluation, "b": results[1].evaluation}, tmp_path / "new" / "crashes.png")
+    for path in (tmp_path / "conditions.png", tmp_path / "new" / "crashes.png"):
+        with Image.open(path) as image:
+            assert image.width == 1350
+
+
+def test_a_lesioned_policy_is_flown_like_any_other():
+    worlds = {"track": "circle", "num_threads": 1, "renderer": "warp", "episode_steps": 5}
+    result = fly(LesionedPolicy(Falling(), Intact()), worlds, 1, deterministic=True)
+    assert result.episodes[0].length == 5
+
+
+def test_provenance(tmp_path, monkeypatch):
+    facts = provenance()
+    assert {"machine", "gpu", "python", "torch", "torchrl", "mujoco", "commit"} <= set(facts)
+    assert git_commit(tmp_path) is None  # no repository
+    monkeypatch.setattr("sys.argv", ["recipes/evaluate.py", "run_dir=a b"])
+    assert command_line() == "python recipes/evaluate.py 'run_dir=a b'"
+    monkeypatch.setenv("PATH", str(tmp_path))  # no git
+    assert git_commit(tmp_path) is None

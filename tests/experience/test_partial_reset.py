@@ -1,0 +1,100 @@
+"""Partial resets: what is seen after them is what TorchRL's own merge gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+
+
+class StockSteps(DroneRacingEnv):
+    """The environment with TorchRL's resets between steps."""
+
+    maybe_reset = EnvBase.maybe_reset
+
+
+def make(kind: type[DroneRacingEnv] = DroneRacingEnv, **settings: Any) -> DroneRacingEnv:
+    return kind("kidney", 4, seed=3, **{"privileged": False, "renderer": "warp", "num_threads": 1, **settings})
+
+
+def flight(env: EnvBase, steps: int = 12) -> list[TensorDict]:
+    """Step with partial resets, from the same seed, with a policy that remembers."""
+    torch.manual_seed(0)
+    data, flown = env.reset(), []
+    for _ in range(steps):
+        data.set("action", torch.rand(4, 4) * 2 - 1)
+        data.set("noise", torch.rand(4))
+        data.set(("next", "memory"), torch.rand(4, 2, 3))
+        data.set(("next", "agent", "age"), torch.rand(4, 1))
+        step, data = env.step_and_maybe_reset(data)
+        flown += [step.clone(), data.clone()]
+    return flown
+
+
+def assert_same_flights(ours: EnvBase, stock: EnvBase) -> None:
+    partial = 0
+    for one, other in zip(flight(ours, 60), flight(stock, 60), strict=True):
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
+        assert (one == other).all()
+        done = one.get(("next", "done"), torch.zeros(4, 1, dtype=torch.bool))
+        partial += bool(done.any() and not done.all())
+    assert partial
+    ours.close()
+    stock.close()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"from_pixels": False},
+        {"from_pixels": False, "privileged": True},
+        {"from_pixels": False, "backend": "mujoco_warp"},
+        {},
+        {"privileged": True},
+        {"looks": "randomised"},
+    ],
+    ids=str,
+)
+def test_steps_are_those_of_torchrl(settings: dict[str, Any]) -> None:
+    assert_same_flights(make(**settings), make(StockSteps, **settings))
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_where_all_episodes_end_at_once_a_policys_keys_are_zero_too(num_envs: int) -> None:
+    env = DroneRacingEnv("kidney", num_envs, from_pixels=False, privileged=False, seed=3, episode_steps=2)
+    data = env.reset().set("memory", torch.ones(num_envs, 2))
+    for _ in range(2):
+        data.set("action", torch.zeros(num_envs, 4))
+        step, data = env.step_and_maybe_reset(data)
+    assert step["next", "truncated"].all() and step["memory"].all()
+    assert not data["memory"].any() and not data["done"].any()
+    assert torch.equal(data["vector"], env.worlds.vector())
+
+
+def test_a_callers_own_data_is_reset_by_torchrl() -> None:
+    env = make()
+    data = env.reset().exclude("pixels").set("done", torch.tensor([[True], [False], [True], [False]]))
+    assert not env.maybe_reset(data)["done"].any()
+    env.close()
+
+
+def test_images_are_those_of_torchrls_merge() -> None:
+    assert_same_flights(TransformedPixelEnv(make(), InitTracker()), TransformedEnv(make(), InitTracker()))
+
+
+def test_the_step_before_keeps_its_images() -> None:
+    env = TransformedPixelEnv(make(), InitTracker())
+    step = env.rand_step(env.reset())
+    kept = step["next", "pixels"].clone()
+    root = step["next"].clone(False).set("_reset", torch.tensor([[True], [False], [True], [False]]))
+    merged = env.reset(root)["pixels"]
+    assert torch.equal(step["next", "pixels"], kept)
+    assert torch.equal(merged[1::2], kept[1::2])
+    assert (merged[::2] != kept[::2]).flatten(1).any(1).all()
+    env.close()

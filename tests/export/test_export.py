@@ -1,0 +1,603 @@
+"""Export: the copies fly as the policy does, a copy that does not is refused, and the flight side needs no torch."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.actor_step import (
+    ActorStep,
+    MissingPackagesError,
+    SampledActorStep,
+    check_output,
+    export_actor,
+    make_step,
+    onnx_actor,
+)
+from dreamer_racing.export.actor_step import actor_step as export
+from dreamer_racing.export.contract import hash_weights, make_contract
+from dreamer_racing.export.parity import (
+    MIN_STEPS,
+    Flight,
+    ParityError,
+    TorchActor,
+    check_parity,
+    episode_steps,
+    record_flight,
+)
+from dreamer_racing.export.shipped_agent import load_agent
+from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules import Interface, ModelSize, get_size
+from dreamer_racing.modules.rssm import mix_uniform
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+
+ROOT = Path(__file__).parents[2]
+REFERENCE = ModelSize("tiny", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4, blocks=4)
+"""The 2025 architecture: block GRU, RMS norm, max-pool."""
+LEARNED = ModelSize("tiny_learned", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4,
+                    recurrence="dense", norm="layer", learned_initial=True, strided=True)  # fmt: skip
+"""The 2023 architecture: dense GRU, layer norm, a learned initial state."""
+
+
+def make_agent(size: ModelSize | str = "debug", interface: Interface | None = None, seed: int = 0) -> Agent:
+    """An agent of random weights, all of which matter: an untrained actor's last layer is nearly zero."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        agent = Agent(get_size(size), interface or Interface(), decode=False)
+        with torch.no_grad():
+            for parameter in agent.actor.mlp.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+            agent.world_model.rssm.initial_belief.add_(torch.randn_like(agent.world_model.rssm.initial_belief))
+    return agent.requires_grad_(False)
+
+
+def contract_of(step: ActorStep) -> dict:
+    return make_contract(step, PRESETS["easy"], Camera(), checkpoint="checkpoint-1", track="circle", preset="easy")
+
+
+def make_flight(agent: Agent, steps: int = MIN_STEPS) -> Flight:
+    """Observations that nobody flew, with a reset in every 40 steps and two next to each other."""
+    random = np.random.default_rng(0)
+    interface = agent.interface
+    observations = (
+        random.integers(0, 256, (steps, 64, 64, 3), np.uint8)
+        if interface.pixels
+        else random.normal(size=(steps, interface.vector_dim)).astype(np.float32)
+    )
+    is_init = np.arange(steps) % 40 == 0
+    is_init[121] = True
+    return Flight(observations, is_init, np.zeros((steps, interface.action_dim), np.float32))
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    return make_agent()
+
+
+@pytest.fixture(scope="module", params=["mode", "sample"])
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, agent: Agent) -> Path:
+    """The .onnx file of an export of either latent mode."""
+    output = tmp_path_factory.mktemp(request.param) / "actor.onnx"
+    step = make_step(agent, request.param)
+    export_actor(step, contract_of(step), make_flight(agent), output)
+    return output
+
+
+# --- the step ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_step_flies_as_the_policy_did(agent: Agent) -> None:
+    env = DroneRacingEnv("circle", 1, seed=0, episode_steps=episode_steps(MIN_STEPS), num_threads=1)
+    flight = record_flight(env, agent, MIN_STEPS)
+    env.close()
+    assert flight.observations.shape == (MIN_STEPS, 64, 64, 3) and flight.observations.dtype == np.uint8
+    assert flight.is_init[0] and flight.episodes >= 4
+    assert flight.observations.std(axis=0).max() > 0, "the drone saw the same image all the time"
+    step = ActorStep(agent)
+    actor = TorchActor(contract_of(step), step)
+    for index, observation in enumerate(flight.observations):
+        if flight.is_init[index]:
+            actor.reset()
+        np.testing.assert_allclose(actor.step(observation), flight.actions[index], atol=1e-6)
+
+
+@pytest.mark.parametrize("step_class", [ActorStep, SampledActorStep])
+@pytest.mark.parametrize("size", ["debug", LEARNED], ids=["zero", "learned"])
+def test_a_reset_forgets_everything(size: ModelSize | str, step_class: type[ActorStep]) -> None:
+    step = step_class(make_agent(size))
+    inputs = step.example_inputs()
+    garbage = {name: torch.full_like(inputs[name], math.nan) for name in ("h", "z", "previous_action")}
+    for clean, dirty in zip(step(*inputs.values()), step(*(inputs | garbage).values()), strict=True):
+        torch.testing.assert_close(clean, dirty, rtol=0, atol=0)
+    kept = step(*(inputs | {"h": torch.ones_like(inputs["h"]), "is_init": torch.tensor([False])}).values())
+    assert not torch.equal(kept[1], step(*inputs.values())[1])
+
+
+def test_a_sample_is_the_gumbel_maximum_of_the_posterior(agent: Agent) -> None:
+    step, count = SampledActorStep(agent), 4000
+    inputs = {name: value.expand(count, *value.shape[1:]) for name, value in step.example_inputs().items()}
+    noise = torch.rand(count, *step.noise_shape, generator=torch.Generator().manual_seed(0))
+    z = step(*(inputs | {"noise": noise}).values())[2].unflatten(-1, step.noise_shape)
+    posterior = agent.world_model.observe(
+        {"pixels": torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8)},
+        torch.zeros(1, 1, 4),
+        torch.ones(1, 1, dtype=torch.bool),
+    )
+    probabilities = mix_uniform(posterior.posterior_logits[0, 0], agent.world_model.rssm.unimix).double()
+    expected = (probabilities.log() - (-noise.double().log()).log()).argmax(-1)
+    assert torch.equal(z.argmax(-1), expected) and torch.equal(z.sum(-1), torch.ones(count, 4))
+    # The training policy samples this distribution by another method: five standard deviations.
+    deviation = (probabilities * (1 - probabilities) / count).sqrt()
+    assert ((z.double().mean(0) - probabilities).abs() < 5 * deviation).all()
+
+
+def test_noise_of_zero_is_no_accident(agent: Agent) -> None:
+    step = SampledActorStep(agent)
+    noise = torch.zeros(1, *step.noise_shape)
+    noise[..., 2] = 0.5
+    z = step(*(step.example_inputs() | {"noise": noise}).values())[2].unflatten(-1, step.noise_shape)
+    assert z.isfinite().all() and torch.equal(z.argmax(-1), torch.full((1, 4), 2))
+
+
+# --- the copies -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("latent", ["mode", "sample"])
+@pytest.mark.parametrize(
+    ("size", "interface"),
+    [(REFERENCE, Interface()), (LEARNED, Interface()), ("debug", Interface(pixels=False, vector_dim=21))],
+    ids=["block", "learned", "vector"],
+)
+def test_every_architecture_flies_alike(
+    size: ModelSize | str, interface: Interface, latent: str, tmp_path: Path
+) -> None:
+    agent = make_agent(size, interface)
+    step, flight = make_step(agent, latent), make_flight(agent)
+    deviation = export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
+    assert deviation.keys() == {"onnxruntime", "torch.export"} and max(deviation.values()) < 1e-5
+    assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
+
+
+def test_the_flight_side_flies_as_torch_does(exported: Path, agent: Agent) -> None:
+    """As `check_parity` says it, without `check_parity`; and z changes, so that a flip could be seen."""
+    import onnxruntime
+
+    contract = json.loads((exported.parent / "contract.json").read_text())
+    step, flight = make_step(agent, contract["latent"]), make_flight(agent)
+    session = onnxruntime.InferenceSession(exported)
+    inputs = {name: value.numpy() for name, value in step.example_inputs().items()}
+    actor, random, classes = onnx_actor.OnnxActor(exported), np.random.default_rng(1), []
+    for image, is_init in zip(flight.observations, flight.is_init, strict=True):
+        noise = random.random((4, 4), np.float32) if step.noise_shape else None
+        inputs |= {"image_u8": image[None], "is_init": np.array([is_init])}
+        inputs |= {} if noise is None else {"noise": noise[None]}
+        expected = [output.numpy() for output in step(*(torch.from_numpy(value) for value in inputs.values()))]
+        for got, wanted in zip(session.run(None, inputs), expected, strict=True):
+            np.testing.assert_allclose(got, wanted, atol=1e-5)
+        if is_init:
+            actor.reset()
+        np.testing.assert_allclose(actor.step(image, noise), expected[0][0], atol=1e-5)
+        np.testing.assert_array_equal(actor.state["z"], expected[2])
+        inputs |= dict(zip(("previous_action", "h", "z"), expected, strict=True))
+        classes.append(tuple(expected[2][0]))
+    assert len(set(classes)) > 3
+
+
+def test_reset_begins_again_and_a_seed_repeats(exported: Path) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), np.uint8)
+    actor = onnx_actor.OnnxActor(exported, seed=5)
+    first = [actor.step(image) for image in images]
+    actor.reset()
+    second = [actor.step(image) for image in images]
+    same_seed = onnx_actor.OnnxActor(exported, seed=5)
+    np.testing.assert_array_equal(first, [same_seed.step(image) for image in images])
+    assert np.array_equal(first, second) == (actor.noise_shape is None), "only noise may tell the episodes apart"
+
+
+def test_the_program_flies_as_torch_does(exported: Path, agent: Agent) -> None:
+    contract = onnx_actor.read_contract(exported.parent / "contract.json")
+    step, program = make_step(agent, contract["latent"]), torch.export.load(exported.with_suffix(".pt2"))
+    actors = {"torch": TorchActor(contract, step), "program": TorchActor(contract, program.module())}
+    assert check_parity(actors, make_flight(agent), seed=3)["program"] < 1e-5
+
+
+def test_the_files_hold_no_paths_of_this_machine(exported: Path) -> None:
+    assert str(ROOT).encode() not in exported.read_bytes()
+    with zipfile.ZipFile(exported.with_suffix(".pt2")) as archive:
+        assert not any(str(ROOT).encode() in archive.read(name) for name in archive.namelist())
+
+
+# --- refusal ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "name"), [("onnx", "onnxruntime"), ("program", "torch.export")])
+def test_an_altered_weight_is_refused(
+    kind: str, name: str, agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = export.write_step
+    step = ActorStep(agent)
+    output = tmp_path / "actor.onnx"
+    export_actor(step, contract_of(step), make_flight(agent), output)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def write_altered(step: ActorStep, onnx: Path, program: Path) -> None:
+        original(step, onnx, program)
+        altered = copy.deepcopy(step)
+        next(altered.rssm.cell.parameters()).add_(0.5)
+        target, elsewhere = {"onnx": onnx, "program": program}[kind], tmp_path / "elsewhere"
+        original(altered, *(path if path == target else elsewhere for path in (onnx, program)))
+        elsewhere.unlink()
+
+    monkeypatch.setattr(export, "write_step", write_altered)
+    with pytest.raises(ParityError, match=rf"^{name} does not fly as torch does: at step \d+ of 200 .* deviates by \d"):
+        export_actor(step, contract_of(step), make_flight(agent), output)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before, "the earlier export stays"
+    with pytest.raises(ParityError):
+        export_actor(step, contract_of(step), make_flight(agent), tmp_path / "new" / "actor.onnx")
+    assert not list((tmp_path / "new").iterdir())
+
+
+class Disturbed(TorchActor):
+    """Changes the outputs of the flight's last step, where no later step can show it."""
+
+    def __init__(self, contract: dict, step: ActorStep, change: Callable[[list[np.ndarray]], None]) -> None:
+        super().__init__(contract, step)
+        self.change, self.steps = change, 0
+
+    def _run(self, feed):
+        self.steps += 1
+        outputs = [value.copy() for value in super()._run(feed)]
+        if self.steps == MIN_STEPS:
+            self.change(outputs)
+        return outputs
+
+
+def check_disturbed(agent: Agent, change: Callable[[list[np.ndarray]], None]) -> float:
+    step = ActorStep(agent)
+    contract = contract_of(step)
+    actors = {"torch": TorchActor(contract, step), "copy": Disturbed(contract, step, change)}
+    return check_parity(actors, make_flight(agent))["copy"]
+
+
+def add_to_action(value: float) -> Callable[[list[np.ndarray]], None]:
+    def change(outputs: list[np.ndarray]) -> None:
+        outputs[0][0, 1] += value
+
+    return change
+
+
+def next_class(outputs: list[np.ndarray]) -> None:
+    outputs[2] = np.roll(outputs[2].reshape(4, 4), 1, axis=1).reshape(1, 16)
+
+
+def test_the_tolerance_of_actions(agent: Agent) -> None:
+    assert check_disturbed(agent, add_to_action(0.8e-4)) == pytest.approx(0.8e-4, rel=0.02)
+    for value in (1.2e-4, math.nan):
+        with pytest.raises(ParityError, match=r"^copy .* step 199 of 200 .* 1 steps are affected"):
+            check_disturbed(agent, add_to_action(value))
+
+
+def test_a_flipped_latent_is_refused_even_if_no_action_shows_it(agent: Agent) -> None:
+    with pytest.raises(ParityError, match=r"step 199 of 200.*by 0.00e\+00.*latent 0 has class \d instead of \d"):
+        check_disturbed(agent, next_class)
+
+
+# --- the contract -----------------------------------------------------------------------------------------------------
+
+
+def test_the_contract_says_what_a_pilot_must_know(exported: Path, agent: Agent) -> None:
+    contract = json.loads((exported.parent / "contract.json").read_text())
+    step = make_step(agent, contract["latent"])
+    inputs = {entry["name"]: (entry["shape"], entry["type"]) for entry in contract["inputs"]}
+    expected = {
+        "image_u8": ([1, 64, 64, 3], "uint8"),
+        "h": ([1, 32], "float32"),
+        "z": ([1, 16], "float32"),
+        "previous_action": ([1, 4], "float32"),
+        "is_init": ([1], "bool"),
+    }
+    sampled = contract["latent"] == "sample"
+    assert inputs == expected | ({"noise": ([1, 4, 4], "float32")} if sampled else {})
+    assert [entry["name"] for entry in contract["outputs"]] == ["action", "h_next", "z_next"]
+    assert contract["control"] == {"rate_hz": 50.0, "period_s": 0.02}
+    camera = contract["camera"]
+    assert (camera["width_px"], camera["height_px"], camera["vertical_field_of_view_deg"]) == (64, 64, 90.0)
+    assert camera["focal_length_px"] == pytest.approx(32.0)
+    assert camera["tilt_up_deg"] == 25.0 and camera["position_body_m"] == [0.10, 0.0, 0.02]
+    assert contract["frames"]["body"].startswith("FLU") and "is_init" in contract["reset"]
+    assert contract["weights_sha256"] == hash_weights(step) and contract["model"]["name"] == "debug"
+    assert contract["files"]["onnx"]["sha256"] == onnx_actor.hash_file(exported)
+    verification = contract["verification"]
+    assert verification["steps"] == 200 and verification["episodes"] == 6 and verification["latent_flips"] == 0
+
+
+def test_actions_get_their_units(exported: Path) -> None:
+    actor = onnx_actor.OnnxActor(exported)
+    np.testing.assert_allclose(actor.setpoint(np.zeros(4)), [13.33, 0, 0, 0])
+    np.testing.assert_allclose(actor.setpoint(np.array([1.0, -1.0, 1.0, 7.0])), [26.66, -10, 10, 4])
+    hover = np.array(actor.contract["action"]["hover"])
+    np.testing.assert_allclose(actor.setpoint(hover), [9.81, 0, 0, 0], atol=1e-3)
+
+
+def test_the_hash_is_that_of_the_weights(agent: Agent) -> None:
+    step = ActorStep(agent)
+    other = copy.deepcopy(step)
+    assert hash_weights(other) == hash_weights(step) == hash_weights(SampledActorStep(agent))
+    next(other.actor.parameters())[0] += 1e-6
+    assert hash_weights(other) != hash_weights(step)
+
+
+# --- the flight side --------------------------------------------------------------------------------------------------
+
+FORBIDDING = """
+import importlib.abc, sys
+
+class Forbid(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {forbidden!r}:
+            raise ImportError(f"{{name}} is forbidden here")
+
+sys.meta_path.insert(0, Forbid())
+import numpy
+from {module} import OnnxActor
+actor = OnnxActor({path!r}, seed=0)
+first, second = (actor.step(numpy.full((64, 64, 3), value, numpy.uint8)) for value in (10, 200))
+assert first.shape == (4,) and 0 < abs(first).max() <= 1 and not (first == second).any()
+print("flown")
+"""
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["plain file", "package"])
+def test_the_flight_side_needs_no_torch(alone: bool, exported: Path, tmp_path: Path) -> None:
+    forbidden, module = ["torch", "tensordict", "torchrl", "mujoco", "hydra"], "dreamer_racing.export.onnx_actor"
+    if alone:
+        shutil.copy(onnx_actor.__file__, tmp_path)
+        forbidden, module = [*forbidden, "gymnasium", "dreamer_racing", "onnx", "onnxscript"], "onnx_actor"
+    program = FORBIDDING.format(forbidden=forbidden, module=module, path=str(exported))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "flown\n"
+
+
+def test_the_flight_side_measures_itself(exported: Path) -> None:
+    command = [sys.executable, onnx_actor.__file__, str(exported), "--steps", "30"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "30 steps, 1 thread(s): p50" in done.stdout and "p99" in done.stdout and "max" in done.stdout
+
+
+def test_the_percentiles_of_a_latency() -> None:
+    assert str(onnx_actor.Latency(0.1, 1.25, 3.0)) == "p50 0.10 ms, p99 1.25 ms, max 3.00 ms"
+    seen: list[float] = []
+    latency = onnx_actor.measure_latency(lambda row: seen.append(row[0]), np.zeros((7, 1)))
+    assert len(seen) == 7 + onnx_actor.WARM_UP_STEPS and 0 < latency.p50 <= latency.p99 <= latency.max
+
+
+@pytest.mark.parametrize(
+    ("observation", "words"),
+    [
+        (np.zeros((32, 64, 3), np.uint8), ["image_u8", "(32, 64, 3)", "(64, 64, 3)"]),
+        (np.zeros((1, 64, 64, 3), np.uint8), ["(1, 64, 64, 3)"]),
+        (np.zeros((64, 64, 3), np.float32), ["float32", "uint8"]),
+        ([[0]], ["list", "numpy"]),
+    ],
+    ids=["size", "batch", "type", "list"],
+)
+def test_a_wrong_image_is_refused_and_changes_nothing(exported: Path, observation: object, words: list[str]) -> None:
+    actor = onnx_actor.OnnxActor(exported)
+    actor.step(np.zeros((64, 64, 3), np.uint8))
+    before = actor.state["h"].copy()
+    with pytest.raises(ValueError, match="image_u8") as error:
+        actor.step(observation)
+    assert all(word in str(error.value) for word in words)
+    np.testing.assert_array_equal(actor.state["h"], before)
+
+
+def test_noise_is_checked_too(exported: Path) -> None:
+    actor = onnx_actor.OnnxActor(exported)
+    with pytest.raises(ValueError, match="noise"):
+        actor.step(np.zeros((64, 64, 3), np.uint8), np.zeros((3, 3), np.float32))
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
+    actor = TorchActor(contract_of(step), step)
+    with pytest.raises(ValueError, match="vector: .* not finite"):
+        actor.step(np.full(21, np.nan, np.float32))
+
+
+def spoil(key: str, value: object):
+    def write(contract: Path) -> None:
+        contract.write_text(json.dumps(json.loads(contract.read_text()) | {key: value}))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (Path.unlink, FileNotFoundError, "contract.json"),
+        (lambda path: path.write_text("{"), ValueError, "not valid JSON"),
+        (lambda path: path.write_text("[]"), ValueError, "format None"),
+        (spoil("format_version", 2), ValueError, "version 2"),
+        (spoil("files", {"onnx": {"name": "actor.onnx", "sha256": "0"}}), ValueError, "SHA-256"),
+        (spoil("outputs", [{"name": "thrust", "shape": [1, 4]}]), ValueError, "promises .*thrust"),
+    ],
+    ids=["missing", "json", "other", "version", "hash", "outputs"],
+)
+def test_a_contract_of_another_file_is_refused(exported: Path, tmp_path: Path, change, error, words: str) -> None:
+    for name in ("actor.onnx", "contract.json"):
+        shutil.copy(exported.with_name(name), tmp_path)
+    change(tmp_path / "contract.json")
+    with pytest.raises(error, match=words):
+        onnx_actor.OnnxActor(tmp_path / "actor.onnx")
+
+
+def test_a_missing_actor_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nothing.onnx"):
+        onnx_actor.OnnxActor(tmp_path / "nothing.onnx")
+
+
+def test_a_missing_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ImportError, match="pip install onnxruntime"):
+        onnx_actor.OnnxActor(exported)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="latent=median: there are mode and sample"):
+        make_step(agent, "median")
+    with pytest.raises(ValueError, match="pixels and vector"):
+        ActorStep(make_agent(interface=Interface(vector_dim=21)))
+    with pytest.raises(ValueError, match="must end in .onnx"):
+        check_output(tmp_path / "actor.pt")
+    with pytest.raises(PermissionError, match="output=/dev/null/x/actor.onnx: cannot write"):
+        check_output("/dev/null/x/actor.onnx")
+    (tmp_path / "contract.json").write_text("{}")
+    with pytest.raises(ValueError, match="describes another actor"):
+        check_output(tmp_path / "actor.onnx")
+    step = ActorStep(agent)
+    with pytest.raises(ValueError, match="steps=199: .* at least 200"):
+        export_actor(step, contract_of(step), make_flight(agent, 199), tmp_path / "new" / "actor.onnx")
+    monkeypatch.setattr(export, "PROTOBUF_LIMIT", 1000)
+    with pytest.raises(ValueError, match="less than 2 GB"):
+        export_actor(step, contract_of(step), make_flight(agent), tmp_path / "new" / "actor.onnx")
+    assert not list((tmp_path / "new").iterdir())
+    monkeypatch.setattr(export, "PACKAGES", ("onnx", "no_such_package"))
+    with pytest.raises(MissingPackagesError, match=r"needs no_such_package.*dreamer_racing\[export\]"):
+        check_output(tmp_path / "actor.onnx")
+
+
+# --- the recipe -------------------------------------------------------------------------------------------------------
+
+
+def recipe(name: str, *overrides: str, cwd: Path, before: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a recipe as a user does, or after some lines of Python."""
+    path = str(ROOT / "recipes" / f"{name}.py")
+    start = f"import runpy, sys\nsys.path.insert(0, {str(Path(path).parent)!r})\n{before}\nsys.argv[0] = {path!r}\n"
+    program = [path] if not before else ["-c", f"{start}runpy.run_path({path!r}, run_name='__main__')"]
+    command = [sys.executable, *program, *overrides]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished debug run on small images, of a loss that has no image decoder."""
+    directory = tmp_path_factory.mktemp("runs") / "first run"
+    done = recipe(
+        "dreamer_v3", "track=circle", "model=debug", "loss=privileged", "env.preset=faithful", "env.camera_tilt=30",
+        "env.image_size=32", "env.control_rate=40",
+        "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000", "evaluation.every=0",
+        f"run_dir='{directory}'", cwd=directory.parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return directory
+
+
+def test_the_recipe_exports_a_run(run_dir: Path) -> None:
+    done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent)
+    assert done.returncode == 0, done.stderr
+    folder = run_dir / "export"
+    assert {path.name for path in folder.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
+    for words in (
+        "replayed: 200 steps",
+        "onnxruntime from torch",
+        "1 thread, onnxruntime: p50",
+        "1 thread, torch: p50",
+    ):
+        assert words in done.stdout
+    contract = json.loads((folder / "contract.json").read_text())
+    assert contract["control"] == {"rate_hz": 40.0, "period_s": 0.025}
+    assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == 0.02
+    assert contract["source"]["env_steps"] == 160 and contract["verification"]["episodes"] >= 4
+    assert (contract["camera"]["width_px"], contract["camera"]["height_px"]) == (32, 32)
+    assert contract["camera"]["focal_length_px"] == pytest.approx(16.0)  # 90° of view: half the height
+    agent, _ = load_agent(run_dir, Interface(image_size=32))
+    assert contract["weights_sha256"] == hash_weights(ActorStep(agent))
+    assert onnx_actor.OnnxActor(folder / "actor.onnx").step(np.zeros((32, 32, 3), np.uint8)).shape == (4,)
+    assert OmegaConf.load(run_dir / "config.yaml").env.camera_tilt == 30.0
+
+
+def test_the_recipe_refuses_a_copy_that_flies_differently(run_dir: Path) -> None:
+    altered = (
+        "import dreamer_racing.export.actor_step as export, copy\n"
+        "write = export.write_step\n"
+        "def altered(step, onnx, program):\n"
+        "    step = copy.deepcopy(step)\n"
+        "    next(step.rssm.cell.parameters()).add_(5.0)\n"
+        "    write(step, onnx, program)\n"
+        "export.write_step = altered\n"
+    )
+    output = run_dir.parent / "refused" / "actor.onnx"
+    done = recipe(
+        "export", f"checkpoint='{run_dir}'", f"output='{output}'", "latent=sample", cwd=run_dir.parent, before=altered
+    )
+    assert done.returncode == 1, done.stderr
+    assert "error: onnxruntime does not fly as torch does: at step" in done.stderr and "Traceback" not in done.stderr
+    assert "try another seed" in done.stderr, "a sample can be bad luck"
+    assert not list(output.parent.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["latent=median"], ["latent=median", "mode", "sample"]),
+        (["checkpoint=/nowhere"], ["/nowhere", "does not exist"]),
+        (["output=/dev/null/x/actor.onnx"], ["/dev/null/x", "cannot write"]),
+        (["steps=10"], ["steps=10", "200"]),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_bad_input_gets_a_plain_error(run_dir: Path, overrides: list[str], words: list[str]) -> None:
+    done = recipe("export", f"checkpoint='{run_dir}'", *overrides, cwd=run_dir.parent)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert all(word in done.stderr for word in words), done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 6
+
+
+def test_only_actors_that_race_are_exported(run_dir: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_dir, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
+    config = OmegaConf.load(tmp_path / "run" / "config.yaml")
+    config.env.suite, config.task = "dmc", "cartpole_swingup"
+    OmegaConf.save(config, tmp_path / "run" / "config.yaml")
+    done = recipe("export", "checkpoint=run", cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "was trained on cartpole_swingup" in done.stderr and not (tmp_path / "run" / "export").exists()
+
+
+def test_missing_packages_are_named(run_dir: Path) -> None:
+    before = "import dreamer_racing.export.actor_step as export\nexport.PACKAGES = ('onnx', 'no_such_package')\n"
+    done = recipe("export", f"checkpoint='{run_dir}'", cwd=run_dir.parent, before=before)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "pip install 'dreamer_racing[export]'" in done.stderr and "no_such_package" in done.stderr
+
+
+def test_the_contract_of_an_agent_that_sees_numbers_lists_them() -> None:
+    step = ActorStep(make_agent(interface=Interface(pixels=False, vector_dim=21)))
+    contract = make_contract(step, PRESETS["easy"], Camera())
+    assert contract["camera"] is None
+    channels = contract["vector"]["channels"]
+    assert len(channels) == 21
+    assert channels[4] == {"name": "body rates of the drone, y", "unit": "rad/s", "divisor": 5.0}

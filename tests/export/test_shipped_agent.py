@@ -1,0 +1,219 @@
+"""The agent that flies: which weights of a checkpoint, and out of a folder that ships as it was in training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.actor_step import ActorStep, export_actor
+from dreamer_racing.export.contract import hash_weights, make_contract
+from dreamer_racing.export.onnx_actor import OnnxActor
+from dreamer_racing.export.parity import MIN_STEPS, Flight
+from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, choose_weights, is_agent, load_agent
+from dreamer_racing.export.weights_file import read_weights, write_weights
+from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.modules import Interface, get_size
+from dreamer_racing.training.checkpoint import RunCheckpoints
+
+WORLDS = {"track": "circle", "num_envs": 1, "camera": Camera(32, 32, tilt=30.0), "control_rate": 25.0, "num_threads": 1}
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = DroneRacingEnv(**WORLDS)
+    yield env
+    env.close()
+
+
+def make_agent(size: str = "debug", image_size: int = 32) -> Agent:
+    """An agent of random weights, none of which is zero."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        agent = Agent(get_size(size), Interface(image_size=image_size), decode=False)
+        for parameter in agent.parameters():
+            parameter.data.add_(0.1 * torch.randn_like(parameter))
+    return agent.requires_grad_(False)
+
+
+def ship(agent: Agent, env: DroneRacingEnv, folder: Path) -> Path:
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    side = agent.interface.image_size
+    images = np.random.default_rng(0).integers(0, 256, (MIN_STEPS, side, side, 3), np.uint8)
+    flight = Flight(images, np.arange(MIN_STEPS) % 50 == 0, np.zeros((MIN_STEPS, 4), np.float32))
+    step = ActorStep(agent)
+    contract = make_contract(step, env.worlds.parameters, env.worlds.camera)
+    export_actor(step, contract, flight, folder / "actor.onnx", shared_weights=True)
+    (folder / "config.yaml").write_text("track: circle\n")
+    (folder / "agent.json").write_text('{"weights": "averaged"}')
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shipped(env: DroneRacingEnv, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ship(make_agent(), env, tmp_path_factory.mktemp("agents") / "round")
+
+
+# --- out of a checkpoint ----------------------------------------------------------------------------------------------
+
+
+def test_the_choice_of_weights() -> None:
+    both = ("averaged", "trained")
+    assert [choose_weights(wanted, both, "x") for wanted in ("auto", *both)] == ["averaged", *both]
+    assert choose_weights("auto", "trained", "x") == "trained"
+    with pytest.raises(ValueError, match="^weights=averaged: runs/x holds the trained weights only"):
+        choose_weights("averaged", "trained", "runs/x")
+    with pytest.raises(ValueError, match="weights=best: there are auto, averaged, trained"):
+        choose_weights("best", both, "x")
+
+
+def test_the_averaged_weights_fly_where_they_are_kept(tmp_path: Path) -> None:
+    learner = DreamerLearner("debug", config=LearnerConfig(average_rate=0.1), seed=1)
+    for parameter in learner.averaged.parameters():
+        parameter.add_(1.0)
+    RunCheckpoints(tmp_path, {"learner": learner}).save(env_steps=40)
+    hashes = {}
+    for weights in ("auto", "averaged", "trained"):
+        agent, metadata = load_agent(tmp_path, Interface(), weights)
+        hashes[weights] = hash_weights(ActorStep(agent))
+        assert metadata["weights"] == ("averaged" if weights == "auto" else weights)
+    assert hashes["auto"] == hashes["averaged"] == hash_weights(ActorStep(learner.flying_agent))
+    assert hashes["trained"] == hash_weights(ActorStep(learner.agent)) != hashes["averaged"]
+
+
+def test_an_agent_is_restored_whatever_its_losses_were(tmp_path: Path) -> None:
+    learner = DreamerLearner("debug", seed=1)
+    RunCheckpoints(tmp_path, {"learner": learner}).save(env_steps=40)
+    agent, metadata = load_agent(tmp_path, Interface())
+    assert metadata["env_steps"] == 40 and agent.world_model.decoder is None
+    assert hash_weights(ActorStep(agent)) == hash_weights(ActorStep(learner.agent))
+    with pytest.raises(ValueError, match="do not fit"):
+        load_agent(tmp_path, Interface(action_dim=3))
+    with pytest.raises(ValueError, match="do not fit"):
+        load_agent(tmp_path, Interface(pixels=False, vector_dim=21))
+    incomplete = {"size": learner.state_dict()["size"], "agent": {}}
+    part = SimpleNamespace(state_dict=lambda: incomplete, load_state_dict=None)
+    RunCheckpoints(tmp_path / "incomplete", {"learner": part}).save(env_steps=40)
+    with pytest.raises(ValueError, match="do not fit .* are missing"):
+        load_agent(tmp_path / "incomplete", Interface())
+    with pytest.raises(FileNotFoundError, match="No complete checkpoint"):
+        load_agent(tmp_path / "nothing", Interface())
+    with pytest.raises(ValueError, match="weights=averaged: .* holds the trained weights only"):
+        load_agent(tmp_path, Interface(), "averaged")
+
+
+# --- out of a folder that ships ---------------------------------------------------------------------------------------
+
+
+def test_a_shipped_agent_flies_as_it_was_trained(shipped: Path, env: DroneRacingEnv) -> None:
+    original, restored = make_agent(), ShippedAgent.load(shipped, env)
+    assert {path.name for path in shipped.iterdir()} == set(FILES)
+    assert hash_weights(ActorStep(restored.agent)) == hash_weights(ActorStep(original))
+    policy, onnx = restored.evaluation_policy(deterministic=True), OnnxActor(shipped / "actor.onnx")
+    flown = env.reset().update({"is_init": torch.ones(1, 1, dtype=torch.bool), "belief": torch.zeros(1, 32),
+                                "state": torch.zeros(1, 16), "previous_action": torch.zeros(1, 4)})  # fmt: skip
+    expected = ActorStep(original)(flown["pixels"], *(flown[key] for key in ("belief", "state", "previous_action")),
+                                   flown["is_init"][0])[0]  # fmt: skip
+    torch.testing.assert_close(policy(flown)["action"], expected, rtol=0, atol=0)
+    np.testing.assert_allclose(onnx.step(flown["pixels"][0].numpy()), expected[0], atol=1e-5)
+
+
+def test_only_what_flies_is_in_it(shipped: Path, env: DroneRacingEnv) -> None:
+    restored = ShippedAgent.load(shipped, env)
+    assert {name.partition(".")[0] for name in read_weights(shipped / "weights.safetensors")} == {
+        "encoder", "rssm", "actor",
+    }  # fmt: skip
+    assert restored.agent.critic is None and restored.agent.world_model.reward_head is None
+    assert {name for name, _ in restored.agent.named_children()} == {"world_model", "actor"}
+    held = sum(parameter.numel() for parameter in restored.agent.parameters())
+    assert held == json.loads((shipped / "contract.json").read_text())["model"]["parameters"]
+
+
+@pytest.mark.slow
+def test_three_agents_are_less_than_ten_megabytes(env: DroneRacingEnv, tmp_path: Path) -> None:
+    folder = ship(make_agent("cpu_small", 64), env, tmp_path / "agent")
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 10e6 / 3
+
+
+def test_agents_are_found_by_their_names(shipped: Path, tmp_path: Path) -> None:
+    assert is_agent(shipped) and not is_agent(shipped.parent)
+    (shipped.parent / "unfinished").mkdir(exist_ok=True)
+    assert agents_in(shipped.parent) == ["round"] and agents_in(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"camera": Camera(64, 64, tilt=30.0)}, "env.image_size=64: .*env.image_size=32"),
+        ({"camera": Camera(32, 32, tilt=25.0)}, "env.camera_tilt=25.0: .*env.camera_tilt=30.0"),
+        ({"camera": Camera(32, 32, 80.0, 30.0)}, "camera.vertical_field_of_view_deg=80.0: .*=90.0"),
+        ({"control_rate": 50.0}, "env.control_rate=50.0: .*round was trained with env.control_rate=25.0"),
+        ({"from_pixels": False}, "env.from_pixels=False: .*env.from_pixels=True"),
+    ],
+    ids=["image size", "tilt", "view", "control rate", "numbers"],
+)
+def test_another_environment_is_refused(other: dict, message: str, shipped: Path) -> None:
+    env = DroneRacingEnv(**WORLDS | other)
+    with pytest.raises(ValueError, match=message):
+        ShippedAgent.load(shipped, env)
+    env.close()
+
+
+def cut_off(folder: Path) -> None:
+    (folder / "weights.safetensors").write_bytes((folder / "weights.safetensors").read_bytes()[:-4])
+
+
+def alter_weight(folder: Path) -> None:
+    weights = read_weights(folder / "weights.safetensors")
+    weights["actor.mlp.output.bias"] += 1e-3
+    write_weights(folder / "weights.safetensors", weights)
+
+
+def leave_out(folder: Path) -> None:
+    weights = read_weights(folder / "weights.safetensors")
+    del weights["actor.mlp.output.bias"]
+    write_weights(folder / "weights.safetensors", weights)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (cut_off, ValueError, "no complete safetensors file"),
+        (alter_weight, ValueError, "weights.safetensors holds other weights than .*contract.json"),
+        (leave_out, ValueError, "weights.safetensors does not fit (?s:.*)mlp.output.bias"),
+        (lambda folder: (folder / "contract.json").unlink(), FileNotFoundError, "lacks contract.json"),
+        (lambda folder: (folder / "agent.json").write_text("{"), ValueError, "agent.json is not valid JSON"),
+    ],
+    ids=["cut off", "altered", "left out", "file", "json"],
+)
+def test_a_broken_folder_is_refused(
+    spoil: Callable[[Path], None],
+    error: type[Exception],
+    message: str,
+    shipped: Path,
+    env: DroneRacingEnv,
+    tmp_path: Path,
+) -> None:
+    shutil.copytree(shipped, tmp_path / "copy")
+    spoil(tmp_path / "copy")
+    with pytest.raises(error, match=message):
+        ShippedAgent.load(tmp_path / "copy", env)
+
+
+def test_the_flight_side_refuses_other_weights(shipped: Path, tmp_path: Path) -> None:
+    shutil.copytree(shipped, tmp_path / "copy")
+    alter_weight(tmp_path / "copy")
+    with pytest.raises(ValueError, match="does not describe .*weights.safetensors: the SHA-256"):
+        OnnxActor(tmp_path / "copy" / "actor.onnx")
+    (tmp_path / "copy" / "weights.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match="no .*weights.safetensors: it belongs beside actor.onnx"):
+        OnnxActor(tmp_path / "copy" / "actor.onnx")

@@ -1,0 +1,90 @@
+"""Variants side by side: what is averaged, and what the table says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dreamer_racing.figures.comparison import CAPTION, compare_variants, comparison_table
+from dreamer_racing.figures.runs import RunData
+from dreamer_racing.training.metrics_file import MetricsTable
+
+NAMES = {"gates": "evaluation/gates_per_episode", "clock": "wall_clock"}
+
+
+def make_run(variant: str, seed: int, every: int = 100, **columns: list[float]) -> RunData:
+    """A run with rows at 100, 200 ... env_steps; NaN where a cell is empty."""
+    count = max(map(len, columns.values()))
+    steps = every * np.arange(1.0, count + 1)
+    values = {NAMES.get(name, name): np.array(column) for name, column in columns.items()}
+    filled = {name: (steps[np.isfinite(column)], column[np.isfinite(column)]) for name, column in values.items()}
+    directory = Path(f"runs/ablation/dreamer_v3_circle_{variant}_seed{seed}")
+    config = {"track": "circle", "seed": seed, "algorithm": "dreamer_v3"}
+    return RunData(directory, config, MetricsTable(filled, steps, []))
+
+
+RUNS = [
+    make_run("late", 0, gates=[0.0] * 10, clock=[30.0] * 9 + [60.0]),
+    make_run("default", 0, gates=[9.0] * 7 + [1.0, 2.0, 3.0]),  # the last fifth: from 800 env_steps on
+    make_run("default", 1, gates=[0.0] * 7 + [4.0, 4.0, 4.0]),
+]
+
+
+def test_the_last_fifth_of_every_seed_counts_once() -> None:
+    reference, late = compare_variants(RUNS).results
+    assert reference.name == "default" and late.name == "late"
+    assert reference.values["gates"].tolist() == [2.0, 4.0]
+    assert reference.window == (800, 1000) and reference.wall_clock is None and late.wall_clock == 60.0
+
+
+def test_variants_are_compared_over_the_same_env_steps() -> None:
+    """Half a run is at its own end what the others were at half their length."""
+    rising = [float(value) for value in range(1, 11)]
+    runs = [
+        make_run("default", 0, gates=rising),
+        make_run("default", 1, gates=rising[:5]),  # ends before 800
+        make_run("killed", 0, gates=rising[:9]),  # ends within
+        make_run("young", 0, gates=rising[:3]),
+    ]
+    comparison = compare_variants(runs, ["gone left out: it has no metrics.csv"])
+    default, killed, young = comparison.results
+    assert default.seeds == 1 and default.values["gates"].tolist() == [9.0]
+    assert killed.values["gates"].tolist() == [8.5]
+    assert young.seeds == 0 and young.values == {} and young.window == (800, 1000)
+    name = "dreamer_v3_circle"
+    assert comparison.problems == [
+        "gone left out: it has no metrics.csv",
+        f"{name}_default_seed1 ends at 500 env_steps, compared are 800 to 1,000: left out",
+        f"{name}_killed_seed0 ends at 900 env_steps, compared are 800 to 1,000: it counts as far as it goes",
+        f"{name}_young_seed0 ends at 300 env_steps, compared are 800 to 1,000: left out",
+    ]
+
+
+def test_the_return_is_that_of_evaluations() -> None:
+    """Training pays every variant by its own b₂."""
+    run = make_run("default", 0, **{"episode/return": [900.0] * 10, "evaluation/return_mean": [5.0] * 10})
+    (result,) = compare_variants([run]).results
+    assert {name: values.tolist() for name, values in result.values.items()} == {"evaluation_return": [5.0]}
+
+
+def test_the_table_has_a_row_a_variant_and_no_column_without_values() -> None:
+    head, _, reference, late, empty, caption = comparison_table(compare_variants(RUNS)).strip().split("\n")
+    assert head == (
+        "| algorithm | track | variant | seeds | env_steps | Gates per episode (deterministic) | wall clock |"
+    )
+    assert reference == "| dreamer_v3 | circle | default | 2 | 800–1,000 | 3 ± 1.41 |  |"
+    assert late == "| dreamer_v3 | circle | late | 1 | 800–1,000 | 0 | 1.0 min |"
+    assert empty == "" and caption == CAPTION and "b₂ = 0" in caption
+
+
+def test_the_table_says_which_cells_have_fewer_seeds_and_what_was_left_out() -> None:
+    nan = float("nan")
+    unseen = make_run("default", 2, gates=[5.0] * 5 + [nan] * 5, clock=[60.0] * 10)  # its last evaluation is too early
+    lines = comparison_table(compare_variants([*RUNS, unseen], ["late left out"])).split("\n")
+    assert "| default | 3 | 800–1,000 | 3 ± 1.41 (n = 2) | 1.0 min |" in lines[2]
+    assert lines[-2] == "- late left out"
+
+
+def test_nothing_to_compare() -> None:
+    with pytest.raises(ValueError, match="no run to compare"):
+        compare_variants([])

@@ -1,0 +1,353 @@
+"""Curves over seeds: values by hand, runs that do not belong together, files in any state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.stats
+import yaml
+
+from dreamer_racing.figures.curves import (
+    ALL_TRACKS,
+    QUANTITIES,
+    bootstrap_interval,
+    interquartile_mean,
+    learning_curves,
+    read_curves,
+    resample,
+    weight_raises,
+    write_curves,
+)
+from dreamer_racing.figures.runs import (
+    CurveKey,
+    evaluation_files,
+    evaluation_score,
+    find_runs,
+    first_of_each_curve,
+    group_runs,
+    read_runs,
+)
+from dreamer_racing.training.metrics_file import read_metrics
+
+
+def write_run(folder: Path, name: str, returns=(0.0, 10.0), track: str = "circle", **settings) -> Path:
+    """A run whose return has these values after 1000, 2000 ... env_steps."""
+    run = folder / name
+    run.mkdir(parents=True)
+    config = {"track": track, "seed": 0, "run_dir": str(run), "env": {"preset": "easy"}} | settings
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    rows = [f"{1000 * (i + 1)},{value},{value / 100}\n" for i, value in enumerate(returns)]
+    (run / "metrics.csv").write_text("env_steps,episode/return,evaluation/success_rate\n" + "".join(rows))
+    return run
+
+
+def curves_of(folder: Path, **options):
+    runs, problems = read_runs(find_runs([folder]))
+    return learning_curves(runs, problems=problems, **options)
+
+
+def at(curve, env_steps: float) -> tuple[float, float, float, int]:
+    index = int(np.abs(curve.env_steps - env_steps).argmin())
+    return curve.centre[index], curve.low[index], curve.high[index], curve.seeds[index]
+
+
+# --- values ---
+
+
+def test_running_mean_between_and_beyond_rows():
+    steps, values = np.array([10.0, 20, 30, 60]), np.array([1.0, 2, 6, 12])
+    grid = np.array([-1.0, 0, 20, 45, 60, 71])
+    expected = [np.nan, 1, (1 + 2 + 6) / 3, 9, 12, np.nan]  # 45: halfway between the rows at 30 and 60
+    np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
+    values[2] = np.nan  # looked for at 30, and not found
+    expected = [np.nan, 1, (1 + 2) / 2, np.nan, 12, np.nan]
+    np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
+
+
+def test_mean_and_standard_deviation_over_seeds(tmp_path):
+    for seed, value in enumerate((1.0, 2.0, 6.0)):
+        write_run(tmp_path, f"dreamer_v3_circle_paper_seed{seed}", [value] * 4, seed=seed)
+    (curve,) = curves_of(tmp_path).curves
+    assert curve.key == CurveKey("circle", "dreamer_v3", "paper")
+    spread = np.sqrt((4 + 1 + 9) / 2)  # of a sample: n − 1
+    np.testing.assert_allclose(at(curve, 2500), (3.0, 3 - spread, 3 + spread, 3))
+
+
+@pytest.mark.parametrize("aggregate", ["mean", "iqm"])
+def test_a_single_seed_has_no_band(tmp_path, aggregate):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", [5.0] * 10, seed=0)
+    write_run(tmp_path, "dreamer_v3_circle_seed1", [5.0] * 5, seed=1)
+    (curve,) = curves_of(tmp_path, aggregate=aggregate).curves
+    assert at(curve, 4000) == (5.0, 5.0, 5.0, 2)
+    np.testing.assert_array_equal(at(curve, 8000), (5.0, np.nan, np.nan, 1))
+
+
+# --- evaluations without a value ---
+
+
+def write_laps(folder: Path, seed: int, laps: list[float | None]) -> Path:
+    """A run with an evaluation after 1000, 2000 ... env_steps, some without a lap."""
+    run = write_run(folder, f"ppo_circle_seed{seed}", algorithm="ppo", seed=seed)
+    rows = [f"{1000 * (i + 1)},20,{'' if lap is None else lap}\n" for i, lap in enumerate(laps)]
+    rows = [row for i, line in enumerate(rows) for row in (f"{1000 * i + 500},,\n", line)]  # and rows of training
+    (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes,evaluation/lap_time_mean\n" + "".join(rows))
+    return run
+
+
+def test_no_lap_is_drawn_where_none_was_flown(tmp_path):
+    write_laps(tmp_path, 0, [None, 6.0, None, 5.0, 4.0])
+    result = curves_of(tmp_path, quantities=["lap_time"], window=100.0)
+    (curve,) = result.curves
+    for env_steps, value in ((1000, np.nan), (1500, np.nan), (2000, 6.0), (2500, np.nan), (3000, np.nan),
+                             (3500, np.nan), (4000, 5.0), (4500, 4.5), (5000, 4.0)):  # fmt: skip
+        np.testing.assert_allclose(at(curve, env_steps)[0], value, rtol=0.01, err_msg=str(env_steps))
+    assert result.problems == []
+
+
+def test_laps_of_fewer_than_half_of_the_seeds_are_not_drawn(tmp_path):
+    write_laps(tmp_path, 0, [7.0, 6.0, 6.0, 5.0])
+    write_laps(tmp_path, 1, [None, 4.0, 4.0])  # ends early: then it does not count
+    write_laps(tmp_path, 2, [None, None, 2.0, 3.0])
+    result = curves_of(tmp_path, quantities=["lap_time"], window=100.0)
+    (curve,) = result.curves
+    np.testing.assert_array_equal(at(curve, 1000), (np.nan, np.nan, np.nan, 1))  # 1 of 3
+    np.testing.assert_allclose(at(curve, 2000), (5.0, 5 - np.sqrt(2), 5 + np.sqrt(2), 2))  # 2 of 3
+    np.testing.assert_allclose(at(curve, 3000), (4.0, 2.0, 6.0, 3))
+    np.testing.assert_allclose(at(curve, 4000), (4.0, 4 - np.sqrt(2), 4 + np.sqrt(2), 2), atol=0.02)
+    assert [problem for problem in result.problems if "left no value" in problem] == [
+        "Mean lap time (s, deterministic): where an evaluation left no value, mean of the seeds that have one, and "
+        "nothing where fewer than half do (1 of 1 curves)"
+    ]
+
+
+def test_a_seed_that_never_flew_a_lap_counts_as_one_without(tmp_path):
+    write_laps(tmp_path, 0, [None, 6.0])
+    for seed in (1, 2):
+        run = write_laps(tmp_path, seed, [None, None])
+        (run / "metrics.csv").write_text("env_steps,evaluation/num_episodes\n1000,20\n2000,20\n")
+    result = curves_of(tmp_path, quantities=["lap_time"])
+    assert np.isnan(result.curves[0].centre).all() and result.curves[0].seeds.max() == 1
+    assert "no values of evaluation/lap_time_mean: ppo_circle_seed1, ppo_circle_seed2" in result.problems
+
+
+def test_both_policies_can_be_drawn(tmp_path):
+    run = write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
+    names = [
+        f"evaluation{policy}/{name}" for policy in ("", "_stochastic") for name in ("success_rate", "gates_per_episode")
+    ]
+    (run / "metrics.csv").write_text(f"env_steps,{','.join(names)}\n1000,1,12,0.5,7\n2000,1,12,0.5,7\n")
+    quantities = ["success_rate", "gates", "stochastic_success_rate", "stochastic_gates"]
+    curves = curves_of(tmp_path, quantities=quantities).curves
+    assert [(curve.quantity, curve.centre[-1]) for curve in curves] == list(
+        zip(quantities, (1, 12, 0.5, 7), strict=True)
+    )
+    assert QUANTITIES["stochastic_success_rate"].comparable
+
+
+def test_interquartile_mean_is_that_of_scipy():
+    scores = np.random.default_rng(0).normal(size=(11, 5))
+    np.testing.assert_allclose(interquartile_mean(scores), scipy.stats.trim_mean(scores, 0.25))
+    assert interquartile_mean(np.array([100.0, 1, 2, 3, -50])) == 2.0  # the middle three of five
+    assert interquartile_mean(np.array([1.0, 2, 6])) == 3.0  # nothing to cut
+
+
+def test_bootstrap_draws_within_strata():
+    constant = [np.full((3, 1), 1.0), np.full((3, 1), 9.0)]  # pooled draws would give 1 ... 9
+    np.testing.assert_allclose(bootstrap_interval(constant), [[5.0], [5.0]])
+    scores = np.random.default_rng(1).normal(size=(400, 1))
+    low, high = bootstrap_interval([scores], statistic=lambda x: x.mean(0)).ravel()
+    half = 1.96 * scores.std() / 20  # of the mean, by the normal distribution
+    np.testing.assert_allclose([low, high], [scores.mean() - half, scores.mean() + half], atol=0.015)
+
+
+def test_iqm_pools_tracks_only_where_values_are_comparable(tmp_path):
+    for track, value in (("circle", 20.0), ("kidney", 60.0)):
+        for seed in range(2):
+            write_run(tmp_path, f"dreamer_v3_{track}_seed{seed}", [value] * 2, track=track, seed=seed)
+    write_run(tmp_path, "ppo_circle_seed0", [0.0] * 2, algorithm="ppo")  # not on every track: not pooled
+    curves = curves_of(tmp_path, quantities=["return", "success_rate"], aggregate="iqm").curves
+    pooled = [curve for curve in curves if curve.key.track == ALL_TRACKS]
+    assert [(curve.key.algorithm, curve.quantity) for curve in pooled] == [("dreamer_v3", "success_rate")]
+    np.testing.assert_allclose(at(pooled[0], 1500), (0.4, 0.4, 0.4, 4))
+
+
+def test_seeds_that_end_early_are_counted_and_named(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", [1.0] * 10, seed=0)
+    write_run(tmp_path, "dreamer_v3_circle_seed1", [3.0] * 5, seed=1)
+    result = curves_of(tmp_path)
+    assert at(result.curves[0], 4000)[::3] == (2.0, 2)
+    assert at(result.curves[0], 8000)[::3] == (1.0, 1)
+    assert result.problems == ["dreamer_v3_circle_seed1 ends at 5,000 of 10,000 env_steps: fewer seeds from there"]
+
+
+def test_a_raise_is_a_whole_increment(tmp_path):
+    run = write_run(tmp_path, "run", [], curriculum={"increment": 0.001})
+    weights = [0, 0, 0.0005, 0.001, 0.001, 0.0017, 0.003, 0.003]  # rows between two levels are means of both
+    lines = [f"{1000 * i},{weight:.8g}\n" for i, weight in enumerate(weights)]
+    (run / "metrics.csv").write_text("env_steps,curriculum/body_rate_weight\n" + "".join(lines))
+    ((data,), _) = read_runs([run])
+    np.testing.assert_array_equal(weight_raises(data), [3000, 6000])
+
+
+@pytest.mark.parametrize("window", [None, 700.0])
+def test_curves_survive_their_file(tmp_path, window):
+    for seed in range(3):
+        write_run(tmp_path / "runs", f"dreamer_v3_circle_seed{seed}", [seed, seed + 1.5], seed=seed)
+    (tmp_path / "runs" / "dreamer_v3_circle_seed2" / "metrics.csv").write_text("")
+    before = curves_of(tmp_path / "runs", window=window)
+    write_curves(tmp_path / "curves.csv", before)
+    after = read_curves(tmp_path / "curves.csv")
+    assert (after.aggregate, after.window, after.problems) == (
+        "mean",
+        window or 0.02 * 2000,
+        before.problems,
+    ) and before.problems
+    for old, new in zip(before.curves, after.curves, strict=True):
+        assert (old.key, old.quantity) == (new.key, new.quantity)
+        np.testing.assert_array_equal(old.seeds, new.seeds)
+        np.testing.assert_allclose(new.env_steps, old.env_steps, atol=0.5)
+        for name in ("centre", "low", "high"):
+            np.testing.assert_allclose(getattr(new, name), getattr(old, name), rtol=1e-5)
+    with pytest.raises(ValueError, match="no learning curves"):
+        read_curves(tmp_path / "runs" / "dreamer_v3_circle_seed0" / "metrics.csv")
+
+
+# --- which runs make a curve ---
+
+
+def test_runs_are_found_but_not_inside_of_runs(tmp_path):
+    runs = [write_run(tmp_path / "a" / "b", "one"), write_run(tmp_path, "two")]
+    for run in runs:
+        write_run(run, "best")
+    assert find_runs([tmp_path]) == find_runs([tmp_path / "a", f"{tmp_path}/t*", runs[0]]) == sorted(runs)
+    with pytest.raises(ValueError, match=r"runs=.*nothing.*no run directory"):
+        find_runs([tmp_path / "nothing"])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "key"),
+    [
+        ("dreamer_v3_circle_paper_seed3", {}, ("circle", "dreamer_v3", "paper")),
+        ("ppo_figure8_decoys_no_noise_seed10", {"algorithm": "ppo", "track": "figure8_decoys"},
+         ("figure8_decoys", "ppo", "no_noise")),
+        ("sac_mine_seed0", {"algorithm": "sac", "track": "tracks/mine.yaml"}, ("mine", "sac", "")),
+        ("dreamer_v3_circle_20260101-120000", {}, ("circle", "dreamer_v3", "")),
+    ],
+)  # fmt: skip
+def test_names_say_the_variant(tmp_path, name, settings, key):
+    ((run,), _) = read_runs([write_run(tmp_path, name, **settings)])
+    assert run.key == key
+
+
+def test_mixed_configurations_are_refused_with_both_values(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0, device="cpu", logger={"every": 10})
+    other = {"preset": "faithful", "looks": "randomised"}
+    write_run(tmp_path, "dreamer_v3_circle_seed1", seed=1, device="cuda", logger={"every": 20}, env=other)
+    with pytest.raises(ValueError, match=r"seed0 and .*seed1 .*alike: env.preset: easy and faithful\. "):
+        curves_of(tmp_path)
+
+
+def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path):
+    for seed, decoys in enumerate(({}, {"decoys": None}, {"decoys": {"count": 4}})):
+        write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, **decoys)
+    assert curves_of(tmp_path).curves[0].seeds.max() == 3
+    write_run(tmp_path, "dreamer_v3_circle_seed3", seed=3, decoys={"count": 2})
+    with pytest.raises(ValueError, match=r"seed2 and .*seed3 .*alike: decoys\.count: 4 and 2\."):  # not with the first
+        curves_of(tmp_path)
+
+
+def test_runs_that_differ_in_what_does_not_matter_are_one_curve(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0, device="cpu", total_env_steps=10, logger={"every": 10})
+    write_run(tmp_path, "dreamer_v3_circle_seed1", seed=1, device="cuda", total_env_steps=20, logger={"every": 20})
+    runs, _ = read_runs(find_runs([tmp_path]))
+    assert [[run.seed for run in group] for group in group_runs(runs).values()] == [[0, 1]]
+    assert [run.seed for run in first_of_each_curve(runs)] == [0]
+
+
+def test_the_same_seed_twice_is_refused(tmp_path):
+    write_run(tmp_path / "a", "dreamer_v3_circle_seed0")
+    write_run(tmp_path / "b", "dreamer_v3_circle_seed0")
+    with pytest.raises(ValueError, match="same run twice.*seed: 0"):
+        curves_of(tmp_path)
+
+
+# --- files in any state ---
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda run: (run / "metrics.csv").unlink(), "it has no metrics.csv"),
+        (lambda run: (run / "config.yaml").unlink(), "it has no config.yaml"),
+        (lambda run: (run / "metrics.csv").write_text(""), "metrics.csv has no rows"),
+        (lambda run: (run / "metrics.csv").write_text("env_steps,episode/return\n"), "metrics.csv has no rows"),
+        (lambda run: (run / "metrics.csv").write_text("env_st"), "metrics.csv has no rows"),
+        (lambda run: (run / "metrics.csv").write_bytes(b"\x89PNG\r\n\x00\xff\n" * 9), "no column env_steps"),
+        (lambda run: (run / "config.yaml").write_text("a: [b"), "config.yaml is not YAML"),
+        (lambda run: (run / "config.yaml").write_text("just words"), "config.yaml holds no settings"),
+    ],
+)
+def test_unreadable_runs_are_named_and_left_out(tmp_path, spoil, words):
+    write_run(tmp_path, "dreamer_v3_circle_seed0", [5.0, 5.0])
+    spoil(write_run(tmp_path, "dreamer_v3_circle_seed1", [9.0, 9.0], seed=1))
+    result = curves_of(tmp_path)
+    assert at(result.curves[0], 1500)[::3] == (5.0, 1)
+    (problem,) = result.problems
+    assert problem.startswith("dreamer_v3_circle_seed1 left out: ") and words in problem
+
+
+def test_nothing_left_is_refused_with_the_reasons(tmp_path):
+    (write_run(tmp_path, "lonely") / "metrics.csv").unlink()
+    with pytest.raises(ValueError, match="no run to draw. lonely left out: it has no metrics.csv"):
+        curves_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "steps", "values", "problems"),
+    [
+        ("1,5\n2,6\n3,7", [1, 2], [5, 6], ["its last row is cut short"]),
+        ("1,5\n2\n3,7\n", [1, 3], [5, 7], ["1 of 3 rows are incomplete"]),
+        ("1,5\nx,6\n3,7\n", [1, 3], [5, 7], ["1 of 3 rows have no number of env_steps"]),
+        ("1,5\n2,?\n3,\n4,nan\n", [1], [5], ["1 cells are not numbers"]),
+        ("3,7\n1,5\n", [1, 3], [5, 7], []),
+    ],
+)
+def test_half_written_files_are_read_as_far_as_they_go(tmp_path, text, steps, values, problems):
+    path = tmp_path / "metrics.csv"
+    path.write_text("env_steps,loss\n" + text)
+    table = read_metrics(path)
+    assert table.problems == problems
+    for found, expected in zip(table.columns["loss"], (steps, values), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_only_wanted_columns_are_read(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("env_steps,a,b\n1,x,2\n")
+    table = read_metrics(path, ["b", "c"])
+    assert list(table.columns) == ["b"] and table.problems == []
+
+
+def test_what_a_run_does_not_log_is_named(tmp_path):
+    write_run(tmp_path, "dreamer_v3_circle_seed0")
+    result = curves_of(tmp_path, quantities=["return", "lap_time"])
+    assert [curve.quantity for curve in result.curves] == ["return"]
+    assert result.problems == ["no values of evaluation/lap_time_mean: all runs of dreamer_v3 circle"]
+    with pytest.raises(ValueError, match="no run has values of lap_time"):
+        curves_of(tmp_path, quantities=["lap_time"])
+    with pytest.raises(ValueError, match="quantities=speed: there are return"):
+        curves_of(tmp_path, quantities=["speed"])
+
+
+def test_evaluations_by_env_steps(tmp_path):
+    folder = tmp_path / "evaluations"
+    folder.mkdir()
+    for name in ("000000200_dream.npz", "000000100_dream.npz", "000000100_stochastic_dream.npz"):
+        (folder / name).touch()
+    assert list(evaluation_files(tmp_path, "_dream.npz")) == [100, 200]
+    (folder / "000000100.json").write_text('{"gates_per_episode": 2, "return_mean": 7.5}')
+    assert evaluation_score(tmp_path, 100) == (2.0, 7.5) > evaluation_score(tmp_path, 200)
+    (folder / "000000100.json").write_text('{"gates_per_episode": null, "return_mean": 7.5}')
+    assert evaluation_score(tmp_path, 100) == evaluation_score(tmp_path, 200)

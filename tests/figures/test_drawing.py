@@ -1,0 +1,158 @@
+"""Plots: what is drawn is where it belongs, for every track, and no global state is left behind."""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+
+from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
+from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve, plot_top_down
+from dreamer_racing.training.metrics_file import read_metrics
+
+
+def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> Trajectory:
+    """From the start pose along its heading, 0 to 8 m/s."""
+    heading = math.radians(track.start_yaw_degrees)
+    direction = torch.tensor([math.cos(heading), math.sin(heading), 0.0])
+    speed = torch.linspace(0, 8, steps + 1).unsqueeze(1)
+    angle = torch.full((steps + 1,), heading)
+    return Trajectory(
+        position=torch.tensor(track.start_position) + 0.02 * speed.cumsum(0) * direction,
+        attitude=from_roll_pitch_yaw(0 * angle, 0 * angle, angle),
+        linear_velocity=speed * direction,
+        target_gate=torch.zeros(steps + 1, dtype=torch.int64),
+        action=torch.zeros(steps, 4),
+        pixels=None,
+        control_dt=0.02,
+        outcome=outcome,
+    )
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_every_track_fits_and_only_different_heights_get_a_side_view(name, tmp_path, figures):
+    track = load_track(name)
+    trajectory = straight_flight(track)
+    plot_top_down(track, trajectory, tmp_path / "new" / "plot.png")
+    with Image.open(tmp_path / "new" / "plot.png") as image:
+        assert image.width == 1350
+        assert 800 < image.height < 1500
+    panels = figures[0].axes
+    assert len(panels) == (2 if name == "split_s" else 1)
+    top = panels[0]
+    assert top.get_aspect() == 1.0
+    for low, high, limits in zip(track.bounds_low, track.bounds_high, (top.get_xlim(), top.get_ylim()), strict=False):
+        assert limits[0] < low < high < limits[1]
+    numbers = {text.get_text(): text.get_position() for text in top.texts if text.get_text().isdigit()}
+    assert list(numbers) == [str(number) for number in range(1, track.num_gates + 1)]
+    for number, place in numbers.items():
+        reach = math.dist(place, track.gates[int(number) - 1].position[:2])
+        assert reach == pytest.approx(track.shape.outer / 2 + 0.45)
+
+
+def test_path_is_coloured_by_speed_and_ends_with_the_crash(tmp_path, figures):
+    track = load_track("circle")
+    trajectory = straight_flight(track)
+    plot_top_down(track, trajectory, tmp_path / "plot.png")
+    (axes,) = figures[0].axes
+    line, arrows = axes.collections
+    assert line.get_clim() == (0.0, 8.0)
+    np.testing.assert_allclose(line.get_array(), np.linspace(0, 8, 61)[1:], rtol=1e-6)
+    np.testing.assert_allclose(line.get_segments()[-1][1], trajectory.position[-1, :2], rtol=1e-6)
+    assert len(arrows.get_offsets()) == 13  # 1.2 s, one every 0.1 s and one at the start
+    markers = {marker.get_marker(): marker.get_xydata()[0] for marker in axes.lines if marker.get_marker() != "None"}
+    np.testing.assert_allclose(markers["o"], track.start_position[:2])
+    np.testing.assert_allclose(markers["X"], trajectory.position[-1, :2])
+    assert axes.get_title(loc="left") == "circle: 1.20 s, up to 8.0 m/s (ground)"
+
+
+def test_no_crash_marker_without_a_crash(tmp_path, figures):
+    track = load_track("circle")
+    plot_top_down(track, straight_flight(track, outcome="finished"), tmp_path / "plot.png")
+    assert "X" not in [line.get_marker() for line in figures[0].axes[0].lines]
+
+
+def test_gates_are_bars_across_the_direction_of_flight():
+    track = load_track("figure8_decoys")
+    axes = Figure().subplots()
+    draw_track(axes, track)
+    bars = [line.get_xydata() for line in axes.lines]
+    assert len(bars) == len(track.decoys) + len(track.gates)
+    for bar, gate in zip(bars, (*track.decoys, *track.gates), strict=True):
+        np.testing.assert_allclose(bar.mean(0), gate.position[:2], atol=1e-9)
+        assert math.dist(*bar) == pytest.approx(track.shape.outer)
+        assert (bar[1] - bar[0]) @ np.array(gate.forward[:2]) == pytest.approx(0.0, abs=1e-9)
+    colors = [line.get_color() for line in axes.lines]
+    assert len(set(colors[:2])) == len(set(colors[2:])) == 1
+    assert colors[0] != colors[-1]
+
+
+def test_camera_looks_25_degrees_above_the_nose():
+    zero = torch.zeros(4)
+    pitch = torch.deg2rad(torch.tensor([0.0, 25.0, 115.0, 0.0]))  # nose down
+    yaw = torch.deg2rad(torch.tensor([0.0, 0.0, 0.0, 90.0]))
+    view = camera_directions(from_roll_pitch_yaw(zero, pitch, yaw))
+    cosine, sine = math.cos(math.radians(25)), math.sin(math.radians(25))
+    expected = torch.tensor([[cosine, 0, sine], [1, 0, 0], [0, 0, -1], [0, cosine, sine]])
+    torch.testing.assert_close(view, expected, atol=1e-6, rtol=0)
+
+
+def test_lost_state_can_be_drawn(tmp_path):
+    track = load_track("circle")
+    trajectory = straight_flight(track, outcome="non_finite_state")
+    trajectory.position[-1] = math.nan
+    trajectory.linear_velocity[-1] = math.nan
+    plot_top_down(track, trajectory, tmp_path / "plot.png")
+
+
+def write_metrics(path, rows: int = 200):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["env_steps", "episode/return", "loss", "loss_actor", "other", "empty"])
+        for row in range(rows):
+            writer.writerow([row * 1000, row if row % 2 else "", 400 - row, -0.1 if row else "nan", 1, ""])
+    return path
+
+
+def test_curves_of_a_run(tmp_path, figures):
+    metrics = write_metrics(tmp_path / "metrics.csv")
+    plot_curve(metrics, tmp_path / "curve.png", title="a run")
+    panels = figures[0].axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["Return", "Losses"]  # no gates in this file
+    assert panels[-1].get_xlabel() == "env_steps"
+    np.testing.assert_array_equal(panels[0].lines[-1].get_xdata(), np.arange(1, 200, 2) * 1000)
+    plot_curve(metrics, tmp_path / "other.svg", columns={"Mine": ["oth*"]})
+    assert [axes.get_title(loc="left") for axes in figures[1].axes] == ["Mine"]
+
+
+def test_empty_and_non_finite_cells_are_left_out(tmp_path):
+    table = read_metrics(write_metrics(tmp_path / "metrics.csv", rows=4)).columns
+    assert list(table) == ["episode/return", "loss", "loss_actor", "other"]
+    assert [values.tolist() for values in table["episode/return"]] == [[1000, 3000], [1, 3]]
+    assert table["loss_actor"][0].tolist() == [1000, 2000, 3000]
+
+
+def test_curves_of_nothing_are_refused(tmp_path):
+    metrics = write_metrics(tmp_path / "metrics.csv")
+    with pytest.raises(ValueError, match=r"bogus.*It has: episode/return, loss"):
+        plot_curve(metrics, tmp_path / "curve.png", columns={"Mine": ["bogus"]})
+    with pytest.raises(ValueError, match="nothing was logged"):
+        plot_curve(write_metrics(tmp_path / "metrics.csv", rows=0), tmp_path / "curve.png")
+
+
+def test_running_mean_keeps_constants_and_ends():
+    np.testing.assert_allclose(_smooth(np.full(10, 3.0), 4), 3.0)
+    np.testing.assert_allclose(_smooth(np.arange(5.0), 3), [0.5, 1, 2, 3, 3.5])
+    np.testing.assert_allclose(_smooth(np.arange(3.0), 0), [0, 1, 2])
+
+
+def test_pyplot_is_not_touched():
+    assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()

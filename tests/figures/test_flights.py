@@ -1,0 +1,205 @@
+"""Figures of evaluations: stored flights and dreams come back exactly, and what is drawn is what was stored."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.evaluation.dreams import (
+    CONTEXT,
+    PREDICTED,
+    STRIDE,
+    Dream,
+    dream_video,
+    film_strip,
+    record_dream,
+    shown_frames,
+)
+from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.flights import read_trajectory, write_trajectory
+from dreamer_racing.figures.drawing import CRASH_COLOR
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR
+from dreamer_racing.figures.flights import Flight, plot_dreams, plot_flights, profile_axis
+
+
+def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool = False) -> Trajectory:
+    generator = torch.Generator().manual_seed(0)
+    rows = {name: torch.randn(steps + 1, size, generator=generator) for name, size in (("p", 3), ("q", 4), ("v", 3))}
+    return Trajectory(
+        position=rows["p"],
+        attitude=rows["q"] / rows["q"].norm(dim=-1, keepdim=True),
+        linear_velocity=rows["v"] * 1e-7,
+        target_gate=torch.arange(steps + 1) // 25,
+        action=torch.rand(steps, 4, generator=generator),
+        pixels=torch.randint(0, 256, (steps + 1, 64, 64, 3), dtype=torch.uint8, generator=generator)
+        if pixels
+        else None,
+        control_dt=0.02,
+        outcome=outcome,
+    )
+
+
+CRASH_RGB = (224, 49, 49)  # `CRASH_COLOR`
+
+
+# --- stored flights ---
+
+
+@pytest.mark.parametrize("outcome", ["ground", "finished", None])
+def test_a_flight_comes_back_exactly(tmp_path, outcome):
+    before = random_flight(outcome=outcome)
+    before.position[-1] = math.nan
+    before.linear_velocity[-1, 0] = math.inf
+    write_trajectory(tmp_path / "new" / "flight.csv", before, "figure8_decoys")
+    after, track = read_trajectory(tmp_path / "new" / "flight.csv")
+    assert (track, after.control_dt, after.outcome, after.pixels) == ("figure8_decoys", 0.02, outcome, None)
+    for name in ("position", "attitude", "linear_velocity", "target_gate", "action"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=0, atol=0, equal_nan=True)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["flight.csv"]
+
+
+@pytest.mark.parametrize("cut", [1, 30, 700, 5000])
+def test_half_a_flight_is_refused(tmp_path, cut):
+    path = tmp_path / "flight.csv"
+    write_trajectory(path, random_flight(), "circle")
+    path.write_bytes(path.read_bytes()[:-cut])
+    with pytest.raises(ValueError, match=r"flight\.csv was cut short"):
+        read_trajectory(path)
+
+
+def test_another_table_is_no_flight(tmp_path):
+    (tmp_path / "metrics.csv").write_text("env_steps,loss\n1,2\n")
+    with pytest.raises(ValueError, match="holds no trajectory: its columns should be t, x, y, z"):
+        read_trajectory(tmp_path / "metrics.csv")
+    (tmp_path / "garbage.csv").write_text('"' + "x" * 200_000)
+    with pytest.raises(ValueError, match="holds no trajectory: field larger than"):
+        read_trajectory(tmp_path / "garbage.csv")
+
+
+# --- stored dreams ---
+
+
+def brighter(batch, context: int) -> torch.Tensor:
+    """Pretend to reconstruct by adding 1, and to predict by writing the number of the context."""
+    images = batch["pixels"] // 2 + 1
+    images[:, context:] = context
+    return images
+
+
+DREAMER = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(decoder=True)), open_loop=brighter)
+
+
+def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
+    flight = random_flight(steps=100, pixels=True)
+    dream = record_dream(DREAMER, flight, windows=2)
+    assert dream is not None and dream.real.shape == (2, CONTEXT + PREDICTED, 64, 64, 3)
+    assert dream.frame_dt == pytest.approx(0.02 * STRIDE)
+    starts = (0, (101 - (STRIDE * (CONTEXT + PREDICTED - 1) + 1)) // 2)
+    for real, start in zip(dream.real, starts, strict=True):
+        np.testing.assert_array_equal(real, flight.pixels[start::STRIDE][: CONTEXT + PREDICTED])
+    np.testing.assert_array_equal(dream.reconstructed, dream.real // 2 + 1)
+    np.testing.assert_array_equal(dream.imagined[:, :CONTEXT], dream.reconstructed[:, :CONTEXT])
+    assert (dream.imagined[:, CONTEXT:] == STRIDE * (CONTEXT - 1) + 1).all()  # the last seen record is a stored one
+    dream.save(tmp_path / "a_dream.npz")
+    again = Dream.load(tmp_path / "a_dream.npz")
+    for name in ("real", "reconstructed", "imagined"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(dream, name))
+    assert (again.context, again.frame_dt) == (dream.context, dream.frame_dt)
+
+
+def test_short_flights_and_agents_without_decoder_leave_no_dream():
+    assert record_dream(DREAMER, random_flight(steps=CONTEXT * STRIDE - 1, pixels=True)) is None
+    shortest = record_dream(DREAMER, random_flight(steps=CONTEXT * STRIDE, pixels=True))
+    assert shortest is not None and shortest.real.shape[1] == CONTEXT + 1
+    blind = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(decoder=None)))
+    assert record_dream(blind, random_flight(pixels=True)) is None
+    assert record_dream(DREAMER, random_flight()) is None
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:2000], lambda data: data[:2000] + bytes(99) + data[2099:]])
+def test_half_a_dream_is_refused(tmp_path, damage):
+    path = tmp_path / "a_dream.npz"
+    record_dream(DREAMER, random_flight(pixels=True)).save(path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match="holds no dream, or half of one"):
+        Dream.load(path)
+
+
+def flat_dream(context: int = 3, frames: int = 13) -> Dream:
+    """Real is 10 everywhere, reconstructed 20, imagined 30."""
+    images = [np.full((1, frames, 8, 8, 3), value, dtype=np.uint8) for value in (10, 20, 30)]
+    return Dream(*images, context=context, frame_dt=0.08)
+
+
+def test_film_strip_places_and_colours():
+    strip = film_strip(flat_dream(), [2, 3], scale=2, border=3)
+    assert strip.shape == (3 * 22, 2 * 22, 3)
+    for row, value in enumerate((10, 20, 30)):
+        for column in range(2):
+            tile = strip[22 * row : 22 * (row + 1), 22 * column : 22 * (column + 1)]
+            assert (tile[3:19, 3:19] == value).all()
+            border = (255, 255, 255) if row == 0 else OPEN_LOOP_COLOR if row == 2 and column == 1 else CONTEXT_COLOR
+            assert (tile[0] == border).all() and (tile[:, -1] == border).all()
+
+
+def test_shown_frames_are_the_end_of_the_context_and_even_after_it():
+    assert shown_frames(flat_dream(), 6) == [1, 2, 3, 6, 9, 12]
+    assert shown_frames(flat_dream(frames=4), 6) == [1, 2, 3]
+
+
+def test_dreams_of_three_stages(tmp_path, figures):
+    plot_dreams([(name, flat_dream()) for name in ("early", "middle", "late")], tmp_path / "imagined.png")
+    panels = figures[0].axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["early", "middle", "late"]
+    labels = [text.get_text() for text in panels[0].get_xticklabels()]
+    assert labels[:3] == ["-0.08 s", "+0.00 s", "+0.08 s"] and labels[-1] == "+0.80 s"
+    video = dream_video([("early", flat_dream(frames=5)), ("late", flat_dream())], scale=2)
+    assert video.shape == (13, 2 * (20 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)
+
+
+# --- figures ---
+
+
+def test_flights_side_by_side(tmp_path, figures):
+    flights = [Flight(name, load_track(name), random_flight()) for name in ("figure8", "figure8_decoys")]
+    plot_flights(flights, tmp_path / "flights.png", over="time")
+    maps, profiles = figures[0].axes[0:4:2], figures[0].axes[1:4:2]
+    assert [axes.get_title(loc="left").split("\n")[0] for axes in maps] == ["figure8", "figure8_decoys"]
+    assert "2 gates in 1.20 s (ground)" in maps[0].get_title(loc="left")
+    for axes in profiles:
+        assert axes.get_xlabel() == "time (s)" and axes.get_xlim() == (0.0, pytest.approx(1.2))
+        assert [text.get_text() for text in axes.texts] == ["1", "2"]
+        assert [line.get_color() for line in axes.lines if line.get_marker() == "X"] == [CRASH_COLOR]
+    labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert labels == ["gate", "decoy", "start", "crash", "camera", "bounding box"]
+
+
+def test_axis_of_the_speed_profile():
+    flight = random_flight(steps=2)
+    flight.position[:] = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
+    np.testing.assert_allclose(profile_axis(flight, "distance"), [0, 5, 17])
+    np.testing.assert_allclose(profile_axis(flight, "time"), [0, 0.02, 0.04])
+    with pytest.raises(ValueError, match="over=height: there are distance, time"):
+        plot_flights([Flight("a", load_track("circle"), flight)], Path("a.png"), over="height")
+
+
+def test_what_was_left_out_is_written_above(tmp_path, figures):
+    flight = Flight("lost", load_track("split_s"), random_flight())
+    plot_flights([flight], tmp_path / "flights.png")
+    plot_flights([flight], tmp_path / "warned.png", problems=["a_run without its last flight"])
+    plot_dreams([("early", flat_dream())], tmp_path / "dreams.png", problems=[f"problem {i}" for i in range(10)])
+    assert [figure.get_suptitle() for figure in figures[:2]] == ["", "! a_run without its last flight"]
+    lines = figures[2].get_suptitle().splitlines()
+    assert lines[0] == "! problem 0" and lines[-2:] == ["! problem 7", "! and 2 more"]
+    with Image.open(tmp_path / "flights.png") as plain, Image.open(tmp_path / "warned.png") as warned:
+        assert plain.width > 700 and warned.width == plain.width
+        assert warned.height - plain.height == pytest.approx(150 * (0.16 + 0.1), abs=2)
+        above = warned.crop((0, 0, warned.width, warned.height - plain.height)).convert("RGB")
+        assert {color for _, color in above.getcolors(10_000)} > {CRASH_RGB, (255, 255, 255)}

@@ -1,0 +1,167 @@
+"""Figures of training: what is drawn for curves and for variants, told from the figures' artists."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgba
+from tests.test_curves import write_run
+
+from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
+from dreamer_racing.figures.curves import Curve, LearningCurves, learning_curves
+from dreamer_racing.figures.drawing import INK
+from dreamer_racing.figures.learning import OTHER_COLOR, line_styles, plot_comparison, plot_learning_curves
+from dreamer_racing.figures.runs import CurveKey, find_runs, read_runs
+from tests.running_recipes import compose
+
+
+def legend_texts(figure) -> list[str]:
+    (legend,) = [child for child in figure.axes[-1].get_children() if hasattr(child, "get_texts")]
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, figures):
+    for algorithm in ("sac", "dreamer_v3"):
+        for track in ("kidney", "circle"):
+            for seed in range(2):
+                write_run(tmp_path, f"{algorithm}_{track}_seed{seed}", track=track, seed=seed, algorithm=algorithm)
+    (write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo") / "metrics.csv").unlink()
+    runs, problems = read_runs(find_runs([tmp_path]))
+    curves = learning_curves(runs, ["return", "success_rate"], problems=problems)
+    plot_learning_curves(curves, tmp_path / "figure.png")
+    *panels, below = figures[0].axes
+    assert [axes.get_title() for axes in panels] == ["Circle", "Kidney", "", ""]
+    assert [axes.get_ylabel() for axes in panels] == [
+        "Return\n(training episodes)", "", "Success rate\n(deterministic)", ""
+    ]  # fmt: skip
+    assert all(axes.get_xlim() == (0.0, 2000.0) and len(axes.lines) == 2 for axes in panels)
+    assert all(len(axes.collections) == 2 for axes in panels)  # bands
+    assert legend_texts(figures[0]) == ["DreamerV3 (2 seeds)", "SAC (2 seeds)"]
+    assert figures[0].get_suptitle() == "! ppo_circle_seed0 left out: it has no metrics.csv"
+    (legend,) = [child for child in below.get_children() if hasattr(child, "get_texts")]
+    assert "standard deviation (n − 1) (none of one seed); running mean" in legend.get_title().get_text()
+    colors = [line.get_color() for line in legend.get_lines()]
+    assert len(set(colors)) == 2
+    assert {line.get_color() for line in panels[0].lines} == set(colors)
+
+
+def curve(key: CurveKey, seeds: list[int], quantity: str = "return") -> Curve:
+    """A curve at 0, 100, 200 ... env_steps."""
+    steps, zero = 100.0 * np.arange(len(seeds)), np.zeros(len(seeds))
+    return Curve(key, quantity, steps, zero, zero - 1, zero + 1, np.array(seeds))
+
+
+def test_the_legend_says_where_seeds_are_missing(tmp_path, figures):
+    same, ends, differ = (CurveKey("circle", name, "") for name in ("dreamer_v3", "ppo", "sac"))
+    curves = [
+        curve(same, [3, 3, 3, 0]),  # ends together, before the others
+        curve(ends, [3, 3, 1, 1]),
+        curve(differ, [1] * 4),
+        curve(differ._replace(track="kidney"), [2, 2, 1, 1]),
+        curve(differ._replace(track="kidney"), [0, 0, 0, 1], "lap_time"),
+    ]
+    plot_learning_curves(LearningCurves(curves, {}, "mean", 10.0, []), tmp_path / "figure.png")
+    assert legend_texts(figures[0]) == [
+        "DreamerV3 (3 seeds)",
+        "PPO (3 seeds, 1 at the end)",
+        "SAC (Circle: 1 seed; Kidney: 2 seeds, 1 at the end)",
+    ]
+
+
+def ablation_keys() -> list[CurveKey]:
+    return [CurveKey("", "dreamer_v3", name) for name in compose("ablation").variants]
+
+
+def test_every_variant_of_the_ablation_has_a_style_of_its_own():
+    keys = ablation_keys()
+    assert len(keys) >= 12
+    styles = line_styles([*keys, CurveKey("", "ppo", "")])
+    looks = {(style["color"], str(style["linestyle"])) for style in styles.values()}
+    assert len(looks) == len(keys) + 1
+    assert [key.variant for key in keys if styles[key]["linewidth"] > 1.5] == ["default"]
+
+
+def test_sixteen_variants_can_be_told_apart_and_no_more():
+    keys = [CurveKey("", "sac", f"v{index:02}") for index in range(17)]
+    styles = line_styles(keys[:16])
+    assert len({(style["color"], str(style["linestyle"])) for style in styles.values()}) == 16
+    few = list(line_styles(keys[:4]).values())  # differ in both
+    assert len({style["color"] for style in few}) == len({str(style["linestyle"]) for style in few}) == 4
+    with pytest.raises(ValueError, match="17 variants of sac: a figure can tell 16 apart"):
+        line_styles(keys)
+
+
+def test_among_many_variants_the_default_stands_out(tmp_path, figures):
+    curves = [curve(key._replace(track="circle"), [3, 3]) for key in ablation_keys()]
+    plot_learning_curves(LearningCurves(curves, {}, "mean", 10.0, []), tmp_path / "figure.png")
+    panel = figures[0].axes[0]
+    assert len(panel.lines) == len(curves) and len(panel.collections) == 1  # one band
+    assert panel.lines[-1].get_linewidth() == max(line.get_linewidth() for line in panel.lines)  # drawn last
+    assert legend_texts(figures[0])[0] == "DreamerV3, default (3 seeds)"
+
+
+# --- variants side by side ---
+
+
+def result(variant: str, gates: list[float] | None, seeds: int, algorithm: str = "dreamer_v3") -> VariantResult:
+    values = {} if gates is None else {"gates": np.array(gates)}
+    return VariantResult(CurveKey("circle", algorithm, variant), seeds, values, (800, 1000), None)
+
+
+RETURN = "evaluation_return"
+COMPARISON = Comparison(
+    [result("default", [1.0, 2.0, 6.0], 3), result("no_replay", [4.0], 2), result("lost", [], 1)], ["late left out"]
+)
+
+
+def test_what_may_be_negative_has_no_bar_from_zero(tmp_path, figures):
+    returns = VariantResult(CurveKey("circle", "ppo", "default"), 2, {RETURN: np.array([-4.0, -2.0])}, (0, 1), None)
+    plot_comparison(Comparison([returns], []), tmp_path / "comparison.png")
+    (axes,) = figures[0].axes
+    assert not axes.patches
+    assert [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "D"] == [[[-3.0, 0.0]]]
+
+
+def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, figures):
+    plot_comparison(COMPARISON, tmp_path / "new" / "comparison.png")
+    assert (tmp_path / "new" / "comparison.png").exists()
+    (axes,) = figures[0].axes  # no values of the other quantity
+    assert axes.get_title(loc="left") == "Gates per episode (deterministic)"
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["default", "no replay", "lost"]
+    bars = axes.patches
+    assert [(bar.get_width(), bar.get_facecolor()) for bar in bars] == [
+        (3.0, to_rgba(INK)),
+        (4.0, to_rgba(OTHER_COLOR)),
+    ]
+    (spread,) = [line.get_segments()[0] for line in axes.collections]  # none of a single seed
+    deviation = np.sqrt((4 + 1 + 9) / 2)
+    np.testing.assert_allclose(spread, [(3 - deviation, 0), (3 + deviation, 0)])
+    dots = [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "o"]
+    assert dots == [[[1, 0], [2, 0], [6, 0]], [[4, 1]]]
+    dashed = [line.get_xdata() for line in axes.lines if line.get_marker() == "None"]
+    assert dashed == [[3.0, 3.0]]
+    assert [(note.get_text(), note.xy) for note in axes.texts] == [("n = 1", (4.0, 1)), ("no values", (0.0, 2))]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first on top
+
+
+def test_the_picture_says_how_and_what_was_left_out(tmp_path, figures):
+    plot_comparison(COMPARISON, tmp_path / "comparison.png")
+    assert figures[0].get_suptitle() == "! late left out"
+    assert " ".join(figures[0].get_supxlabel().split()) == CAPTION
+
+
+def test_several_algorithms_are_named_and_have_no_common_reference(tmp_path, figures):
+    plot_comparison(Comparison([result("", [1.0], 1), result("", [2.0], 1, "ppo")], []), tmp_path / "comparison.png")
+    (axes,) = figures[0].axes
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == ["dreamer_v3 circle default", "ppo circle default"]
+    assert all(line.get_marker() == "o" for line in axes.lines)
+
+
+def test_variants_without_any_value_are_still_listed(tmp_path, figures):
+    nothing = [replace(one, values={}) for one in COMPARISON.results]
+    plot_comparison(Comparison(nothing, []), tmp_path / "comparison.png")
+    (axes,) = figures[0].axes
+    assert len(axes.get_yticklabels()) == 3 and not axes.patches

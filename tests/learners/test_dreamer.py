@@ -1,0 +1,433 @@
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.finite_guard import NonFiniteLossError
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
+from dreamer_racing.modules import SIZES, Interface
+
+CONFIG = LearnerConfig(imagination_horizon=4, lr=1e-3, warmup_updates=0)
+
+
+def make_batch(batch: int = 3, time: int = 6) -> TensorDict:
+    """Windows with a crash, a truncation and the resets that follow them."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.zeros(batch, time, 64, 64, 3, dtype=torch.uint8)
+    for step in range(time):
+        pixels[:, step, 8 * step : 8 * step + 16, 10:30] = 200  # a bar that moves
+    flag = torch.zeros(batch, time, 1, dtype=torch.bool)
+    is_init, terminated, truncated = flag.clone(), flag.clone(), flag.clone()
+    terminated[0, 2] = truncated[1, 3] = True
+    is_init[0, 3] = is_init[1, 4] = is_init[2, 0] = True
+    return TensorDict(
+        {
+            "pixels": pixels,
+            "previous_action": (torch.rand(batch, time, 4, generator=generator) * 2 - 1).masked_fill(is_init, 0.0),
+            "reward": torch.randn(batch, time, 1, generator=generator).masked_fill(is_init, 0.0),
+            "is_init": is_init,
+            "terminated": terminated,
+            "truncated": truncated,
+        },
+        [batch, time],
+    )
+
+
+def test_update_returns_scalar_tensors_and_moves_every_network():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    before = copy.deepcopy(learner.agent.state_dict())
+    batch = make_batch()
+    metrics = learner.update(batch)
+    metrics = learner.update(batch)
+    for key, value in metrics.items():
+        assert value.shape == (), key
+        assert not value.requires_grad, key
+        assert value.isfinite(), key
+    expected = {"loss", "loss_image", "kl", "entropy", "return_scale", "return_mean", "reward_error", "image_error"}
+    assert expected < metrics.keys()
+    assert {f"gradient_norm/{name}" for name in ("world_model", "actor", "critic")} < metrics.keys()
+    for name, value in learner.agent.state_dict().items():
+        still = name.endswith(("initial_belief", "min_std"))
+        assert torch.equal(value, before[name]) == still, name
+
+
+def test_losses_fall_on_a_fixed_batch():
+    torch.manual_seed(0)
+    learner = DreamerLearner("debug", config=replace(CONFIG, lr=3e-3), seed=0)
+    batch = make_batch()
+    first = learner.update(batch)
+    for _ in range(100):
+        last = learner.update(batch)
+    assert last["image_error"] < 0.4 * first["image_error"]
+    assert last["loss_reward"] < 0.5 * first["loss_reward"]
+    assert last["loss_continue"] < 0.5 * first["loss_continue"]
+    assert last["loss_critic"] < first["loss_critic"]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_gradients_do_not_leak_between_networks(shared):
+    """The actor's and the imagined critic's losses stay theirs; the replayed one enters the model only if asked to."""
+    learner = DreamerLearner("debug", config=replace(CONFIG, replay_value_gradient=shared), seed=0)
+    with torch.no_grad():
+        learner.agent.critic.head.mlp.output.weight.normal_()
+    losses = learner.compute_losses(make_batch())
+    reached = {}
+    for key in [key for key in losses if key.startswith("loss_")]:
+        learner.agent.zero_grad(set_to_none=True)
+        losses[key].backward(retain_graph=True)
+        reached[key] = {
+            name
+            for name, network in learner.agent.named_children()
+            if any(parameter.grad is not None for parameter in network.parameters())
+        }
+    world_model = {key for key in reached if reached[key] == {"world_model"}}
+    assert world_model == {"loss_image", "loss_reward", "loss_continue", "loss_dynamics", "loss_representation"}
+    assert reached["loss_actor"] == {"actor"}
+    assert reached["loss_critic"] == {"critic"}
+    assert reached["loss_replay_critic"] == ({"critic", "world_model"} if shared else {"critic"})
+
+
+def test_resume_equals_never_having_stopped():
+    batch = make_batch()
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(batch)
+    saved = copy.deepcopy(learner.state_dict())
+    resumed = DreamerLearner("debug", config=CONFIG, seed=1)
+    resumed.load_state_dict(saved)
+    assert resumed.updates == 1
+    results = []
+    for each in (learner, resumed):
+        torch.manual_seed(5)
+        results.append([each.update(batch) for _ in range(2)][-1])
+    assert results[0].keys() == results[1].keys()
+    for key, value in results[0].items():
+        assert torch.equal(value, results[1][key]), key
+    for name, value in learner.agent.state_dict().items():
+        assert torch.equal(value, resumed.agent.state_dict()[name]), name
+
+
+def test_return_normaliser_is_saved():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.losses["actor"].return_normalizer.high.fill_(7.0)
+    resumed = DreamerLearner("debug", config=CONFIG, seed=0)
+    resumed.load_state_dict(learner.state_dict())
+    assert resumed.losses["actor"].return_normalizer.scale().item() == 7.0
+
+
+def test_state_survives_a_file(tmp_path):
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(make_batch())
+    torch.save(learner.state_dict(), tmp_path / "learner.pt")
+    DreamerLearner("debug", config=CONFIG).load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=True))
+
+
+def test_state_of_another_size_is_refused_with_what_to_do():
+    learner = DreamerLearner("debug", config=CONFIG)
+    other = DreamerLearner(replace(SIZES["debug"], name="wider", units=32), config=CONFIG)
+    with pytest.raises(ValueError, match=r"'debug'.*'wider'.*units 16 there, 32 here.*model=debug") as error:
+        other.load_state_dict(learner.state_dict())
+    assert "\n" not in str(error.value)
+
+
+def learner_of(world_model_loss, seed, **interface):
+    if WORLD_MODEL_LOSSES[world_model_loss].reads_privileged:
+        interface["privileged_dim"] = 21
+    return DreamerLearner(
+        "debug", Interface(**interface), replace(CONFIG, world_model_loss=world_model_loss), seed=seed
+    )
+
+
+def assert_refused(saved, learner, words):
+    before = copy.deepcopy(learner.state_dict())
+    with pytest.raises(ValueError, match=words) as error:
+        learner.load_state_dict(saved.state_dict())
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+    after = learner.state_dict()
+    for name, value in before["agent"].items():
+        assert torch.equal(value, after["agent"][name]), name
+    for name, loss in before["losses"].items():
+        assert all(torch.equal(value, after["losses"][name][key]) for key, value in loss.items()), name
+    assert after["updates"] == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("privileged", "reconstruction"), ("decoder_free", "reward_only"), ("informed", "privileged")]
+)
+def test_state_of_another_loss_is_refused(first, second):
+    for there, here in ((first, second), (second, first)):
+        saved = learner_of(there, 1)
+        saved.updates = 7
+        assert_refused(saved, learner_of(here, 2), r"beyond this learner's, and lacks .* trained with another loss")
+
+
+@pytest.mark.parametrize(
+    ("there", "here"),
+    [
+        ({"action_dim": 6}, {}),
+        ({"pixels": False, "vector_dim": 21}, {}),
+        ({"pixels": False, "vector_dim": 21}, {"pixels": False, "vector_dim": 9}),
+    ],
+    ids=["actions", "pixels", "numbers"],
+)
+def test_state_of_another_environment_is_refused(there, here):
+    assert_refused(learner_of("reconstruction", 1, **there), learner_of("reconstruction", 2, **here), "environment")
+
+
+def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
+    """Names and shapes of all that depends on the images' size, as checkpoints have them since the first."""
+    learner = DreamerLearner("debug", config=CONFIG, seed=1)
+    saved = learner.state_dict()
+    shapes = {key: list(value.shape) for key, value in saved["agent"].items() if value.ndim > 1}
+    expected = {
+        "encoder.encoders.pixels.convolutions.0.weight": [2, 12, 4, 4],
+        "encoder.encoders.pixels.convolutions.1.weight": [4, 2, 4, 4],
+        "encoder.encoders.pixels.convolutions.2.weight": [8, 4, 4, 4],
+        "rssm.posterior_hidden.second.weight": [16, 128],
+        "decoder.projection.linear.weight": [128, 48],
+        "decoder.convolutions.0.weight": [8, 4, 4, 4],
+        "decoder.convolutions.1.weight": [4, 2, 4, 4],
+        "decoder.convolutions.2.weight": [2, 12, 4, 4],
+    }
+    for key, shape in expected.items():
+        assert shapes[f"world_model.{key}"] == shape, key
+    assert not [key for key in shapes if ".encoder." in key or ".decoder." in key if key[12:] not in expected]
+    del saved["image_size"]  # which older checkpoints do not have
+    resumed = DreamerLearner("debug", config=CONFIG, seed=2)
+    resumed.load_state_dict(saved)
+    for key, value in resumed.agent.state_dict().items():
+        assert torch.equal(value, saved["agent"][key]), key
+
+
+@pytest.mark.parametrize("loss", ["reconstruction", "decoder_free"])
+def test_state_of_another_image_size_is_refused(loss):
+    small, large = learner_of(loss, 1, image_size=32), learner_of(loss, 2, image_size=96)
+    assert_refused(small, large, "images of 32 × 32 pixels, not 96 × 96: choose env.image_size=32")
+    older = small.state_dict() | {"agent": learner_of(loss, 3).agent.state_dict()}
+    del older["image_size"]
+    with pytest.raises(ValueError, match="64 × 64 pixels, not 96 × 96"):
+        large.load_state_dict(older)
+
+
+@pytest.mark.parametrize("image_size", [32, 96])
+def test_every_image_size_updates(image_size):
+    learner = learner_of("reconstruction", 0, image_size=image_size)
+    batch = make_batch()
+    batch["pixels"] = batch["pixels"].repeat(1, 1, 2, 2, 1)[:, :, :image_size, :image_size]
+    metrics = learner.update(batch)
+    assert metrics["loss"].isfinite()
+    torch.testing.assert_close(metrics["loss_image"], metrics["image_error"] * image_size**2 * 3)
+    assert learner.open_loop(batch, context=2).shape == (3, 6, image_size, image_size, 3)
+
+
+def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
+    first = DreamerLearner("debug", config=CONFIG, seed=0)
+    assert torch.equal(torch.rand(1), expected)
+    second = DreamerLearner("debug", config=CONFIG, seed=0)
+    for name, value in first.agent.state_dict().items():
+        assert torch.equal(value, second.agent.state_dict()[name]), name
+
+
+def test_imagination_may_start_from_a_subset():
+    learner = DreamerLearner("debug", config=replace(CONFIG, imagination_starts=5), seed=0)
+    seen = []
+    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    metrics = learner.update(make_batch())
+    assert seen[0].batch_size == (4, 5)
+    assert metrics["loss_replay_critic"].isfinite()
+
+
+def test_every_terminal_record_is_a_start_of_no_weight():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    seen = []
+    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    learner.update(make_batch())
+    weight = seen[0]["weight"].view(4, 3, 6)
+    assert torch.equal(weight[0], 1.0 - make_batch()["terminated"].squeeze(-1).float())
+    assert torch.equal(weight[:, 0, 2], torch.zeros(4))
+
+
+def test_open_loop_video():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    images = learner.open_loop(make_batch(), context=2)
+    assert images.shape == (3, 6, 64, 64, 3)
+    assert images.dtype == torch.uint8
+
+
+def spoil_reward(value):
+    return lambda batch, learner: batch["reward"][0, 1].fill_(value)
+
+
+def spoil_gradient(batch, learner):
+    weight = next(learner.agent.critic.head.parameters())
+    weight.register_hook(lambda gradient: gradient * math.inf)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoil_reward(math.nan), spoil_reward(math.inf), spoil_reward(-math.inf), spoil_gradient],
+    ids=["nan", "inf", "-inf", "gradient"],
+)
+def test_what_would_spoil_the_networks_is_refused(spoil):
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    before, batch = copy.deepcopy(learner.agent.state_dict()), make_batch()
+    spoil(batch, learner)
+    with pytest.raises(NonFiniteLossError, match="not finite") as error:
+        learner.update(batch)
+    assert error.value.batch["reward"].shape == (3, 6, 1)
+    assert learner.updates == 0
+    for name, value in learner.agent.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_policy_shares_the_parameters():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    policy = learner.policy(deterministic=True)
+    assert policy.deterministic
+    assert policy.actor is learner.agent.actor
+    assert policy.rssm is learner.agent.world_model.rssm
+
+
+def test_losses_are_chosen_by_name(monkeypatch):
+    class BoldActorLoss(ReinforceLoss):
+        """Has ten times the entropy."""
+
+        def forward(self, tensordict):
+            self.entropy_scale.fill_(3e-3)
+            return super().forward(tensordict)
+
+    monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss)
+    learner = DreamerLearner("debug", config=replace(CONFIG, actor_loss="bold"), seed=0)
+    assert isinstance(learner.losses["actor"], BoldActorLoss)
+    learner.update(make_batch())
+    with pytest.raises(ValueError, match="'timid'.*reinforce"):
+        DreamerLearner("debug", config=replace(CONFIG, actor_loss="timid"))
+
+
+@pytest.mark.parametrize("recurrence", ["block", "dense"])
+@pytest.mark.parametrize("norm", ["rms", "layer"])
+def test_every_variant_updates(recurrence, norm):
+    size = replace(
+        SIZES["debug"],
+        name="variant",
+        recurrence=recurrence,
+        blocks=2 if recurrence == "block" else 1,
+        norm=norm,
+        learned_initial=norm == "layer",
+        strided=norm == "layer",
+        cnn_kernel=4 if norm == "layer" else 5,
+    )
+    learner = DreamerLearner(size, config=CONFIG, seed=0)
+    assert learner.update(make_batch())["loss"].isfinite()
+
+
+@pytest.mark.parametrize("recurrence", ["block", "dense"])
+def test_mixed_precision_is_close_to_full(recurrence):
+    size = replace(SIZES["debug"], name="variant", recurrence=recurrence, blocks=2, norm="rms")
+    results = []
+    for mixed_precision in (False, True):
+        learner = DreamerLearner(size, config=replace(CONFIG, mixed_precision=mixed_precision), seed=0)
+        torch.manual_seed(0)
+        results.append(learner.update(make_batch()))
+        assert all(parameter.dtype == torch.float32 for parameter in learner.agent.parameters())
+        assert all(value.dtype == torch.float32 and value.isfinite() for value in results[-1].values())
+    assert not torch.equal(results[0]["loss"], results[1]["loss"]), "nothing was computed in bfloat16"
+    torch.testing.assert_close(results[0]["loss"], results[1]["loss"], rtol=1e-2, atol=0)
+
+
+def test_rates_are_the_settings_of_the_learner_that_goes_on():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner.update(make_batch())
+    other = DreamerLearner("debug", config=replace(CONFIG, lr=1e-5, behavior_lr=1e-6, warmup_updates=7), seed=1)
+    other.load_state_dict(copy.deepcopy(learner.state_dict()))
+    assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6]
+    assert {group["warmup_steps"] for group in other.optimizer.param_groups} == {7}
+    assert other.updates == 1
+
+
+def test_what_is_scheduled_reaches_optimiser_and_losses_and_returns_to_what_is_configured():
+    learner = DreamerLearner("debug", config=replace(CONFIG, lr=1e-3, behavior_lr=4e-4), seed=0)
+
+    def settings() -> list[float]:
+        actor, critic = learner.losses["actor"], learner.losses["critic"]
+        rates = [group["lr"] for group in learner.optimizer.param_groups]
+        return [*rates, learner.discount, float(actor.discount), float(critic.discount), float(actor.entropy_scale)]
+
+    learner.adjust(rates=0.5, discount=0.9, entropy_scale=0.1)
+    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    learner.update(make_batch())
+    learner.adjust()
+    configured = CONFIG.discount
+    assert settings() == pytest.approx([1e-3, 4e-4, configured, configured, configured, CONFIG.entropy_scale])
+
+
+def test_a_discount_of_zero_leaves_only_the_next_reward():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
+    learner.adjust(discount=0.0)
+    context = learner.losses["world_model"](make_batch()).pop("replay_context")
+    imagined = learner.losses["actor"](learner._choose_starts(context, make_batch()))
+    returns = imagined["imagination"]["lambda_return"]
+    assert returns.mean().item() == pytest.approx(imagined["imagined_reward"].item(), abs=1e-5)
+
+
+def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
+    learner = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=0)
+    assert learner.evaluation_policy().actor is learner.averaged.actor
+    assert learner.policy().actor is learner.agent.actor
+    before = {name: value.clone() for name, value in learner.averaged.named_parameters()}
+    learner.update(make_batch())
+    trained = dict(learner.agent.named_parameters())
+    for name, value in learner.averaged.named_parameters():  # the first update: the mean of all there are
+        torch.testing.assert_close(value, trained[name].detach())
+    for _ in range(4):  # 1/2, 1/3, then the rate itself
+        before = {name: value.clone() for name, value in learner.averaged.named_parameters()}
+        learner.update(make_batch())
+    for name, value in learner.averaged.named_parameters():
+        torch.testing.assert_close(value, torch.lerp(before[name], trained[name].detach(), 0.25))
+    resumed = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=1)
+    resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for name, value in resumed.averaged.named_parameters():
+        assert torch.equal(value, dict(learner.averaged.named_parameters())[name]), name
+
+
+def test_without_averages_the_trained_weights_fly():
+    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor
+
+
+def test_imagination_begins_in_the_newest_windows_where_it_is_told_to():
+    config = replace(CONFIG, imagination_starts=8, imagine_recent=True)
+    learner, batch = DreamerLearner("debug", config=config, seed=0), make_batch(batch=4, time=6)
+    batch["recent"] = torch.tensor([False, False, True, True]).unsqueeze(-1).expand(4, 6)
+    latents = TensorDict({"belief": torch.zeros(4, 6, 32), "state": torch.zeros(4, 6, 16)}, [4, 6])
+    latents["belief"][2:] = 1.0
+    for _ in range(10):
+        assert learner._choose_starts(latents, batch)["belief"].min() == 1.0
+    learner.config = replace(config, imagination_starts=20)  # more than the 12 there are: the others fill up
+    assert learner._choose_starts(latents, batch)["belief"][:, 0].sum() == 12
+
+
+def test_the_smallest_deviation_is_scheduled_saved_and_flown():
+    learner = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=0)
+    features = torch.zeros(1, 48)
+    assert learner.agent.actor(features).std.min() >= 0.4
+    learner.adjust(min_std=0.2)
+    with torch.no_grad():
+        learner.agent.actor.mlp.output.bias.fill_(-50.0)
+    assert learner.agent.actor(features).std.max().item() == pytest.approx(0.2)
+    restored = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=1)
+    restored.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for agent in (restored.agent, restored.averaged):
+        assert agent.actor.min_std.item() == pytest.approx(0.2)
+    older = learner.state_dict()
+    del older["agent"]["actor.min_std"]
+    other = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4), seed=1)
+    other.load_state_dict(older)
+    assert other.agent.actor.min_std.item() == pytest.approx(0.4)

@@ -1,0 +1,147 @@
+"""PPO: advantages by hand and against TorchRL's own, learning on a bandit, and states that come back."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.objectives.value import GAE
+
+from dreamer_racing.learners import NetworkSize, PPOConfig, PPOLearner
+from dreamer_racing.learners.finite_guard import NonFiniteLossError
+from dreamer_racing.modules import Interface
+
+SMALL, NUMBERS = NetworkSize(2, 16), Interface(action_dim=1, pixels=False, vector_dim=1)
+
+
+def make_rollout(
+    vector: Tensor, following: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor
+) -> TensorDict:
+    """A rollout ``[N, T]`` of columns ``(N, T)``."""
+    batch = list(vector.shape)
+    ended = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    return TensorDict(
+        {
+            "vector": vector.unsqueeze(-1),
+            "action": torch.zeros(*batch, 1),
+            "action_log_prob": torch.zeros(batch),
+            "next": {
+                "vector": following.unsqueeze(-1),
+                "reward": reward.unsqueeze(-1),
+                **{key: value.unsqueeze(-1) for key, value in ended.items()},
+            },
+        },
+        batch,
+    )
+
+
+def random_rollout(num_envs: int = 4, steps: int = 12) -> TensorDict:
+    """Episodes that end either way; what comes next is what is seen in the next step unless one ended."""
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.rand(2, num_envs, steps, generator=generator) < 0.15
+    terminated, truncated = ends[0], ends[1] & ~ends[0]
+    vector = torch.randn(num_envs, steps, generator=generator)
+    following = torch.randn(num_envs, steps, generator=generator)
+    goes_on = ~(terminated | truncated)[:, :-1]
+    following[:, :-1][goes_on] = vector[:, 1:][goes_on]
+    reward = torch.randn(num_envs, steps, generator=generator)
+    return make_rollout(vector, following, reward, terminated, truncated)
+
+
+class Echo(nn.Module):
+    """A critic that finds what it sees."""
+
+    def forward(self, vector: Tensor) -> Tensor:
+        return vector
+
+
+def test_advantages_by_hand() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(discount=0.5, lambda_=0.5, reward_scale=2.0), seed=0)
+    learner.critic = TensorDictModule(Echo(), ["vector"], ["state_value"])
+    no = torch.tensor([[False, False, False, False]])
+    terminated, truncated = no.clone(), no.clone()
+    terminated[0, 1], truncated[0, 2] = True, True
+    rollout = make_rollout(
+        torch.tensor([[1.0, 2.0, 3.0, 4.0]]),
+        torch.tensor([[2.0, 9.0, 8.0, 6.0]]),
+        torch.tensor([[1.0, 1.0, 1.0, 1.0]]),
+        terminated,
+        truncated,
+    )
+    records = learner.with_advantages(rollout)
+    # 2 r + γ V(next) − V: the last two bootstrap from what came next, the second from nothing.
+    last = 2 + 0.5 * 6 - 4
+    cut = 2 + 0.5 * 8 - 3
+    crash = 2 - 2
+    first = 2 + 0.5 * 2 - 1 + 0.25 * crash
+    torch.testing.assert_close(records["advantage"].flatten(), torch.tensor([first, crash, cut, last]).float())
+    value_target = torch.tensor([first + 1, crash + 2, cut + 3, last + 4]).float()
+    torch.testing.assert_close(records["value_target"].flatten(), value_target)
+
+
+def test_advantages_equal_torchrls() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(reward_scale=1.0), seed=0)
+    rollout = random_rollout()
+    oracle = GAE(gamma=0.99, lmbda=0.95, value_network=learner.critic)(rollout.clone())
+    records = learner.with_advantages(rollout)
+    for key in ("advantage", "value_target"):
+        torch.testing.assert_close(records[key], oracle[key].flatten(0, 1), atol=1e-5, rtol=1e-5)
+
+
+def bandit(learner: PPOLearner, rounds: int) -> float:
+    """Reward −(a − 0.5)², episodes of one step; return the mean action that was learnt."""
+    for _ in range(rounds):
+        seen = torch.zeros(256, 1, 1)
+        acted = learner.policy()(TensorDict({"vector": seen}, [256, 1]))
+        reward = -(acted["action"] - 0.5).square().squeeze(-1)
+        no = torch.zeros(256, 1, dtype=torch.bool)
+        rollout = make_rollout(seen.squeeze(-1), seen.squeeze(-1), reward, ~no, no)
+        learner.update(rollout.update(acted.select("action", "action_log_prob")))
+    return learner.policy(deterministic=True)(TensorDict({"vector": torch.zeros(1, 1)}, [1]))["action"].item()
+
+
+def test_it_learns_a_bandit() -> None:
+    torch.manual_seed(0)
+    learner = PPOLearner(SMALL, NUMBERS, seed=0)
+    assert abs(bandit(learner, 0)) < 0.05
+    assert bandit(learner, 25) == pytest.approx(0.5, abs=0.1)
+    assert learner.updates == 25 * 5 * 8
+
+
+def test_a_restored_learner_goes_on_as_the_one_that_was_saved() -> None:
+    torch.manual_seed(0)
+    learner, other = PPOLearner(SMALL, NUMBERS, seed=0), PPOLearner(SMALL, NUMBERS, seed=1)
+    learner.update(random_rollout())
+    other.load_state_dict(copy.deepcopy(learner.state_dict()))
+    metrics = []
+    for each in (learner, other):
+        torch.manual_seed(1)
+        metrics.append(each.update(random_rollout()))
+    assert metrics[0].keys() == metrics[1].keys()
+    assert all(torch.equal(metrics[0][name], metrics[1][name]) for name in metrics[0])
+    assert other.updates == learner.updates
+
+
+def test_networks_of_another_size_are_refused() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, seed=0)
+    saved = PPOLearner(NetworkSize(3, 8), NUMBERS, seed=0).state_dict()
+    with pytest.raises(ValueError, match="network.layers=3, this learner's with 2: set network.layers=3"):
+        learner.load_state_dict(saved)
+
+
+def test_networks_for_other_images_are_refused() -> None:
+    learner = PPOLearner(SMALL, Interface(image_size=64), seed=0)
+    with pytest.raises(ValueError, match=r"env.image_size=96, this learner's with 64"):
+        learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
+
+
+def test_a_reward_that_is_not_finite_spoils_no_network() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, seed=0)
+    rollout = random_rollout()
+    rollout["next", "reward"][0, 0] = float("inf")
+    with pytest.raises(NonFiniteLossError):
+        learner.update(rollout)
+    for network in (learner.actor, learner.critic):
+        assert all(value.isfinite().all() for value in network.state_dict().values())

@@ -1,0 +1,181 @@
+"""Agents that ship, as a user makes, evaluates and flies them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
+from dreamer_racing.training.checkpoint import latest_checkpoint
+from tests.running_recipes import ROOT, recipe, recipe_module
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+
+EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished debug run that keeps averaged weights, evaluated."""
+    directory = tmp_path_factory.mktemp("runs") / "run"
+    done = recipe(
+        "dreamer_v3", "track=circle", "model=debug", "model.average_rate=0.1", "loss=privileged", "env.image_size=32",
+        "env.control_rate=25", "env.num_envs=4", "prefill=100", "total_env_steps=160", "replay.capacity=1000",
+        "evaluation.every=0", f"run_dir={directory}", cwd=directory.parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return directory
+
+
+@pytest.fixture(scope="module")
+def agent(run_dir: Path) -> Path:
+    """An agent made of that run, and its evaluation."""
+    folder = run_dir.parent / "agents" / "mine"
+    command = ("export", f"checkpoint={run_dir}", f"agent={folder}", "commit=abc1234")
+    early = recipe(*command, cwd=run_dir.parent)
+    assert early.returncode == 2 and "an agent ships with its numbers. Make it with: python recipes/evaluate.py" in (
+        early.stderr
+    )
+    assert not is_agent(folder)
+    trained = recipe("evaluate", f"checkpoint={run_dir}", "weights=trained", *EVALUATION, cwd=run_dir.parent)
+    assert trained.returncode == 0 and "weights: trained\n" in trained.stdout, trained.stderr
+    other = recipe(*command, cwd=run_dir.parent)
+    assert other.returncode == 2 and "evaluation of other weights" in other.stderr, "trained, not averaged ones"
+    averaged = recipe("evaluate", f"checkpoint={run_dir}", *EVALUATION, cwd=run_dir.parent)
+    assert averaged.returncode == 0 and "weights: averaged (weights=auto)" in averaged.stdout, averaged.stderr
+    done = recipe(*command, f"evaluation={run_dir}/evaluation_2/evaluation.json", cwd=run_dir.parent)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_an_agent_says_where_it_comes_from(agent: Path, run_dir: Path) -> None:
+    assert {path.name for path in agent.iterdir()} == set(FILES)
+    about = json.loads((agent / "agent.json").read_text())
+    assert (about["track"], about["preset"], about["control_rate"]) == ("circle", "easy", 25.0)
+    assert (about["env_steps"], about["weights"], about["training"]["commit"]) == (160, "averaged", "abc1234")
+    command = about["training"]["command"]
+    assert command.startswith("python recipes/dreamer_v3.py track=circle model=debug model.average_rate=0.1 ")
+    evaluation = json.loads((run_dir / "evaluation_2" / "evaluation.json").read_text())
+    assert evaluation["provenance"]["weights"] == "averaged"
+    for mode in ("deterministic", "stochastic"):
+        assert about["evaluation"][mode]["return_mean"] == evaluation[mode]["return_mean"]
+    texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
+    assert not any(str(run_dir.parent) in text for text in texts), "paths of this machine"
+
+
+@pytest.mark.slow
+def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run_dir: Path, tmp_path: Path) -> None:
+    flown = recipe("fly", f"agent={agent}", "run_dir=fly", cwd=tmp_path)
+    assert flown.returncode == 0, flown.stderr
+    assert all(words in flown.stdout for words in ("gates per episode", "laps  ", "finished  ", "mine on circle"))
+    assert {path.name for path in (tmp_path / "fly").iterdir()} == {
+        "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif",
+    }  # fmt: skip
+    done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    written = json.loads((tmp_path / "runs" / "agent_mine" / "evaluation" / "evaluation.json").read_text())
+    expected = json.loads((run_dir / "evaluation_2" / "evaluation.json").read_text())
+    assert written["deterministic"] == expected["deterministic"]
+    assert written["provenance"]["weights_sha256"] == expected["provenance"]["weights_sha256"]
+    assert (
+        json.loads((tmp_path / "fly" / "evaluation.json").read_text())["episodes"]
+        == (expected["deterministic"]["episodes"])
+    )
+    done = recipe("export", f"checkpoint={agent}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    contract = json.loads((tmp_path / "runs" / "agent_mine" / "export" / "contract.json").read_text())
+    assert contract["weights_sha256"] == written["provenance"]["weights_sha256"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"image_size": 64}, "image_size=64: .*mine was trained with image_size=32, and flies with nothing else"),
+        ({"control_rate": 50.0}, "control_rate=50.0: .*mine was trained with control_rate=25.0"),
+        ({"camera_tilt": 10.0}, "camera_tilt=10.0: .*mine was trained with camera_tilt=25.0"),
+        ({"track": "monza"}, "monza"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_what_an_agent_cannot_fly_is_refused(
+    agent: Path, settings: dict, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fly = recipe_module("fly")
+    config = fly.FlyConfig(agent=str(agent), **settings)
+    fly.check(config)
+    with pytest.raises(SystemExit, match="2"):
+        fly.fly_agent(config)
+    assert re.search(f"^error: .*{words}", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+def test_weights_that_an_agent_does_not_hold_are_refused(agent: Path) -> None:
+    settings = recipe_module("composing.schema").EvaluateConfig(checkpoint=str(agent), weights="trained", device="cpu")
+    with pytest.raises(ValueError, match="weights=trained: .*mine holds the averaged weights only"):
+        recipe_module("composing.restoring").restore(settings)
+
+
+def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> None:
+    fly, export, schema = (recipe_module(name) for name in ("fly", "export", "composing.schema"))
+    for settings in ({"pilot": "hover"}, {"viewer": True}):
+        with pytest.raises(ValueError, match="and agent=kidney: give one of them"):
+            fly.check(fly.FlyConfig(agent="kidney", **settings))
+    with pytest.raises(ValueError, match="pilot=human: there are scripted, hover"):
+        fly.check(fly.FlyConfig(pilot="human"))
+    (tmp_path / "agent.json").write_text("{}")
+    for settings, words in (
+        ({"commit": "abc"}, "commit=abc is for agent=FOLDER"),
+        ({"agent": "new", "output": "x.onnx"}, "output=x.onnx and agent=new: give one"),
+        ({"agent": "new", "latent": "sample"}, "latent=sample: agents ship with latent=mode"),
+        ({"agent": "new"}, "checkpoint=there is an agent already"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            export.check_agent(schema.ExportConfig(checkpoint="there", **settings), tmp_path)
+
+
+def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    restoring = recipe_module("composing.restoring")
+    assert restoring.AGENTS == ROOT / "agents"
+    monkeypatch.setattr(restoring, "AGENTS", tmp_path)
+    with pytest.raises(FileNotFoundError, match="kidny: the path does not exist.* ship, to be given by name: none"):
+        restoring.find_trained("kidny")
+    for name in ("kidney", "circle"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "agent.json").write_text("{}")
+    with pytest.raises(FileNotFoundError, match="by name: circle, kidney"):
+        restoring.find_trained("kidny")
+    assert restoring.find_trained("kidney") == restoring.find_trained(str(tmp_path / "kidney")) == tmp_path / "kidney"
+
+
+@pytest.mark.slow
+def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path: Path) -> None:
+    arena = recipe_module("composing.arena")
+    shutil.copytree(run_dir, tmp_path / "run")
+    checkpoint = latest_checkpoint(tmp_path / "run")
+    (path,) = checkpoint.glob("components/*-learner/state.pt")
+    state = torch.load(path, weights_only=True)
+    assert state.pop("averaged")
+    torch.save(state, path)
+    config, cpu = arena.trained_config(tmp_path / "run"), torch.device("cpu")
+    with pytest.raises(ValueError, match=f"weights=averaged: {checkpoint} holds the trained weights only"):
+        arena.restore_learner(config, checkpoint, cpu, "averaged")
+    assert arena.restore_learner(config, checkpoint, cpu)[0].averaged is None
+    assert arena.restore_learner(config, latest_checkpoint(run_dir), cpu)[0].averaged is not None
+    assert arena.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
+
+
+def test_the_agents_that_ship_are_whole_and_small() -> None:
+    folders = [ROOT / "agents" / name for name in agents_in(ROOT / "agents")]
+    for folder in folders:
+        assert {path.name for path in folder.iterdir()} == set(FILES)
+        assert OmegaConf.load(folder / "config.yaml").run_dir is None
+    assert sum(path.stat().st_size for folder in folders for path in folder.iterdir()) <= 10e6

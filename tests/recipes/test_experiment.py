@@ -1,0 +1,184 @@
+"""The experiment runner: which command a run needs next, and an experiment of all algorithms from start to end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.training.checkpoint import latest_checkpoint, mark_finished
+from dreamer_racing.training.lock import RunLock
+from tests.running_recipes import ROOT, compose, recipe_module, rows
+
+
+def settings(directory: Path, *overrides: str) -> DictConfig:
+    return compose("experiment", f"directory={directory}", *overrides)
+
+
+def next_command(directory: Path, *overrides: str) -> list[str] | None:
+    """What the runner would do, told from the recipe on."""
+    import hydra
+
+    experiment = recipe_module("experiment")
+    config = settings(directory, *overrides)
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base="1.3"):
+        command = experiment.next_command(config, [f"directory={directory}", *overrides])
+    return None if command is None else [Path(command[1]).name, *command[2:]]
+
+
+def leave_run(directory: Path, env_steps: int, overrides: list[str], finished: bool = True) -> Path:
+    """Leave what a run leaves that got so far: a checkpoint without parts, its overrides, the mark of its end."""
+    from torchrl.checkpoint import Checkpoint
+
+    path = directory / "checkpoints" / f"checkpoint-{env_steps:012d}"
+    path.parent.mkdir(parents=True)
+    Checkpoint().save(path, metadata={"env_steps": env_steps})
+    OmegaConf.save(OmegaConf.create([f"run_dir={directory}", *overrides]), directory / "overrides.yaml")
+    if finished:
+        mark_finished(directory, env_steps)
+    return directory
+
+
+CHOSEN = ["name=first", "algorithm=sac", "track=circle", "seed=3", "budget=cpu", "variant=state", "env.num_envs=8"]
+RUN = "first/sac_circle_state_seed3"
+OVERRIDES = ["track=circle", "seed=3", "budget=cpu", "env.num_envs=8", "env.from_pixels=false"]
+
+
+def test_a_run_starts_with_what_was_given_and_what_its_variant_adds(tmp_path: Path) -> None:
+    assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"run_dir={tmp_path / RUN}", *OVERRIDES]
+
+
+def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path) -> None:
+    run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
+    assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
+    mark_finished(run_dir, 1_000_000)
+    assert next_command(tmp_path, *CHOSEN) is None
+    assert next_command(tmp_path, *CHOSEN, "total_env_steps=900000") is None
+
+
+def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
+    """tuned=auto became tuned=race at the run's beginning, which has a length of its own."""
+    chosen = ["name=first", "algorithm=dreamer_v3", "track=circle", "seed=3", "budget=none", "variant=default"]
+    command = next_command(tmp_path, *chosen)
+    assert command is not None
+    run_dir = leave_run(
+        Path(command[1].removeprefix("run_dir=")), 1_100_000, [*command[2:], "tuned=race"], finished=False
+    )
+    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1200000"]
+    mark_finished(run_dir, 1_200_000)
+    assert next_command(tmp_path, *chosen) is None
+
+
+def test_a_run_that_was_killed_in_its_last_evaluation_is_not_finished(tmp_path: Path) -> None:
+    run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES, finished=False)
+    assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
+
+
+def test_an_override_may_be_spelt_in_several_ways(tmp_path: Path) -> None:
+    leave_run(tmp_path / RUN, 1_000_000, [*OVERRIDES[:-1], "env.from_pixels=False"])
+    assert next_command(tmp_path, *CHOSEN) is None
+
+
+def test_a_finished_run_goes_on_when_more_is_asked_for(tmp_path: Path) -> None:
+    run_dir = leave_run(tmp_path / RUN, 1_000_000, OVERRIDES)
+    assert next_command(tmp_path, *CHOSEN) is None
+    more = next_command(tmp_path, *CHOSEN, "total_env_steps=3000000")
+    assert more == ["sac.py", f"resume={run_dir}", "total_env_steps=3000000"]
+
+
+def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
+    leave_run(tmp_path / RUN, 1000, OVERRIDES)
+    with pytest.raises(ValueError, match=r"other settings, there and asked for: env\.num_envs: 8 and 16\."):
+        next_command(tmp_path, *CHOSEN[:-1], "env.num_envs=16")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [("algorithm=tdmpc", "algorithm=tdmpc: there are dreamer_v3, ppo, sac"), ("variant=mad", "variant=mad: there are")],
+)
+def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=words):
+        next_command(tmp_path, override)
+
+
+@pytest.mark.slow
+def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), "--multirun", "budget=smoke", "name=smoke",
+               "algorithm=dreamer_v3,ppo,sac", "track=circle", "seed=0", "device=cpu"]  # fmt: skip
+    first, second = (
+        subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
+        for _ in range(2)
+    )
+    assert first.returncode == 0 and second.returncode == 0, first.stderr + second.stderr
+    for algorithm in ("dreamer_v3", "ppo", "sac"):
+        run_dir = tmp_path / "runs" / "smoke" / f"{algorithm}_circle_default_seed0"
+        assert f"{run_dir}: started, budget=smoke" in first.stdout and f"{run_dir}: done" in first.stdout
+        assert f"{run_dir}: finished, skipped" in second.stdout
+        table = rows(run_dir)
+        assert int(table[-1]["env_steps"]) >= 1200
+        for column in (
+            "loss",
+            "episode/return",
+            "evaluation/success_rate",
+            "curriculum/body_rate_weight",
+            "wall_clock",
+        ):
+            assert any(row[column] for row in table), f"{algorithm}: {column}"
+        assert list((run_dir / "videos").glob("*.mp4")) and list((run_dir / "plots").glob("*.png"))
+        assert OmegaConf.load(run_dir / "config.yaml").algorithm == algorithm
+    figures = {path.name for path in (tmp_path / "runs" / "smoke" / "figures").iterdir()}
+    assert figures >= {"learning_curves.png", "trajectories.png", "comparison.md", "comparison.png"}
+    assert "imagined_dreamer_v3_circle_default_seed0.png" in figures
+
+
+STATES = ["--multirun", "budget=smoke", "name=few", "algorithm=ppo", "variant=state", "track=circle", "device=cpu"]
+
+
+def experiment(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start an experiment, as a user does."""
+    command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), *STATES, *overrides]
+    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Path) -> None:
+    runs = tmp_path / "runs" / "few"
+    for seed in (0, 1):
+        (runs / f"ppo_circle_state_seed{seed}").mkdir(parents=True)
+    (runs / "ppo_circle_state_seed0" / "checkpoints").write_text("in the way")
+    lock = RunLock(runs / "ppo_circle_state_seed1")
+    process = experiment("seed=0,1,2", cwd=tmp_path)
+    output, _ = process.communicate(timeout=300)
+    lock.release()
+    assert process.returncode == 1, output
+    assert "failed: ppo_circle_state_seed0: ppo ended with status 2" in output
+    assert "failed: ppo_circle_state_seed1:" in output and "in use by a live run" in output
+    assert not (runs / "ppo_circle_state_seed1" / "log.txt").exists(), "a live run's log is its own"
+    assert f"{runs / 'ppo_circle_state_seed2'}: done" in output
+    assert (runs / "figures" / "learning_curves.png").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+    runs = tmp_path / "runs" / "few"
+    length = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
+    process = experiment(*length, "total_env_steps=100000000", cwd=tmp_path)
+    metrics = runs / "ppo_circle_state_seed0" / "metrics.csv"
+    deadline = time.monotonic() + 200
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, output
+    assert "interrupted" in output and "seed1" not in output and "done" not in output
+    reached = int(latest_checkpoint(runs / "ppo_circle_state_seed0").name.rpartition("-")[2])
+    process = experiment(*length, f"total_env_steps={reached + 500}", "seed=0", cwd=tmp_path)
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output

@@ -1,0 +1,203 @@
+"""`recipes/plot.py` as a user runs it: figures from stored files, and plain refusals."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from omegaconf import OmegaConf
+from tests.test_curves import write_run
+from tests.test_figures import flat_dream, random_flight
+
+from dreamer_racing.evaluation.flights import write_trajectory
+from dreamer_racing.figures.curves import read_curves
+from tests.running_recipes import recipe_module
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "plot.py"
+
+
+def plot(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(RECIPE), *overrides]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
+
+
+@pytest.fixture(scope="module")
+def recipe() -> ModuleType:
+    """The recipe as a module."""
+    return recipe_module("plot")
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for seed in range(2):
+        run = write_run(tmp_path / "runs", f"dreamer_v3_circle_paper_seed{seed}", seed=seed)
+        for env_steps, gates in ((1000, 3), (2000, 1)):
+            stem = run / "evaluations" / f"{env_steps:09d}"
+            write_trajectory(f"{stem}_trajectory.csv", random_flight(), "circle")
+            flat_dream().save(f"{stem}_dream.npz")
+            Path(f"{stem}.json").write_text(json.dumps({"gates_per_episode": gates, "return_mean": 0.0}))
+    return tmp_path
+
+
+def test_all_figures_and_the_curves_again_from_their_csv(runs):
+    (write_run(runs / "runs", "ppo_circle_paper_seed0", algorithm="ppo") / "metrics.csv").write_text("")
+    done = plot("aggregate=iqm", "quantities=[return,success_rate]", "flight=best", cwd=runs)
+    assert done.returncode == 0, done.stderr
+    made = {path.name for path in (runs / "figures").iterdir()}
+    dream = "imagined_dreamer_v3_circle_paper_seed0"
+    assert made == {
+        "learning_curves.png", "learning_curves.csv", "trajectories.png", f"{dream}.png", f"{dream}.mp4", f"{dream}.gif"
+    }  # fmt: skip
+    assert "warning: ppo_circle_paper_seed0 left out: metrics.csv has no rows" in done.stdout
+    curves = read_curves(runs / "figures" / "learning_curves.csv")
+    assert curves.aggregate == "iqm" and [curve.quantity for curve in curves.curves] == ["return", "success_rate"]
+    done = plot("runs=figures/learning_curves.csv", "output=again", cwd=runs)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in (runs / "again").iterdir()] == ["learning_curves.png"]
+
+
+def test_flights_and_dreams_by_name_need_no_runs(runs, recipe):
+    folder, output = runs / "runs" / "dreamer_v3_circle_paper_seed1" / "evaluations", runs / "figures"
+    flights, dreams = [str(folder / "000001000_trajectory.csv")], [str(folder / "000002000_dream.npz")]
+    for figure in ("trajectories", "imagined"):
+        options = {"flights": flights, "dreams": dreams, "output": str(output), "runs": "nowhere"}
+        recipe.draw(recipe.PlotConfig(figure=figure, **options))
+    assert {path.name for path in output.iterdir()} == {
+        "trajectories.png", "imagined.png", "imagined.mp4", "imagined.gif"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("which", "expected"), [("best", "1,000"), ("last", "2,000")])
+def test_last_and_best_flight(runs, recipe, which, expected):
+    read, _ = recipe.read_runs(recipe.find_runs([runs / "runs"]))
+    problems: list[str] = []
+    (flight,) = recipe.chosen_flights(read, which, problems)
+    assert flight.title == f"dreamer_v3_circle_paper_seed0, {expected} env_steps" and problems == []
+
+
+def cut(path: Path) -> str:
+    """Leave the first half of a file."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return str(path)
+
+
+@pytest.mark.parametrize("which", ["best", "last"])
+def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, capsys, which):
+    folder = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
+    chosen, other = ("1", "2") if which == "best" else ("2", "1")
+    cut(folder / f"00000{chosen}000_trajectory.csv")
+    recipe.draw(recipe.PlotConfig(figure="trajectories", flight=which, runs=str(runs / "runs"), output=str(runs / "f")))
+    assert f"{other},000 env_steps" in figures[0].axes[0].get_title(loc="left")
+    warning = (
+        f"dreamer_v3_circle_paper_seed0 without 00000{chosen}000_trajectory.csv: 00000{chosen}000_trajectory.csv was"
+    )
+    assert warning in capsys.readouterr().out
+    assert warning[:60] in " ".join(figures[0].get_suptitle().split())
+
+
+def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
+    folder = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
+    for env_steps in (3000, 4000, 5000):
+        flat_dream().save(folder / f"{env_steps:09d}_dream.npz")
+
+    def shown() -> tuple[list[str], list[str]]:
+        ((run, _), _) = recipe.read_runs(recipe.find_runs([runs / "runs"]))
+        stages, problems = recipe.stages_of_training(run)
+        return [file.name[5:9] for file in stages], problems
+
+    assert shown() == (["1000", "3000", "5000"], [])
+    cut(folder / "000003000_dream.npz")
+    cut(folder / "000005000_dream.npz")
+    names, problems = shown()
+    assert names == ["1000", "2000", "4000"]
+    assert [problem.partition(":")[0].split()[-1] for problem in problems] == [
+        "000003000_dream.npz", "000005000_dream.npz"
+    ]  # fmt: skip
+    cut(folder / "000001000_dream.npz")  # nothing is older: the one after it
+    assert shown()[0] == ["2000", "4000"]
+
+
+def test_nothing_but_half_files_costs_no_other_figure(runs, recipe, capsys):
+    for path in (runs / "runs").rglob("*_dream.npz"):
+        cut(path)
+    for path in (runs / "runs").rglob("*_trajectory.csv"):
+        cut(path)
+    recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
+    assert {path.name for path in (runs / "figures").iterdir()} == {"learning_curves.png", "learning_curves.csv"}
+    out = capsys.readouterr().out
+    assert "paper_seed0 without 000002000_trajectory.csv and 1 other: 000002000_trajectory.csv was cut short" in out
+    assert "paper_seed0 without 000002000_dream.npz and 1 other: 000002000_dream.npz holds no dream" in out
+
+
+@pytest.mark.parametrize(("figure", "option"), [("trajectories", "flights"), ("imagined", "dreams")])
+def test_half_a_file_that_the_user_named_is_refused(runs, recipe, figure, option):
+    ending = {"flights": "trajectory.csv", "dreams": "dream.npz"}[option]
+    file = cut(runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations" / f"000002000_{ending}")
+    settings = {option: [file], "runs": str(runs / "runs"), "output": str(runs / "figures")}
+    with pytest.raises(ValueError, match=f"{ending}"):
+        recipe.draw(recipe.PlotConfig(figure=figure, **settings))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"figure": "violins"}, "figure=violins: there are learning_curves"),
+        ({"quantities": ["speed"]}, "quantities=speed: there are return"),
+        ({"runs": "nowhere"}, "runs=nowhere: there is no run directory"),
+        ({"flight": "worst"}, "flight=worst: there are last, best"),
+        ({"over": "height"}, "over=height: there are distance, time"),
+    ],
+)
+def test_bad_settings_are_refused(runs, recipe, settings, words):
+    given = {"runs": str(runs / "runs"), "output": str(runs / "figures")} | settings
+    with pytest.raises(ValueError, match=words):
+        recipe.draw(recipe.PlotConfig(**given))
+
+
+def test_mixed_configurations_are_refused_and_cost_no_other_figure(runs):
+    write_run(runs / "runs", "dreamer_v3_circle_paper_seed2", seed=2, env={"preset": "faithful"})
+    done = plot("figure=learning_curves", cwd=runs)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "env.preset: easy and faithful" in done.stderr
+    done = plot(cwd=runs)
+    assert done.returncode == 0, done.stderr
+    assert "warning: figure=learning_curves failed: " in done.stdout and "env.preset: easy and faithful" in done.stdout
+    made = {path.name for path in (runs / "figures").iterdir()}
+    assert made >= {"trajectories.png", "imagined_dreamer_v3_circle_paper_seed0.png"}
+    assert "learning_curves.png" not in made
+
+
+def test_all_figures_refuse_if_none_can_be_drawn(tmp_path, recipe):
+    for seed, preset in enumerate(("easy", "faithful")):
+        write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, env={"preset": preset})
+    with pytest.raises(ValueError, match=r"nothing could be drawn.*figure=learning_curves: .*easy and faithful"):
+        recipe.draw(recipe.PlotConfig(runs=str(tmp_path), output=str(tmp_path / "figures")))
+
+
+def test_a_defect_costs_no_other_figure_and_is_no_secret(runs, recipe, monkeypatch):
+    def broken(*_: object) -> None:
+        raise TypeError("not a figure")
+
+    monkeypatch.setitem(recipe.FIGURES, "learning_curves", broken)
+    with pytest.raises(TypeError, match="not a figure"):
+        recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
+    assert (runs / "figures" / "trajectories.png").exists()
+
+
+def test_figures_of_an_experiment_do_not_depend_on_each_other(runs):
+    write_run(runs / "runs", "dreamer_v3_circle_paper_seed2", seed=2, env={"preset": "faithful"})
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(runs / "runs")}}})
+    recipe_module("composing.report").DrawFigures().on_multirun_end(config)
+    assert (runs / "runs" / "figures" / "trajectories.png").exists()
+
+
+def test_a_comparison_names_what_was_left_out(runs, recipe, figures):
+    write_run(runs / "runs", "dreamer_v3_circle_seed0", returns=[1.0] * 40)
+    recipe.draw(recipe.PlotConfig(figure="comparison", runs=str(runs / "runs"), output=str(runs / "figures")))
+    warning = "dreamer_v3_circle_paper_seed0 ends at 2,000 env_steps, compared are 32,000 to 40,000: left out"
+    assert f"- {warning}\n" in (runs / "figures" / "comparison.md").read_text()
+    assert warning in " ".join(figures[0].get_suptitle().split())

@@ -1,0 +1,127 @@
+"""A run that was interrupted and resumed equals one that was not, bit for bit: on a CPU, with one thread."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dreamer_racing.training.checkpoint import latest_checkpoint
+
+ROOT = Path(__file__).parents[2]
+SETTINGS = [
+    "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4", "env.num_envs=4",
+    "env.episode_steps=40", "env.start_on_line=0.5", "env.control_rate=25", "prefill=64", "replay.capacity=1200",
+    "replay.recent_share=0.5",
+    "evaluation.every=500", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=0",
+    "logger.every=400", "logger=csv", "device=cpu", "curriculum.threshold=-100", "curriculum.cooldown=3",
+]  # fmt: skip
+
+
+BASELINE = [
+    "env.from_pixels=false", "network.units=16", "env.num_envs=4", "env.episode_steps=40", "evaluation.every=500",
+    "evaluation.episodes=1", "checkpoint.every=0", "logger.every=400", "logger=csv", "device=cpu",
+    "curriculum.threshold=-100", "curriculum.cooldown=3",
+]  # fmt: skip
+
+
+def train(directory: Path, steps: int, *overrides: str, recipe: str = "dreamer_v3") -> None:
+    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *overrides, f"total_env_steps={steps}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def parts(run_dir: Path) -> dict[str, Any]:
+    """Everything that a checkpoint holds, by file."""
+    found: dict[str, Any] = {}
+    for path in sorted(latest_checkpoint(run_dir).rglob("*")):
+        name = str(path.relative_to(latest_checkpoint(run_dir)))
+        if path.suffix == ".pt":
+            found[name] = torch.load(path, weights_only=True)
+        elif path.suffix in (".bin", ".json") and path.name != "manifest.json":
+            found[name] = path.read_bytes()
+    return found
+
+
+def learner_updates(checkpoint: dict[str, Any]) -> int:
+    return next(value["updates"] for name, value in checkpoint.items() if "learner" in name)
+
+
+def evaluations(run_dir: Path) -> list[dict[str, str]]:
+    """What the evaluations of a run came to."""
+    with (run_dir / "metrics.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["evaluation/return_mean"]]
+    return [{name: row[name] for name in row if name.startswith("evaluation")} for row in rows]
+
+
+def assert_same(first: Any, second: Any, where: str) -> None:
+    if isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), where
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        for key in first:
+            assert_same(first[key], second[key], f"{where}/{key}")
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second), where
+        for index, (left, right) in enumerate(zip(first, second, strict=True)):
+            assert_same(left, right, f"{where}/{index}")
+    else:
+        assert first == second, where
+
+
+RACE = [
+    "tuned=race", "schedule.learning_rates.to=null", "schedule.discount.to=null", "schedule.min_std.to=null",
+    "evaluation.start_noise=0", "model.imagination_starts=8",
+    "evaluation.stochastic=false", "loss.ppo.updates=7", "loss.ppo.kl_target=1e-9",
+    "schedule.wait_for_model=1.1", "schedule.wait_every=300", "model.mixed_precision=false",
+]  # fmt: skip
+"""What races on a CPU, without the ramps over a run's length, which here is another before and after."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tuned", [["tuned=none"], RACE], ids=["none", "race"])
+def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: Path) -> None:
+    settings = [*SETTINGS, *tuned, "track=circle", "env=faithful"]
+    train(tmp_path, 2000, *settings, "run_dir=whole")
+    train(tmp_path, 1024, *settings, "run_dir=parted")
+    before = parts(tmp_path / "parted")
+    train(tmp_path, 2000, "resume=parted")
+    whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
+    assert learner_updates(whole) - learner_updates(before) >= 200
+    names = {name.split("/")[1].partition("-")[2] for name in whole}
+    assert names == {
+        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "random_state"
+    }  # fmt: skip
+    assert_same(whole, parted, "checkpoint")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("recipe", "overrides"),
+    [
+        ("ppo", ["rollout_steps=16", "ppo.epochs=2"]),
+        ("sac", ["prefill=64", "replay.capacity=1200", "sac.batch_size=16"]),
+    ],
+    ids=["ppo", "sac"],
+)
+def test_a_resumed_baseline_equals_an_uninterrupted_one(recipe: str, overrides: list[str], tmp_path: Path) -> None:
+    settings = [*BASELINE, *overrides, "track=circle", "env=faithful"]
+    train(tmp_path, 2048, *settings, "run_dir=whole", recipe=recipe)
+    train(tmp_path, 1000, *settings, "run_dir=parted", recipe=recipe)
+    before = parts(tmp_path / "parted")
+    train(tmp_path, 2048, "resume=parted", recipe=recipe)
+    whole, parted = parts(tmp_path / "whole"), parts(tmp_path / "parted")
+    assert learner_updates(whole) - learner_updates(before) >= 200
+    assert_same(whole, parted, "checkpoint")
+    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "parted")
+    best = [latest_checkpoint(tmp_path / name / "best").name for name in ("whole", "parted")]
+    assert best[0] == best[1]

@@ -1,0 +1,68 @@
+"""What fits into memory, with the machine's numbers put in by hand."""
+
+from __future__ import annotations
+
+import math
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from dreamer_racing import machine as memory
+from dreamer_racing.machine import available_memory, check_fits, keep_freed_memory, out_of_memory_advice
+
+
+def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    information = tmp_path / "meminfo"
+    information.write_text("MemTotal:       8000000 kB\nMemFree:         100000 kB\nMemAvailable:    2000000 kB\n")
+    monkeypatch.setattr(memory, "Path", lambda _: information)
+    assert available_memory("cpu") == available_memory(torch.device("cpu")) == 2_000_000 * 1024
+    information.unlink()
+    assert available_memory("cpu") == math.inf
+
+
+def test_nothing_is_known_of_other_devices() -> None:
+    assert available_memory("meta") == math.inf
+    check_fits(10**30, "meta", "replay.capacity=1")
+
+
+def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available_memory", lambda device: 12e9)
+    check_fits(12_000_000_000, "cpu", "replay.capacity=7")
+    with pytest.raises(
+        ValueError, match=r"^replay.capacity=7 needs 24.0 GB .* cpu has 12.0 GB left: .* 50% of"
+    ) as error:
+        check_fits(24_000_000_000, "cpu", "replay.capacity=7")
+    assert "replay.storage=memmap" in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(ValueError, match=r"lower it to 0\.001% of that"):
+        check_fits(1_200_000_000_000_000, "cpu", "replay.capacity=7")
+
+
+def test_advice_keeps_the_first_line_of_the_error() -> None:
+    advice = out_of_memory_advice(torch.OutOfMemoryError("Tried to allocate 2.00 GiB.\nSee documentation"))
+    assert advice.startswith("Tried to allocate 2.00 GiB. ") and "\n" not in advice and "documentation" not in advice
+    for setting in ("model.batch_size", "model.imagination_starts", "replay.device=cpu", "model.mixed_precision"):
+        assert setting in advice
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep freed memory")
+def test_freed_memory_is_kept() -> None:
+    code = """
+import resource, torch
+from dreamer_racing.machine import keep_freed_memory
+assert keep_freed_memory()
+for _ in range(40):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(16_000_000)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 100, "16 million numbers are 15,625 pages, and the last ones need no new page"
+
+
+def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
+    assert not keep_freed_memory()

@@ -1,0 +1,359 @@
+"""Saving and restoring a run, killed processes and signals."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.checkpoint import CheckpointError
+
+from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
+from dreamer_racing.experience.replay import StreamReplay, make_replay
+from dreamer_racing.training import checkpoint as checkpoint_module
+from dreamer_racing.training.checkpoint import (
+    BestCheckpoint,
+    GracefulExit,
+    RunCheckpoints,
+    ensure_writable,
+    latest_checkpoint,
+    load_components,
+)
+
+
+class Run:
+    """A run whose whole state tells its number of steps."""
+
+    def __init__(self, run_dir: Path, size: int = 100, keep_last: int = 2):
+        self.learner = torch.nn.Linear(size, size)
+        self.optimiser = torch.optim.Adam(self.learner.parameters(), lr=0.1)
+        self.replay: StreamReplay = make_replay(200, 2, 4, 5)
+        self.curriculum = BodyRateCurriculum(window=1, cooldown=1, maximum=1.0)
+        self.counters = {"env_steps": 0, "updates": 0}
+        self.checkpoints = RunCheckpoints(run_dir, self.components, keep_last=keep_last)
+
+    @property
+    def components(self) -> dict:
+        names = ("learner", "optimiser", "replay", "curriculum", "counters")
+        return {name: getattr(self, name) for name in names}
+
+    def advance(self) -> None:
+        steps = self.counters["env_steps"] = self.counters["env_steps"] + 10
+        self.replay.extend(rollout(steps))
+        self.optimiser.zero_grad()
+        self.learner(torch.randn(1, self.learner.in_features)).mean().backward()
+        self.optimiser.step()
+        self.learner.bias.data.fill_(steps)
+        self.curriculum.update([60.0])
+
+    def save(self) -> Path:
+        return self.checkpoints.save(self.counters["env_steps"])
+
+    def assert_consistent(self) -> int:
+        """Every part is of the same moment. Returns which."""
+        steps = self.counters["env_steps"]
+        assert (self.learner.bias == steps).all()
+        assert self.replay.write_count == 2 * (5 * steps // 10)
+        assert (self.replay.records(1)["pixels"][-1] == steps // 10 % 256).all()
+        assert self.curriculum.body_rate_weight == pytest.approx(0.001 * steps / 10)
+        assert self.optimiser.state_dict()["state"][0]["step"] == steps / 10
+        return steps
+
+
+def rollout(steps: int) -> TensorDict:
+    flag, value = torch.zeros(2, 5, 1, dtype=torch.bool), torch.rand(2, 5, 1)
+    pixels = torch.full((2, 5, 8, 8, 3), steps // 10 % 256, dtype=torch.uint8)
+    arrived = {"pixels": pixels, "reward": value, "reward_base": value, "body_rate_norm": value}
+    root = {"pixels": pixels, "action": torch.rand(2, 5, 4), "is_init": flag}
+    return TensorDict({**root, "next": {**arrived, "terminated": flag, "truncated": flag}}, [2, 5])
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    run = Run(tmp_path)
+    for _ in range(3):
+        run.advance()
+        run.save()
+    return tmp_path
+
+
+def test_restored_run_continues_identically(tmp_path):
+    run = Run(tmp_path)
+    random.seed(1)
+    np.random.seed(2)  # noqa: NPY002 -- the global generator is what is restored
+    torch.manual_seed(3)
+    run.advance()
+    run.save()
+
+    def future(run: Run) -> list:
+        run.advance()
+        draws = [random.random(), np.random.rand(), torch.rand(()).item()]  # noqa: NPY002
+        return [*draws, run.learner.weight.detach().clone(), run.replay.sample()["pixels"]]
+
+    expected = future(run)
+    other = Run(tmp_path)
+    metadata = other.checkpoints.load()
+    assert metadata["env_steps"] == other.assert_consistent() == 10
+    actual = future(other)
+    assert actual[:3] == expected[:3]
+    assert all(torch.equal(a, b) for a, b in zip(actual[3:], expected[3:], strict=True))
+
+
+def test_keeps_the_last_ones(saved):
+    assert sorted(path.name for path in (saved / "checkpoints").iterdir()) == [
+        "checkpoint-000000000020",
+        "checkpoint-000000000030",
+    ]
+
+
+def test_second_save_at_the_same_step_does_nothing(saved):
+    run = Run(saved)
+    run.checkpoints.load()
+    run.advance()
+    path = run.save()
+    written = (path / "manifest.json").stat().st_mtime_ns
+    assert run.save() == path
+    assert (path / "manifest.json").stat().st_mtime_ns == written
+
+
+def test_resuming_from_an_older_checkpoint_replaces_the_later_ones(saved):
+    run = Run(saved)
+    run.checkpoints.load(saved / "checkpoints" / "checkpoint-000000000020")
+    run.counters["env_steps"] = 15
+    run.checkpoints.save(25)
+    assert [path.name[-2:] for path in sorted((saved / "checkpoints").iterdir())] == ["20", "25"]
+    run.checkpoints.load()
+    assert run.counters["env_steps"] == 15
+    run.counters["env_steps"] = 16
+    run.checkpoints.save(25)  # loaded since: it is saved anew
+    run.checkpoints.load()
+    assert run.counters["env_steps"] == 16
+
+
+def test_latest_accepts_a_run_a_folder_and_one_checkpoint(saved):
+    newest = saved / "checkpoints" / "checkpoint-000000000030"
+    assert latest_checkpoint(saved) == latest_checkpoint(saved / "checkpoints") == latest_checkpoint(newest) == newest
+
+
+def test_latest_passes_over_incomplete_folders(saved, caplog):
+    folder = saved / "checkpoints"
+    newest = folder / "checkpoint-000000000030"
+    shutil.copytree(newest, folder / ".checkpoint-000000000040.partial")
+    copied = folder / "checkpoint-000000000050"
+    shutil.copytree(newest, copied)
+    next(copied.rglob("state.pt")).unlink()  # a copy that lost a file
+    (folder / "checkpoint-000000000060").mkdir()
+    with caplog.at_level(logging.WARNING):
+        assert latest_checkpoint(saved) == newest
+    assert "000060" in caplog.text
+    assert "000050" in caplog.text
+
+
+@pytest.mark.parametrize("make", [lambda path: None, lambda path: path.mkdir(), lambda path: path.touch()])
+def test_nothing_to_restore_is_said_with_the_path(tmp_path, make):
+    make(tmp_path / "run")
+    with pytest.raises(FileNotFoundError, match=str(tmp_path / "run")):
+        latest_checkpoint(tmp_path / "run")
+
+
+def test_some_components_and_what_does_not_fit(saved):
+    learner = torch.nn.Linear(100, 100)
+    assert load_components(saved, {"learner": learner})["env_steps"] == 30
+    assert (learner.bias == 30).all()
+    with pytest.raises(CheckpointError, match="checkpoint-000000000030.*learner"):
+        load_components(saved, {"learner": torch.nn.Linear(3, 3)})
+    with pytest.raises(CheckpointError, match="missing.*actor"):
+        load_components(saved, {"actor": torch.nn.Linear(3, 3)})
+    with pytest.raises(CheckpointError, match="2 streams of 100 records, this one has 4 of 50"):
+        load_components(saved, {"replay": make_replay(200, 4, 4, 5)})
+
+
+def test_a_part_that_older_checkpoints_lack_is_left_as_it_is(saved):
+    run = Run(saved)
+    parts = {**run.checkpoints.components, "lag": {"waits": 1}}
+    with pytest.raises(CheckpointError, match="missing.*lag"):
+        RunCheckpoints(saved, parts).load()
+    RunCheckpoints(saved, parts).load(may_lack=("lag",))
+    assert run.assert_consistent() == 30
+    assert parts["lag"] == {"waits": 1}
+    RunCheckpoints(saved, parts).save(40)
+    parts["lag"]["waits"] = 0
+    RunCheckpoints(saved, parts).load(may_lack=("lag",))
+    assert parts["lag"] == {"waits": 1}
+
+
+class Unreadable:
+    def state_dict(self) -> dict:
+        return {"path": Path("x")}  # loads only with arbitrary code execution allowed
+
+    def load_state_dict(self, state: dict) -> None: ...
+
+
+def test_a_failed_save_leaves_the_earlier_ones(saved):
+    checkpoints = RunCheckpoints(saved, {"counters": {}, "part": Unreadable()})
+    with pytest.raises(CheckpointError, match="Earlier checkpoints are untouched"):
+        checkpoints.save(40)
+    assert [path.name[-2:] for path in sorted((saved / "checkpoints").iterdir())] == ["20", "30"]
+
+
+def test_random_state_of_absent_devices_is_skipped(caplog):
+    state = checkpoint_module.RandomState().state_dict()
+    state["torch_cuda"] = [torch.zeros(16, dtype=torch.uint8)] * 99
+    torch.rand(3)
+    with caplog.at_level(logging.WARNING):
+        checkpoint_module.RandomState().load_state_dict(state)
+    assert "99 CUDA devices" in caplog.text
+    assert torch.equal(torch.get_rng_state(), state["torch_cpu"])
+
+
+@pytest.mark.parametrize("folder", ["file/run", "/proc/nowhere"])
+def test_unwritable_folder_is_named(tmp_path, folder):
+    (tmp_path / "file").touch()
+    folder = tmp_path / folder
+    with pytest.raises(PermissionError, match=f"{folder}.*run_dir="):
+        ensure_writable(folder)
+    with pytest.raises(PermissionError, match="Cannot write"):
+        RunCheckpoints(folder, {})
+    assert ensure_writable(tmp_path / "new" / "run").is_dir()
+    assert not list((tmp_path / "new" / "run").iterdir())
+
+
+# --- kill -9 ---
+
+
+def save_forever(run_dir: Path, saved_steps) -> None:
+    torch.set_num_threads(1)
+    run = Run(run_dir, size=700)
+    if saved_steps.value:
+        run.checkpoints.load()
+    while True:
+        run.advance()
+        run.save()
+        saved_steps.value = run.counters["env_steps"]
+
+
+def die_inside(run_dir: Path, function: str, call: int) -> None:
+    """Restores the run and saves once, killing itself at the given call of a function of the operating system."""
+    torch.set_num_threads(1)
+    run = Run(run_dir)
+    run.checkpoints.load()
+    module, name = function.split(".")
+    original = getattr({"os": os, "shutil": shutil}[module], name)
+    calls = iter(range(1_000_000))
+
+    def fatal(*args, **kwargs):
+        if next(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(*args, **kwargs)
+
+    setattr({"os": os, "shutil": shutil}[module], name, fatal)
+    run.advance()
+    run.save()
+
+
+@pytest.fixture(scope="module")
+def processes():
+    """Children fork from a clean server, which has imported torch once."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        ["dreamer_racing.training.checkpoint", "dreamer_racing.experience.replay", "torchrl.collectors"]
+    )
+    return context
+
+
+def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path, processes):
+    announced = processes.Value("q", 0)
+    leftovers = 0
+    for delay in (0.002, 0.008, 0.014, 0.02, 0.026, 0.032):
+        process = processes.Process(target=save_forever, args=(tmp_path, announced))
+        before = announced.value
+        process.start()
+        deadline = time.monotonic() + 30
+        while announced.value == before and process.is_alive() and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(delay)
+        process.kill()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        leftovers += len(list((tmp_path / "checkpoints").glob(".*")))
+        run = Run(tmp_path, size=700)
+        assert not list((tmp_path / "checkpoints").glob(".*"))
+        run.checkpoints.load()
+        assert run.assert_consistent() >= announced.value > before
+        announced.value = run.counters["env_steps"]
+    assert leftovers > 0, "no kill fell into a save: this test has tested nothing"
+
+
+@pytest.mark.parametrize(
+    ("function", "call"),
+    [("os.replace", call) for call in range(3)] + [("os.fsync", 0), ("os.fsync", 5), ("shutil.rmtree", 0)],
+)
+def test_kill_at_each_step_of_publishing(saved, processes, function, call):
+    process = processes.Process(target=die_inside, args=(saved, function, call))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert latest_checkpoint(saved)  # also before anything cleans up
+    run = Run(saved)
+    run.checkpoints.load()
+    assert run.assert_consistent() in (30, 40)
+    assert not list((saved / "checkpoints").glob(".*"))
+
+
+def test_a_checkpoint_that_stepped_aside_comes_back(saved):
+    newest = saved / "checkpoints" / "checkpoint-000000000030"
+    newest.rename(newest.with_name(f".{newest.name}.replaced"))  # killed between the two renames of a replacement
+    assert latest_checkpoint(saved).name.endswith("20")
+    Run(saved)
+    assert latest_checkpoint(saved) == newest
+
+
+# --- signals ---
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_sets_the_flag_second_raises(number):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with GracefulExit() as stop:
+        assert not stop.requested
+        os.kill(os.getpid(), number)
+        assert stop.requested and stop.signal_name == number.name
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012 -- the signal may arrive a little later
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_handlers_return_after_an_exception():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(ZeroDivisionError), GracefulExit():
+        raise ZeroDivisionError
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_best_is_kept_and_only_the_best(tmp_path):
+    counters = {"env_steps": 10}
+    best = BestCheckpoint(tmp_path, {"counters": counters})
+    assert best.score is None
+    assert best.offer(1.0, 10)
+    counters["env_steps"] = 20
+    assert not best.offer(1.0, 20)
+    restored: dict[str, int] = {}
+    assert load_components(tmp_path / "best", {"counters": restored})["score"] == 1.0
+    assert restored == {"env_steps": 10}
+    resumed = BestCheckpoint(tmp_path, {"counters": counters})
+    assert resumed.score == 1.0
+    counters["env_steps"] = 5  # resumed from before the best
+    assert resumed.offer(2.0, 5)
+    load_components(tmp_path / "best", {"counters": restored})
+    assert restored == {"env_steps": 5}
+    assert len(list((tmp_path / "best").glob("checkpoints/checkpoint-*"))) == 1

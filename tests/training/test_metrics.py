@@ -1,0 +1,210 @@
+"""The metrics file, its resumption, and the episodes found in rollouts."""
+
+from __future__ import annotations
+
+import csv
+from enum import IntEnum
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from dreamer_racing.training.metrics import EpisodeTracker, MetricsLog
+
+
+class Cause(IntEnum):
+    NONE = 0
+    GROUND = 1
+    GATE = 2
+
+
+def read(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_averages_between_writes(tmp_path):
+    log = MetricsLog(tmp_path)
+    log.push({"loss": torch.tensor(1.0), "norm": torch.tensor([1, 3])})
+    log.push({"loss": torch.tensor(2.0), "norm": torch.tensor([5, 7])})
+    log.push({"loss": 6.0})
+    assert log.write(10) == {"loss": 3.0, "norm": 4.0}
+    log.push({"loss": 0.1})
+    log.write(20)
+    assert log.write(30) == {}
+    assert read(tmp_path) == [
+        {"env_steps": "10", "loss": "3", "norm": "4"},
+        {"env_steps": "20", "loss": "0.1", "norm": ""},
+    ]
+
+
+def test_pushed_tensors_may_be_overwritten(tmp_path):
+    log = MetricsLog(tmp_path)
+    static = torch.tensor(1.0)  # as a CUDA graph's outputs are
+    for value in (1.0, 2.0, 3.0):
+        static.fill_(value)
+        log.push({"loss": static})
+    assert log.write(1) == {"loss": 2.0}
+
+
+def test_graphs_are_not_kept(tmp_path):
+    log = MetricsLog(tmp_path)
+    log.push({"loss": torch.ones(3, requires_grad=True).sum()})
+    assert not any(total.requires_grad for total, _ in log._mean._tensors.values())
+
+
+def test_pushing_does_not_read_tensors_and_a_write_reads_once(tmp_path, monkeypatch):
+    log, reads = MetricsLog(tmp_path), []
+    for name in ("item", "tolist", "cpu", "__float__"):
+        original = getattr(torch.Tensor, name)
+        monkeypatch.setattr(torch.Tensor, name, lambda self, *a, f=original: (reads.append(f), f(self, *a))[1])
+    for step in range(5):
+        log.push({"a": torch.tensor(1.0), "b": torch.ones(2)})
+        log.push({f"rare/{step}": torch.tensor(1.0)})
+    assert reads == []
+    log.write(1)
+    assert len(reads) == 1
+
+
+def test_columns_that_appear_later(tmp_path):
+    log = MetricsLog(tmp_path)
+    for step in range(1, 4):
+        log.push({f"metric/{index}": float(step) for index in range(step)})
+        log.write(step)
+    rows = read(tmp_path)
+    assert list(rows[0]) == ["env_steps", "metric/0", "metric/1", "metric/2"]
+    assert [row["metric/2"] for row in rows] == ["", "", "3"]
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+def test_resuming_drops_later_rows_and_a_torn_one(tmp_path):
+    log = MetricsLog(tmp_path)
+    for step in (10, 20, 30, 40):
+        log.push({"a": float(step), "b": 1.0})
+        log.write(step)
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("1,2")  # killed while writing "1234567,2,3"
+    log = MetricsLog(tmp_path, resume_env_steps=25)
+    assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20"]
+    log.push({"b": 5.0, "c": 6.0})
+    log.write(35)
+    assert read(tmp_path)[-1] == {"env_steps": "35", "a": "", "b": "5", "c": "6"}
+
+
+def test_resuming_without_a_file_starts_one(tmp_path):
+    MetricsLog(tmp_path, resume_env_steps=25)
+    assert (tmp_path / "metrics.csv").read_text().strip() == "env_steps"
+
+
+def test_a_new_run_keeps_the_old_file(tmp_path):
+    for value in (1.0, 2.0, 3.0):
+        log = MetricsLog(tmp_path)
+        log.push({"a": value})
+        log.write(1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.1.csv", "metrics.2.csv", "metrics.csv"]
+    assert "1,1" in (tmp_path / "metrics.1.csv").read_text()
+    assert read(tmp_path)[0]["a"] == "3"
+
+
+def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from torchrl.record.loggers.csv import CSVLogger
+
+    other = CSVLogger(exp_name="other", log_dir=str(tmp_path))
+    with MetricsLog(tmp_path, loggers=[other], tensorboard=True) as log:
+        for step in (10, 20):
+            log.push({"loss/actor": torch.tensor(step / 10)})
+            log.write(step)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(event.step, event.value) for event in events.Scalars("loss/actor")] == [(10, 1.0), (20, 2.0)]
+    assert "2.0" in (tmp_path / "other" / "scalars" / "loss" / "actor.csv").read_text()
+
+
+# --- episodes ---
+
+
+def make_rollout(num_envs: int, steps: int, end: float, generator: torch.Generator) -> TensorDict:
+    def rand() -> torch.Tensor:
+        return torch.rand(num_envs, steps, 1, generator=generator)
+
+    done = rand() < end
+    crash = torch.where(done, (rand() * 3).long(), 0)
+    race = {"gates_passed": (rand() * 10).long(), "crash": crash, "finished": crash < 0}
+    arrived = {"reward": rand(), "done": done, "truncated": done & (crash == 0), "race": race}
+    return TensorDict({"is_init": torch.zeros_like(done), "next": arrived}, [num_envs, steps])
+
+
+def reference_episodes(rollouts: list[TensorDict]) -> list[dict]:
+    num_envs = rollouts[0].shape[0]
+    returns, lengths, episodes = [0.0] * num_envs, [0] * num_envs, []
+    for rollout in rollouts:
+        for time in range(rollout.shape[1]):
+            for env in range(num_envs):
+                step = rollout[env, time]["next"]
+                returns[env] += step["reward"].item()
+                lengths[env] += 1
+                if step["done"]:
+                    facts = {"gates_passed": step["race", "gates_passed"].item(), "crash": step["race", "crash"].item()}
+                    episodes.append({"env": env, "return": returns[env], "length": lengths[env], **facts})
+                    returns[env], lengths[env] = 0.0, 0
+    return episodes
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    num_envs=st.integers(1, 4),
+    steps=st.lists(st.integers(1, 12), min_size=1, max_size=4),
+    end=st.sampled_from([0.0, 0.1, 0.6, 1.0]),
+    seed=st.integers(0, 100),
+)
+def test_episodes_equal_a_step_by_step_count(num_envs, steps, end, seed):
+    generator = torch.Generator().manual_seed(seed)
+    rollouts = [make_rollout(num_envs, count, end, generator) for count in steps]
+    tracker, found = EpisodeTracker(num_envs), []
+    for rollout in rollouts:
+        resumed = EpisodeTracker(num_envs)
+        resumed.load_state_dict(tracker.state_dict())
+        tracker = resumed
+        found += [{key: value.item() for key, value in episode.items()} for episode in tracker.update(rollout)]
+    expected = reference_episodes(rollouts)
+    assert len(found) == len(expected)
+    for actual, episode in zip(found, expected, strict=True):
+        assert {key: actual[key] for key in episode} == pytest.approx(episode, rel=1e-5)
+
+
+def test_interrupted_episodes_are_forgotten():
+    generator = torch.Generator().manual_seed(0)
+    tracker = EpisodeTracker(2)
+    tracker.update(make_rollout(2, 5, 0.0, generator))
+    rollout = make_rollout(2, 3, 0.0, generator)
+    rollout["is_init"][0, 0] = True  # environment 0 was reset, as on resuming
+    rollout["next", "done"][:, -1] = True
+    assert tracker.update(rollout)["length"].tolist() == [3, 8]
+
+
+def test_summary():
+    tracker = EpisodeTracker(4, crash_causes=Cause)
+    rollout = make_rollout(4, 1, 1.0, torch.Generator().manual_seed(0))
+    rollout["next", "race", "crash"] = torch.tensor([0, 1, 1, 2]).view(4, 1, 1)
+    rollout["next", "race", "gates_passed"] = torch.tensor([1, 2, 3, 6]).view(4, 1, 1)
+    rollout["next", "reward"] = torch.tensor([1.0, 2.0, 3.0, 4.0]).view(4, 1, 1)
+    assert tracker.summary(tracker.update(rollout)) == {
+        "episode/return": 2.5,
+        "episode/length": 1.0,
+        "episode/gates_passed": 3.0,
+        "crash/ground": 0.5,
+        "crash/gate": 0.25,
+    }
+    rollout["next", "done"][:] = False
+    assert tracker.summary(tracker.update(rollout)) == {}
+
+
+def test_environments_without_a_race():
+    tracker = EpisodeTracker(2, crash_causes=Cause)
+    rollout = make_rollout(2, 4, 1.0, torch.Generator().manual_seed(0))
+    del rollout["next", "race"]
+    assert set(tracker.summary(tracker.update(rollout))) == {"episode/return", "episode/length"}
