@@ -29,7 +29,7 @@ from composing.command_line import CONFIG_DIR
 
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.learners.networks import ObservationNetwork
-from dreamer_racing.training.checkpoint import GracefulExit
+from dreamer_racing.training.signals import GracefulExit
 
 RECIPES = {"ppo": ppo, "sac": sac}
 CASES = (

@@ -38,7 +38,7 @@ from dreamer_racing.losses import imagine
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.world_model import join_features
-from dreamer_racing.training.checkpoint import latest_checkpoint
+from dreamer_racing.training.directory import latest_checkpoint
 
 NEAR, HALF_VIEW = 3.0, math.radians(40.0)  # m and rad to either side: where a gate counts as seen
 WRONG_GATE = 2.0  # m: an error that means another gate

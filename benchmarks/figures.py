@@ -24,7 +24,7 @@ from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.dreams import CONTEXT, PREDICTED, Dream
 from dreamer_racing.evaluation.evaluate import Trajectory, evaluate
-from dreamer_racing.evaluation.flights import write_trajectory
+from dreamer_racing.evaluation.trajectory import write_trajectory
 
 ALGORITHMS, TRACKS = ("dreamer_v3", "ppo", "sac"), ("circle", "kidney", "figure8")
 SKILL = {"dreamer_v3": 1.0, "ppo": 0.1, "sac": 0.05}

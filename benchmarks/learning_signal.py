@@ -40,7 +40,8 @@ from dreamer_racing.losses import ActorLoss, PPOActorLoss, imagine
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
-from dreamer_racing.training.checkpoint import latest_checkpoint, load_components
+from dreamer_racing.training.checkpoint import load_components
+from dreamer_racing.training.directory import latest_checkpoint
 
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from

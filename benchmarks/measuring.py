@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dreamer_racing.provenance import provenance
+from dreamer_racing.machine import provenance
 
 
 def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:

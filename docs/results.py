@@ -21,8 +21,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from composing.command_line import plain_errors
-
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
@@ -61,12 +59,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="only compare")
     arguments = parser.parse_args()
-    with plain_errors():
+    try:
         text = make_page(ROOT / "results")
-        if not arguments.check:
-            PAGE.write_text(text, encoding="utf-8")
-        elif PAGE.read_text(encoding="utf-8") != text:
-            raise ValueError(f"{PAGE.relative_to(ROOT)} is not what results/ makes: run python docs/results.py.")
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    if not arguments.check:
+        PAGE.write_text(text, encoding="utf-8")
+    elif PAGE.read_text(encoding="utf-8") != text:
+        parser.error(f"{PAGE.relative_to(ROOT)} is not what results/ makes: run python docs/results.py.")
 
 
 def make_page(results: Path) -> str:

@@ -1,11 +1,17 @@
-"""Memory: whether something fits, found out before it is allocated; and freed blocks kept for the next update."""
+"""The machine: its cores and memory, and what it says about itself beside numbers that were measured on it."""
 
 from __future__ import annotations
 
 import ctypes
+import importlib.metadata
 import math
+import os
+import platform
+import shlex
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -75,3 +81,46 @@ def out_of_memory_advice(error: RuntimeError) -> str:
         "(model.imagination_starts; null takes every record of the batch), the network (model=size12m and smaller), "
         "the replay (replay.device=cpu). model.mixed_precision=true halves what the networks keep."
     )
+
+
+PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp")
+
+
+def provenance() -> dict[str, Any]:
+    """Return machine, versions and commit, as JSON knows them."""
+    return {
+        "machine": f"{platform.system()} {platform.machine()}, {_cpu()}, {torch.get_num_threads()} torch threads",
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+        "commit": git_commit(Path(__file__).parent),
+    }
+
+
+def git_commit(folder: Path) -> str | None:
+    """Name the commit that a folder is at, ``-dirty`` if files have changed since; None outside a repository."""
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # no git here
+        return None
+    return answer.stdout.strip() or None
+
+
+def command_line() -> str:
+    """Return the command that started this process, to be run again in the same folder."""
+    return shlex.join(["python", *sys.argv])
+
+
+def _cpu() -> str:
+    from dreamer_racing.machine import available_cpus
+
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line for line in lines if line.startswith("model name")]
+    return f"{available_cpus()} x {names[0].partition(': ')[2]}" if names else f"{available_cpus()} cores"
+
+
+def available_cpus() -> int:
+    """CPUs this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

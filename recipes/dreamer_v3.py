@@ -23,9 +23,9 @@ from composing.building import (
     resolve_common,
     seed_generators,
 )
-from composing.checks import check_dreamer
+from composing.checks import check_dreamer, replay_ratio
 from composing.command_line import CONFIG_DIR, choose_device, computes_bfloat16
-from composing.launching import ReplayRun, launch
+from composing.launching import launch
 from composing.schema import Collection, DreamerConfig, register
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -36,8 +36,9 @@ from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import GracefulExit
 from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.run import ReplayRun
+from dreamer_racing.training.signals import GracefulExit
 
 NUM_ENVS = 32
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
@@ -197,6 +198,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         curriculum,
         OverlappedRollouts(collector, acting, policy) if overlapped else None,
         lag=ModelLag(config.schedule.wait_for_model),
+        ratio=replay_ratio(config),
         replay=make_run_replay(
             config,
             env,

@@ -28,7 +28,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.training.checkpoint import CHECKPOINTS, finished_env_steps, latest_checkpoint
+from dreamer_racing.training.directory import CHECKPOINTS, finished_env_steps, latest_checkpoint
 from dreamer_racing.training.lock import RunLock
 
 RECIPES = Path(__file__).resolve().parent

@@ -19,11 +19,11 @@ from composing.schema import PlotConfig, register
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.dreams import Dream, dream_video
-from dreamer_racing.evaluation.flights import read_trajectory
+from dreamer_racing.evaluation.dreams import Dream
+from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
-from dreamer_racing.figures.film import write_gif, write_video
+from dreamer_racing.figures.film import dream_video, write_gif, write_video
 from dreamer_racing.figures.flights import PROFILE_AXES, Flight, plot_dreams, plot_flights
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.runs import (
@@ -35,7 +35,7 @@ from dreamer_racing.figures.runs import (
     first_readable,
     read_runs,
 )
-from dreamer_racing.training.checkpoint import ensure_writable
+from dreamer_racing.training.directory import ensure_writable
 
 register()
 

@@ -14,14 +14,15 @@ import hydra
 from composing.arena import make_env, make_learner
 from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
 from composing.checks import check
-from composing.launching import Run, launch
+from composing.launching import launch
 from composing.schema import PPORunConfig, register
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from dreamer_racing.learners import PPOLearner
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import GracefulExit
+from dreamer_racing.training.run import Run
+from dreamer_racing.training.signals import GracefulExit
 
 NUM_ENVS = {"pixels": 64, "state": 1024}
 

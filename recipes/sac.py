@@ -21,13 +21,14 @@ from composing.building import (
     resolve_baseline,
     seed_generators,
 )
-from composing.checks import check, check_replay
-from composing.launching import ReplayRun, launch
+from composing.checks import check, check_replay, replay_ratio
+from composing.launching import launch
 from composing.schema import SACRunConfig, register
 from omegaconf import DictConfig
 
 from dreamer_racing.learners import SACLearner
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.run import ReplayRun
 
 NUM_ENVS = {"pixels": 64, "state": 256}
 TRANSITION = 2  # records of a window: what was seen before an action, and after it
@@ -67,7 +68,9 @@ def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     collector = make_collector(config, env, learner.policy())
     curriculum = make_curriculum(config)
     replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
-    return assemble(SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay)
+    return assemble(
+        SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay, ratio=replay_ratio(config)
+    )
 
 
 if __name__ == "__main__":

@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from dreamer_racing import machine as memory
+from dreamer_racing import machine
 from dreamer_racing.machine import available_memory, check_fits, keep_freed_memory, out_of_memory_advice
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     information = tmp_path / "meminfo"
     information.write_text("MemTotal:       8000000 kB\nMemFree:         100000 kB\nMemAvailable:    2000000 kB\n")
-    monkeypatch.setattr(memory, "Path", lambda _: information)
+    monkeypatch.setattr(machine, "Path", lambda _: information)
     assert available_memory("cpu") == available_memory(torch.device("cpu")) == 2_000_000 * 1024
     information.unlink()
     assert available_memory("cpu") == math.inf
@@ -30,7 +30,7 @@ def test_nothing_is_known_of_other_devices() -> None:
 
 
 def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "available_memory", lambda device: 12e9)
+    monkeypatch.setattr(machine, "available_memory", lambda device: 12e9)
     check_fits(12_000_000_000, "cpu", "replay.capacity=7")
     with pytest.raises(
         ValueError, match=r"^replay.capacity=7 needs 24.0 GB .* cpu has 12.0 GB left: .* 50% of"
@@ -64,5 +64,5 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
+    monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: object())
     assert not keep_freed_memory()

@@ -8,17 +8,13 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
-
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, add_border, enlarge, side_by_side
 
 if TYPE_CHECKING:
     from dreamer_racing.evaluation.evaluate import Trajectory
@@ -26,7 +22,6 @@ if TYPE_CHECKING:
 
 CONTEXT, PREDICTED = 3, 10  # stored frames: those that the model has seen, then those that it predicts on its own
 STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
-WHITE = (255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -114,61 +109,3 @@ def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int =
         context=CONTEXT,
         frame_dt=STRIDE * trajectory.control_dt,
     )
-
-
-def shown_frames(dream: Dream, columns: int) -> list[int]:
-    """Choose frames to print: the last two of the context, then evenly to the end."""
-    last = dream.real.shape[1] - 1
-    context = list(range(max(0, dream.context - 2), dream.context))
-    rest = np.linspace(dream.context, last, max(1, columns - len(context))).round().astype(int)
-    return [*context, *sorted(set(rest.tolist()))]
-
-
-def film_strip(dream: Dream, frames: Sequence[int], scale: int = 2, border: int = 3) -> np.ndarray:
-    """Put frames of the first window side by side: real above reconstructed above imagined.
-
-    Borders of the lower two are green where the model has seen the image and orange where it imagines.
-
-    Args:
-        dream: T frames.
-        frames: F indices of them.
-        scale: whole factor by which pixels are enlarged, without blurring.
-        border: its width, pixels.
-
-    Returns:
-        (3 (scale H + 2 border), F (scale W + 2 border), 3) uint8.
-    """
-    chosen = np.array(frames)
-    seen = np.where((chosen < dream.context)[:, None], CONTEXT_COLOR, OPEN_LOOP_COLOR)  # (F, 3)
-    colors = (np.broadcast_to(WHITE, seen.shape), np.broadcast_to(CONTEXT_COLOR, seen.shape), seen)
-    rows = [
-        np.concatenate(list(add_border(enlarge(images[0, chosen], scale), color, border)), axis=1)
-        for images, color in zip((dream.real, dream.reconstructed, dream.imagined), colors, strict=True)
-    ]
-    return np.concatenate(rows)
-
-
-def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarray:
-    """Compose the stages of training under each other, each real | imagined under its name, as long as the longest.
-
-    Args:
-        dreams: the stages, each with its name; their windows follow one another.
-        scale: whole factor by which pixels are enlarged, without blurring.
-
-    Returns:
-        (frames, height, width, 3) uint8.
-    """
-    films = [_film(name, dream, scale) for name, dream in dreams]
-    length = max(map(len, films))
-    held = [np.concatenate((film, film[-1:].repeat(length - len(film), axis=0))) for film in films]
-    return np.concatenate(held, axis=1)
-
-
-def _film(name: str, dream: Dream, scale: int) -> np.ndarray:
-    pairs = zip(dream.real, dream.imagined, strict=True)
-    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=scale) for pair in pairs])
-    banner = Image.new("RGB", (frames.shape[2], 10 * scale), "white")
-    font = ImageFont.load_default(size=7 * scale)
-    ImageDraw.Draw(banner).text((4, scale), name, fill="black", font=font)
-    head = np.broadcast_to(np.asarray(banner), (len(frames), *np.asarray(banner).shape))
-    return np.concatenate((head, frames), axis=1)

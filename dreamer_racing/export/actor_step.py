@@ -24,10 +24,10 @@ from torch import Tensor, nn
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
 from dreamer_racing.export.parity import ACTION_TOLERANCE, Flight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import join_features
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
-from dreamer_racing.training.checkpoint import ensure_writable
+from dreamer_racing.training.directory import ensure_writable
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 OUTPUTS = ("action", "h_next", "z_next")

@@ -1,7 +1,7 @@
 """Flies an exported actor on the vehicle's computer: numpy, onnxruntime and the standard library, nothing else.
 
-The file stands alone: beside an installed `dreamer_racing` it is `dreamer_racing.export.onnx_actor`, and copied to the flight
-computer it is a module `onnx_actor` of its own. Run as a program it measures one step there:
+The file stands alone: beside an installed `dreamer_racing` it is `dreamer_racing.export.onnx_actor`, and copied to
+the flight computer it is a module `onnx_actor` of its own. Run as a program it measures one step there:
 
     python onnx_actor.py actor.onnx --steps 1000
 

@@ -17,8 +17,8 @@ from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.onnx_actor import RecurrentActor
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import DreamerPolicy
+from dreamer_racing.modules.agent import Agent
 
 ACTION_TOLERANCE = 1e-4
 """Largest deviation of an action, in [−1, 1], from the original's: 1.3 mm/s² of thrust, 0.001 rad/s."""

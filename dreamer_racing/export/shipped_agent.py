@@ -19,8 +19,8 @@ from dreamer_racing.export.actor_step import WEIGHTS, ActorStep
 from dreamer_racing.export.contract import describe_camera, hash_weights
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
 from dreamer_racing.export.weights_file import read_weights
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training.checkpoint import load_state
 
 AGENT, CONFIG, ACTOR = "agent.json", "config.yaml", "actor.onnx"

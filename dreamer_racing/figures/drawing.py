@@ -28,7 +28,7 @@ from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.training.metrics_file import read_metrics
+from dreamer_racing.training.metrics import read_metrics
 
 GATE_COLOR = "#e8590c"
 DECOY_COLOR = "#c2255c"

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.dreams import Dream, film_strip, shown_frames
+from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.figures.drawing import (
     CRASH_COLOR,
@@ -36,7 +36,7 @@ from dreamer_racing.figures.drawing import (
     save,
     speed_scale,
 )
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 
 TITLE_ROOM = 0.35  # inches above the panels
 PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}

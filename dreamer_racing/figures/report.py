@@ -16,10 +16,11 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
-from dreamer_racing.evaluation.flights import write_trajectory
+from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import side_by_side, write_video
-from dreamer_racing.learners.dreamer import DreamerLearner, Flyer
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.learner import Flyer
 
 CONTEXT, DREAM = 10, 40  # control steps the model sees, then predicts on its own, in the video
 

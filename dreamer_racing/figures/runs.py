@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import yaml
 
-from dreamer_racing.training.metrics_file import MetricsTable, read_metrics
+from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
 T = TypeVar("T")
 

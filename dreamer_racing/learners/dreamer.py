@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,6 +17,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep, Step
 from dreamer_racing.learners.finite_guard import FiniteGuard
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.losses import (
     ACTOR_LOSSES,
     CRITIC_LOSSES,
@@ -27,10 +28,10 @@ from dreamer_racing.losses import (
     find_loss,
 )
 from dreamer_racing.losses.contract import require_keys
-from dreamer_racing.modules import Actor, Critic, DreamerPolicy, Interface, ModelSize, WorldModel, get_size
+from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training.clock import Timer, untimed
 
 
 @dataclass(frozen=True)
@@ -110,62 +111,6 @@ class LearnerConfig:
     world_model_loss: str = "reconstruction"
     actor_loss: str = "reinforce"
     critic_loss: str = "two_hot"
-
-
-class Flyer(Protocol):
-    """What can be evaluated: every learner, and a `ShippedAgent`."""
-
-    device: torch.device
-
-    def evaluation_policy(self, deterministic: bool = False) -> Any:
-        """Return the acting step to evaluate, which may be one of averaged weights."""
-        ...
-
-
-class Learner(Flyer, Protocol):
-    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do."""
-
-    updates: int
-
-    def policy(self, deterministic: bool = False) -> Any:
-        """Return the acting step that is trained, which shares the learner's parameters."""
-        ...
-
-    def check_finite(self) -> None:
-        """Raise ``NonFiniteLossError`` if an update was not finite."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, but for the global random generators."""
-        ...
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned."""
-        ...
-
-
-class Agent(nn.Module):
-    """The three networks that are trained together.
-
-    Args:
-        size: Their widths.
-        interface: What the agent sees and does.
-        decode: Whether the world model has decoders of what is seen.
-
-    Attributes:
-        interface: As given.
-        world_model: Predicts.
-        actor: Acts.
-        critic: Judges; holds its slow copy.
-    """
-
-    def __init__(self, size: ModelSize, interface: Interface, decode: bool = True) -> None:
-        super().__init__()
-        head = (size.actor_critic_layers, size.units, size.norm)
-        self.interface = interface
-        self.world_model = WorldModel(size, interface, decode)
-        self.actor = Actor(size.features, interface.action_dim, *head)
-        self.critic = Critic(size.features, *head, size.bins)
 
 
 ParameterGroups = list[dict[str, Any]]

@@ -17,6 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -24,7 +25,6 @@ from dreamer_racing.learners.networks import (
     ObservationNetwork,
 )
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.clock import Timer, untimed
 
 
 @dataclass

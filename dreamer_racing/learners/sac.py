@@ -15,6 +15,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
+from dreamer_racing.learners.learner import Timer, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -22,7 +23,6 @@ from dreamer_racing.learners.networks import (
     ObservationNetwork,
 )
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.clock import Timer, untimed
 
 NO_WEIGHT = 1e-30  # beside a transition's 1: lost in float32, but a sum of it is not 0
 

@@ -26,7 +26,8 @@ from dreamer_racing.losses.representation import (
 from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 
 T = TypeVar("T")

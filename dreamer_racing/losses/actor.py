@@ -22,7 +22,8 @@ from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import WorldModel
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 
 class Judgement(NamedTuple):

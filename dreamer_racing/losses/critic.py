@@ -18,7 +18,8 @@ from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import join_features
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 
 @torch.no_grad()

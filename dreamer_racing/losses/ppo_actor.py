@@ -23,7 +23,8 @@ from dreamer_racing.losses.imagination import imagine
 from dreamer_racing.modules.actor import ActionDistribution
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 KL_TOLERANCE = 1.5
 """Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""

@@ -18,7 +18,8 @@ from dreamer_racing.modules.rssm import Posterior
 from dreamer_racing.modules.world_model import WorldModel
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 
 class ReconstructionLoss(WorldModelLoss):

@@ -21,7 +21,8 @@ from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
 if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import Agent, LearnerConfig
+    from dreamer_racing.learners.dreamer import LearnerConfig
+    from dreamer_racing.modules.agent import Agent
 
 
 def separate_kl(kl: Tensor, free_nats: float) -> Tensor:

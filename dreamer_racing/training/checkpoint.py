@@ -1,4 +1,4 @@
-"""Checkpoints of a run: crash-safe saving, finding the latest, restoring; and a graceful end on a signal.
+"""Checkpoints of a run: crash-safe saving and restoring.
 
 A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the format of `torchrl.checkpoint`. It is
 written beside its final place and renamed into it, so that a folder of that name is always complete; what a killed
@@ -8,16 +8,11 @@ process leaves behind has a name with a leading dot, is never read, and is remov
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import shutil
-import signal
-import tempfile
-import threading
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any
 
 import torch
@@ -30,11 +25,9 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-logger = logging.getLogger(__name__)
+from dreamer_racing.training.directory import CHECKPOINTS, PREFIX, ensure_writable, is_complete, latest_checkpoint
 
-CHECKPOINTS = "checkpoints"
-_PREFIX = "checkpoint"
-FINISHED = "finished.json"
+logger = logging.getLogger(__name__)
 
 
 class RandomState(GlobalRNGState):
@@ -109,7 +102,7 @@ class RunCheckpoints:
         self.directory = Path(run_dir).absolute() / CHECKPOINTS
         self.components = components
         self._checkpoint = _bind({**components, "random_state": RandomState()})
-        self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, prefix=_PREFIX)
+        self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, prefix=PREFIX)
         self._last_saved: Path | None = None
         ensure_writable(self.directory)
         _remove_partial(self.directory)
@@ -130,7 +123,7 @@ class RunCheckpoints:
         Raises:
             CheckpointError: if it cannot be written; the previous checkpoints are untouched.
         """
-        final = self.directory / f"{_PREFIX}-{env_steps:012d}"
+        final = self.directory / f"{PREFIX}-{env_steps:012d}"
         if final == self._last_saved:
             return final
         partial = self.directory / f".{final.name}.partial"
@@ -273,111 +266,6 @@ class _PlainState:
         self.value = state
 
 
-def latest_checkpoint(path: str | Path) -> Path:
-    """Finds the newest complete checkpoint. Folders that a killed process left incomplete are passed over.
-
-    Args:
-        path: run directory, folder of checkpoints, or one checkpoint.
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
-    path = Path(path).absolute()
-    if _is_complete(path):
-        return path
-    for directory in (path / CHECKPOINTS, path):
-        for candidate in sorted(directory.glob(f"{_PREFIX}-*"), reverse=True):
-            if _is_complete(candidate):
-                return candidate
-            logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
-    found = "exists, but holds none" if path.exists() else "does not exist"
-    raise FileNotFoundError(
-        f"No complete checkpoint at {path}: the path {found}. Give a run directory (with a subfolder "
-        f"'{CHECKPOINTS}'), a folder of '{_PREFIX}-<env_steps>' folders, or one of these."
-    )
-
-
-def mark_finished(run_dir: str | Path, env_steps: int) -> None:
-    """Note in a run directory that all that the run was asked for is done, evaluation and metrics included."""
-    partial = Path(run_dir) / f".{FINISHED}.partial"
-    partial.write_text(json.dumps({"env_steps": env_steps}) + "\n", encoding="utf-8")
-    os.replace(partial, Path(run_dir) / FINISHED)
-
-
-def finished_env_steps(run_dir: str | Path) -> int:
-    """Return the env_steps that a run was finished at; 0 if it was not."""
-    try:
-        return int(json.loads((Path(run_dir) / FINISHED).read_text(encoding="utf-8"))["env_steps"])
-    except FileNotFoundError:
-        return 0
-
-
-def ensure_writable(directory: str | Path) -> Path:
-    """Creates a folder if needed and writes a file to it, to fail before a run and not at its first checkpoint.
-
-    Returns:
-        The absolute path of the folder.
-
-    Raises:
-        PermissionError: if nothing can be written there.
-    """
-    directory = Path(directory).expanduser().absolute()
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory) as file:
-            file.write(b"writable")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise PermissionError(
-            f"Cannot write to the folder {directory} ({error.strerror or error}). The run keeps its checkpoints and "
-            "metrics there: choose another with run_dir=PATH, or give this user write permission and free space."
-        ) from error
-    return directory
-
-
-class GracefulExit:
-    """Turns SIGINT and SIGTERM into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
-
-    The handlers from before are put back at exit. Outside the main thread, where Python allows no handlers, the flag
-    is never set.
-
-    Example:
-        >>> with GracefulExit() as stop:
-        ...     while not stop.requested:
-        ...         break
-    """
-
-    def __init__(self) -> None:
-        self.signal_name: str | None = None
-        self._previous: dict[signal.Signals, Any] = {}
-
-    @property
-    def requested(self) -> bool:
-        """Whether a signal has arrived."""
-        return self.signal_name is not None
-
-    def __enter__(self) -> GracefulExit:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        self._previous.clear()
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        # No logging here: the signal may have interrupted a write to the same stream.
-        name = signal.Signals(number).name
-        if self.requested:
-            raise KeyboardInterrupt(f"{name} after {self.signal_name}")
-        self.signal_name = name
-
-
 def _bind(components: Mapping[str, Any]) -> Checkpoint:
     checkpoint = Checkpoint()
     for name, component in components.items():
@@ -394,14 +282,6 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
         return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
         raise CheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
-
-
-def _is_complete(path: Path) -> bool:
-    """Whether the manifest, which is written last, is there with every file it lists (a copy may have lost some)."""
-    if not path.is_dir() or not Checkpoint.is_checkpoint(path):
-        return False
-    parts = Checkpoint.manifest(path)["components"].values()
-    return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])
 
 
 def _check_loadable(path: Path) -> None:
@@ -435,9 +315,9 @@ def _publish(partial: Path, final: Path) -> None:
 
 def _remove_partial(directory: Path) -> None:
     """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
-    for path in directory.glob(f".*{_PREFIX}-*"):
+    for path in directory.glob(f".*{PREFIX}-*"):
         final = path.with_name(path.name.removeprefix(".").removesuffix(".replaced"))
-        if path.name.endswith(".replaced") and not final.exists() and _is_complete(path):
+        if path.name.endswith(".replaced") and not final.exists() and is_complete(path):
             os.replace(path, final)
         else:
             logger.info("Removing the unfinished %s.", path)

@@ -2,16 +2,8 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-
-Timer = Callable[[str], AbstractContextManager]
-"""Context manager by the name of an activity, as ``RunClock.timed``."""
-
-
-def untimed(activity: str) -> AbstractContextManager:
-    """Measure nothing."""
-    return nullcontext()
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 
 class RunClock:

@@ -9,20 +9,18 @@ import csv
 import logging
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from enum import IntEnum
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
+import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from dreamer_racing.training.metrics_file import X_AXIS, read_rows
-
 logger = logging.getLogger(__name__)
+X_AXIS = "env_steps"
 
 
 class MetricsLog:
@@ -190,102 +188,93 @@ class RunningMean:
         return {name: total / count for name, (total, count) in totals.items()}
 
 
-class EpisodeTracker:
-    """Finds the finished episodes in a collector's rollouts, carrying unfinished ones from rollout to rollout.
+@dataclass(frozen=True)
+class MetricsTable:
+    """What could be read of a `metrics.csv`."""
+
+    columns: dict[str, tuple[np.ndarray, np.ndarray]]
+    """env_steps and values, (R,) each, by name; without empty, unreadable and non-finite cells, or no entry at all."""
+    env_steps: np.ndarray
+    """(R,) of all rows."""
+    problems: list[str]
+    """What was left out, one phrase each."""
+
+
+def read_rows(path: Path) -> tuple[list[str], list[list[str]], list[str]]:
+    """Read the complete rows; the last one may have been cut short by a kill, or is being written.
 
     Args:
-        num_envs: N.
-        crash_causes: names of the values of ``("next", "race", "crash")``, 0 meaning no crash.
+        path: the file.
 
-    Example:
-        >>> tracker = EpisodeTracker(num_envs=16)
-        >>> # for rollout in collector:
-        >>> #     episodes = tracker.update(rollout)
-        >>> #     metrics.push(tracker.summary(episodes))
+    Returns:
+        The header, the rows with as many cells as it has, and what was left out, one phrase each.
+
+    Raises:
+        ValueError: this is no table of metrics.
     """
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        lines = file.readlines()
+    problems = []
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
+        problems.append("its last row is cut short")
+    try:
+        header, *rows = [cells for cells in csv.reader(lines) if cells] or [[X_AXIS]]
+    except csv.Error as error:
+        raise ValueError(f"{path} is not a table of metrics: {error}.") from error
+    if X_AXIS not in header:
+        raise ValueError(f"{path} is not a table of metrics: its first line has no column {X_AXIS}.")
+    whole = [row for row in rows if len(row) == len(header)]
+    if len(whole) < len(rows):
+        problems.append(f"{len(rows) - len(whole)} of {len(rows)} rows are incomplete")
+    return header, whole, problems
 
-    _FACTS = ("gates_passed", "crash", "finished")
 
-    def __init__(self, num_envs: int, crash_causes: type[IntEnum] | None = None) -> None:
-        self.crash_causes = crash_causes
-        self._return = torch.zeros(num_envs, dtype=torch.float64)  # (N,) of the unfinished episodes
-        self._length = torch.zeros(num_envs, dtype=torch.int64)  # (N,)
+def read_metrics(path: str | Path, wanted: Collection[str] | None = None) -> MetricsTable:
+    """Read columns of a `metrics.csv` as numbers, in the order of env_steps.
 
-    def update(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Accounts for one rollout.
+    Args:
+        path: the file.
+        wanted: names of columns; None for all. Those that the file does not have are left out.
 
-        Args:
-            rollout: batch ``[N, T]`` with ``("next", "reward")``, ``("next", "done")`` and, if there are any,
-                ``("next", "truncated")``, ``("next", "race", ...)`` and the root's ``is_init``.
+    Raises:
+        ValueError: this is no table of metrics, or it has no rows.
+        OSError: the file is missing or cannot be read.
+    """
+    header, rows, problems = read_rows(Path(path))
+    if not rows:
+        raise ValueError(f"{path} has no rows: nothing was logged yet.")
+    steps = _numbers([row[header.index(X_AXIS)] for row in rows])
+    order = np.argsort(steps, kind="stable")[: np.isfinite(steps).sum()]  # what is not a number comes last
+    if len(order) < len(rows):
+        problems.append(f"{len(rows) - len(order)} of {len(rows)} rows have no number of env_steps")
+    columns, unreadable = {}, 0
+    for index, name in enumerate(header):
+        if name == X_AXIS or (wanted is not None and name not in wanted):
+            continue
+        cells = [row[index] for row in rows]
+        values = _numbers(cells)
+        unreadable += sum(not _is_number(cells[i]) for i in np.flatnonzero(np.isnan(values)))
+        kept = order[np.isfinite(values[order])]
+        if len(kept):
+            columns[name] = (steps[kept], values[kept])
+    if unreadable:
+        problems.append(f"{unreadable} cells are not numbers")
+    return MetricsTable(columns, steps[order], problems)
 
-        Returns:
-            Finished episodes, batch ``[E]``, on the CPU, in the order in which they ended: ``env`` int64, ``return``
-            float32 (undiscounted), ``length`` int64 (control steps), and as they were at the episode's last step
-            ``truncated``, ``gates_passed``, ``crash`` and ``finished``, as far as the rollout has them, all ``(E,)``.
-        """
-        reward = rollout["next", "reward"].squeeze(-1).cpu().double()  # (N, T)
-        done = rollout["next", "done"].squeeze(-1).cpu()
-        self._forget_interrupted(rollout)
-        # Sums since the unfinished episode began, or since the rollout's first step after that.
-        returned = self._return.unsqueeze(-1) + reward.cumsum(-1)  # (N, T)
-        lasted = self._length.unsqueeze(-1) + torch.arange(1, done.shape[-1] + 1)
-        env, step = done.nonzero(as_tuple=True)  # (E,) environment by environment
-        previous = torch.arange(len(env)) - 1
-        continues = torch.zeros_like(env, dtype=torch.bool)  # an earlier episode of this environment ended here too
-        continues[1:] = env[1:] == env[:-1]
-        returns, lengths = (
-            values[env, step] - torch.where(continues, values[env, step][previous], 0) for values in (returned, lasted)
-        )
-        self._carry(returned, lasted, env, step)
-        order = torch.argsort(step, stable=True)
-        episodes = {"env": env, "return": returns.float(), "length": lengths, **self._facts(rollout, env, step)}
-        return TensorDict(episodes, batch_size=[len(env)])[order]
 
-    def summary(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Returns the metrics of finished episodes: means, and for each crash cause the share that ended by it.
+def _numbers(cells: list[str]) -> np.ndarray:
+    """Parse (R,); what is empty or not a number becomes NaN."""
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError:
+        return np.array([float(cell) if cell and _is_number(cell) else np.nan for cell in cells])
 
-        Args:
-            episodes: batch ``[E]`` of `update`.
 
-        Returns:
-            ``episode/return``, ``episode/length``, ``episode/gates_passed``, ``crash/<cause>``; empty if E = 0.
-        """
-        if not len(episodes):
-            return {}
-        names = [name for name in ("return", "length", "gates_passed") if name in episodes]
-        metrics = {f"episode/{name}": episodes[name].double().mean().item() for name in names}
-        for cause in self.crash_causes or ():
-            if cause and "crash" in episodes:
-                metrics[f"crash/{cause.name.lower()}"] = (episodes["crash"] == cause).double().mean().item()
-        return metrics
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that a checkpoint needs."""
-        return {"return": self._return.clone(), "length": self._length.clone()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self._return = state_dict["return"].clone()
-        self._length = state_dict["length"].clone()
-
-    def _forget_interrupted(self, rollout: TensorDictBase) -> None:
-        """Drops the unfinished episodes of environments that were reset meanwhile, as they are when a run resumes."""
-        is_init = rollout.get("is_init", None)
-        if is_init is not None:
-            began = is_init[:, 0].reshape(-1).cpu()
-            self._return[began] = 0
-            self._length[began] = 0
-
-    def _carry(self, returned: Tensor, lasted: Tensor, env: Tensor, step: Tensor) -> None:
-        """Keeps what came after each environment's last episode end."""
-        last = torch.full((len(returned),), -1).scatter_reduce(0, env, step, "amax")  # (N,) −1: none ended
-        at = last.clamp(min=0).unsqueeze(-1)
-        self._return, self._length = (
-            values[:, -1] - torch.where(last >= 0, values.gather(-1, at).squeeze(-1), 0)
-            for values in (returned, lasted)
-        )
-
-    def _facts(self, rollout: TensorDictBase, env: Tensor, step: Tensor) -> dict[str, Tensor]:
-        found = {name: rollout["next"].get(("race", name), None) for name in self._FACTS}
-        found["truncated"] = rollout["next"].get("truncated", None)
-        return {name: value.squeeze(-1).cpu()[env, step] for name, value in found.items() if value is not None}
+def _is_number(cell: str) -> bool:
+    """Whether a cell is a number or, as it may be, empty."""
+    try:
+        float(cell or "nan")
+    except ValueError:
+        return False
+    return True

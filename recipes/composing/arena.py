@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -16,25 +16,15 @@ from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.export.shipped_agent import AVERAGED, ShippedAgent, choose_weights, kept_weights
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.learners.dreamer import DreamerLearner, Flyer, Learner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.training.checkpoint import load_components, load_state
+from dreamer_racing.training.run import Report
 
 Environment = DroneRacingEnv | ControlSuiteEnv
 SUITES = ("race", "dmc")
-
-
-class Report(Protocol):
-    """Evaluates a learner's policy."""
-
-    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
-        """Evaluate, write what there is to look at, return metrics."""
-        ...
-
-    def close(self) -> None:
-        """Free simulators."""
-        ...
 
 
 def is_race(config: RunConfig) -> bool:

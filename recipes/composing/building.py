@@ -16,28 +16,25 @@ from torchrl.envs import Compose, InitTracker
 from composing.arena import Environment, crash_causes, is_race, make_report, reward_terms, scene_name
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, choose_device, new_run_dir
-from composing.launching import Run
 from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
-from dreamer_racing.learners.dreamer import Learner
+from dreamer_racing.learners.learner import Learner
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training.checkpoint import (
-    BestCheckpoint,
-    CollectorState,
-    RunCheckpoints,
-    ensure_writable,
-)
+from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
+from dreamer_racing.training.directory import ensure_writable
+from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
-from dreamer_racing.training.metrics import EpisodeTracker, MetricsLog
+from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.run import Run
 
 R = TypeVar("R", bound=Run)
 

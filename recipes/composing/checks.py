@@ -22,7 +22,8 @@ from dreamer_racing.losses import ImaginedPPOConfig
 from dreamer_racing.losses.ppo_actor import KL_TOLERANCE
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
-from dreamer_racing.training.checkpoint import latest_checkpoint
+from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.run import ReplayRatio
 
 
 class Range(NamedTuple):
@@ -163,32 +164,12 @@ def refuse_to_replace(config: RunConfig) -> None:
     )
 
 
-class ReplayRatio(NamedTuple):
-    """How much a learner with a replay trains: so many records on per environment step made since the prefill.
-
-    Args:
-        ratio: records trained on per environment step.
-        records: that an update trains on.
-        prefill: env_steps collected before the first update.
-        setting: name of the ratio in the configuration.
-    """
-
-    ratio: float
-    records: int
-    prefill: int
-    setting: str
-
-    @classmethod
-    def of(cls, config: DreamerConfig | SACRunConfig) -> ReplayRatio:
-        """Read it off a configuration."""
-        if isinstance(config, SACRunConfig):
-            return cls(config.sac.replay_ratio, config.sac.batch_size, config.prefill, "sac.replay_ratio")
-        model = config.model
-        return cls(model.replay_ratio, model.batch_size * model.batch_length, config.prefill, "model.replay_ratio")
-
-    def updates(self, env_steps: int) -> int:
-        """Updates in a run of so many env_steps."""
-        return max(0, int((env_steps - self.prefill) * self.ratio / self.records))
+def replay_ratio(config: DreamerConfig | SACRunConfig) -> ReplayRatio:
+    """How much a run with a replay trains."""
+    if isinstance(config, SACRunConfig):
+        return ReplayRatio(config.sac.replay_ratio, config.sac.batch_size, config.prefill, "sac.replay_ratio")
+    model = config.model
+    return ReplayRatio(model.replay_ratio, model.batch_size * model.batch_length, config.prefill, "model.replay_ratio")
 
 
 def check(config: RunConfig) -> None:
@@ -247,7 +228,7 @@ def check_replay(config: DreamerConfig | SACRunConfig) -> None:
             f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
             "first update: raise the one, or lower the other."
         )
-    replay = ReplayRatio.of(config)
+    replay = replay_ratio(config)
     if not replay.updates(config.total_env_steps):
         raise ValueError(
             f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "

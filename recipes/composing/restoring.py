@@ -13,9 +13,10 @@ from composing.schema import EvaluateConfig, PerceptionConfig, RunConfig
 from dreamer_racing.export.actor_step import ActorStep
 from dreamer_racing.export.contract import hash_weights
 from dreamer_racing.export.shipped_agent import AVERAGED, TRAINED, ShippedAgent, agents_in, choose_weights, is_agent
-from dreamer_racing.learners.dreamer import DreamerLearner, Flyer
-from dreamer_racing.provenance import command_line, provenance
-from dreamer_racing.training.checkpoint import ensure_writable, latest_checkpoint
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.machine import command_line, provenance
+from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 
 AGENTS = Path(__file__).parents[2] / "agents"
 """Where the agents that ship lie, each in a folder of its name."""

@@ -24,7 +24,7 @@ from dreamer_racing.evaluation.protocol import (
     run_protocol,
 )
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
-from dreamer_racing.provenance import command_line, git_commit, provenance
+from dreamer_racing.machine import command_line, git_commit, provenance
 
 WORLDS = {"track": "circle", "from_pixels": False, "num_threads": 1}
 

@@ -20,6 +20,8 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.drone.quadrotor import PRESETS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export import actor_step as export
+from dreamer_racing.export import onnx_actor
 from dreamer_racing.export.actor_step import (
     ActorStep,
     MissingPackagesError,
@@ -27,9 +29,7 @@ from dreamer_racing.export.actor_step import (
     check_output,
     export_actor,
     make_step,
-    onnx_actor,
 )
-from dreamer_racing.export.actor_step import actor_step as export
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.parity import (
     MIN_STEPS,
@@ -41,8 +41,8 @@ from dreamer_racing.export.parity import (
     record_flight,
 )
 from dreamer_racing.export.shipped_agent import load_agent
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
 
 pytest.importorskip("onnxscript")

@@ -20,8 +20,9 @@ from dreamer_racing.export.onnx_actor import OnnxActor
 from dreamer_racing.export.parity import MIN_STEPS, Flight
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, choose_weights, is_agent, load_agent
 from dreamer_racing.export.weights_file import read_weights, write_weights
-from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.modules import Interface, get_size
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training.checkpoint import RunCheckpoints
 
 WORLDS = {"track": "circle", "num_envs": 1, "camera": Camera(32, 32, tilt=30.0), "control_rate": 25.0, "num_threads": 1}

@@ -7,7 +7,7 @@ import pytest
 
 from dreamer_racing.figures.comparison import CAPTION, compare_variants, comparison_table
 from dreamer_racing.figures.runs import RunData
-from dreamer_racing.training.metrics_file import MetricsTable
+from dreamer_racing.training.metrics import MetricsTable
 
 NAMES = {"gates": "evaluation/gates_per_episode", "clock": "wall_clock"}
 

@@ -29,7 +29,7 @@ from dreamer_racing.figures.runs import (
     group_runs,
     read_runs,
 )
-from dreamer_racing.training.metrics_file import read_metrics
+from dreamer_racing.training.metrics import read_metrics
 
 
 def write_run(folder: Path, name: str, returns=(0.0, 10.0), track: str = "circle", **settings) -> Path:

@@ -16,7 +16,7 @@ from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve, plot_top_down
-from dreamer_racing.training.metrics_file import read_metrics
+from dreamer_racing.training.metrics import read_metrics
 
 
 def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> Trajectory:

@@ -12,20 +12,11 @@ import torch
 from PIL import Image
 
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.dreams import (
-    CONTEXT,
-    PREDICTED,
-    STRIDE,
-    Dream,
-    dream_video,
-    film_strip,
-    record_dream,
-    shown_frames,
-)
+from dreamer_racing.evaluation.dreams import CONTEXT, PREDICTED, STRIDE, Dream, record_dream
 from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.evaluation.flights import read_trajectory, write_trajectory
+from dreamer_racing.evaluation.trajectory import read_trajectory, write_trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
 from dreamer_racing.figures.flights import Flight, plot_dreams, plot_flights, profile_axis
 
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
-from tests.test_curves import write_run
 
 from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
 from dreamer_racing.figures.curves import Curve, LearningCurves, learning_curves
 from dreamer_racing.figures.drawing import INK
 from dreamer_racing.figures.learning import OTHER_COLOR, line_styles, plot_comparison, plot_learning_curves
 from dreamer_racing.figures.runs import CurveKey, find_runs, read_runs
+from tests.figures.test_curves import write_run
 from tests.running_recipes import compose
 
 

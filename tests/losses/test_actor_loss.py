@@ -4,9 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.losses import ReinforceLoss
 from dreamer_racing.modules import SIZES
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
 
 

@@ -1,9 +1,9 @@
 import torch
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.losses import imagine, lambda_return
 from dreamer_racing.modules import SIZES
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
 
 

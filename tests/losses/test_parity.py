@@ -22,9 +22,10 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Model
 from torchrl.objectives.dreamer_v3 import categorical_kl_balanced
 from torchrl.objectives.utils import ValueEstimators
 
-from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import CriticLoss, DynamicsActorLoss, ReconstructionLoss, ReinforceLoss, kl_losses
 from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
+from dreamer_racing.modules.agent import Agent
 
 SIZE = SIZES["debug"]
 HORIZON = 333

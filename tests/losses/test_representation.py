@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.objectives import LossModule
 
-from dreamer_racing.learners.dreamer import Agent, DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import (
     WORLD_MODEL_LOSSES,
     DecoderFreeLoss,
@@ -22,6 +22,7 @@ from dreamer_racing.losses import (
     redundancy_reduction,
 )
 from dreamer_racing.modules import SIZES, Interface, WorldModel, join_features, symlog
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast
 
 PRIVILEGED_DIM = 5

@@ -8,7 +8,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.experience.replay import records_from_rollout
-from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.sizes import SIZES

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from dreamer_racing.learners.dreamer import Agent
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.sizes import SIZES, get_size
 

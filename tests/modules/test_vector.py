@@ -9,7 +9,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learners.dreamer import Agent
 from dreamer_racing.modules import (
     SIZES,
     DreamerPolicy,
@@ -19,6 +18,7 @@ from dreamer_racing.modules import (
     VectorDecoder,
     VectorEncoder,
 )
+from dreamer_racing.modules.agent import Agent
 
 SIZE = SIZES["debug"]
 VECTOR_DIM = 7

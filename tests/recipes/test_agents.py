@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
-from dreamer_racing.training.checkpoint import latest_checkpoint
+from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
 
 pytest.importorskip("onnxscript")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.training.checkpoint import latest_checkpoint, mark_finished
+from dreamer_racing.training.directory import latest_checkpoint, mark_finished
 from dreamer_racing.training.lock import RunLock
 from tests.running_recipes import ROOT, compose, recipe_module, rows
 

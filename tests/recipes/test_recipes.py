@@ -20,7 +20,7 @@ from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.lesions import LESIONS
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import latest_checkpoint
+from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
 SMALL = [

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.training.checkpoint import latest_checkpoint
+from dreamer_racing.training.directory import latest_checkpoint
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = [

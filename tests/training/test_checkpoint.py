@@ -20,14 +20,9 @@ from torchrl.checkpoint import CheckpointError
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay, make_replay
 from dreamer_racing.training import checkpoint as checkpoint_module
-from dreamer_racing.training.checkpoint import (
-    BestCheckpoint,
-    GracefulExit,
-    RunCheckpoints,
-    ensure_writable,
-    latest_checkpoint,
-    load_components,
-)
+from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints, load_components
+from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
+from dreamer_racing.training.signals import GracefulExit
 
 
 class Run:

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from dreamer_racing.training.metrics import EpisodeTracker, MetricsLog
+from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.metrics import MetricsLog
 
 
 class Cause(IntEnum):

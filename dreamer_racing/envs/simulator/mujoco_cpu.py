@@ -1,7 +1,5 @@
 """N worlds on CPU: MuJoCo's C engine for the rigid bodies, batched natively, and a renderer for their cameras."""
 
-import os
-
 import mujoco
 import torch
 from mujoco.batch import Batch
@@ -13,6 +11,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.machine import available_cpus
 
 
 class MujocoSimulator(Simulator):
@@ -72,8 +71,3 @@ class MujocoSimulator(Simulator):
         if self.renderer is not None:
             self.renderer.close()
             self.renderer = None
-
-
-def available_cpus() -> int:
-    """CPUs this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

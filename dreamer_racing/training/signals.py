@@ -1,0 +1,50 @@
+"""A graceful end on a signal."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+
+class GracefulExit:
+    """Turns SIGINT and SIGTERM into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
+
+    The handlers from before are put back at exit. Outside the main thread, where Python allows no handlers, the flag
+    is never set.
+
+    Example:
+        >>> with GracefulExit() as stop:
+        ...     while not stop.requested:
+        ...         break
+    """
+
+    def __init__(self) -> None:
+        self.signal_name: str | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal has arrived."""
+        return self.signal_name is not None
+
+    def __enter__(self) -> GracefulExit:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        # No logging here: the signal may have interrupted a write to the same stream.
+        name = signal.Signals(number).name
+        if self.requested:
+            raise KeyboardInterrupt(f"{name} after {self.signal_name}")
+        self.signal_name = name
