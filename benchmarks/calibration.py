@@ -74,7 +74,7 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
     learner = cast(DreamerLearner, restored)
     return {
         "benchmark": "calibration", "track": config.track, "actor": config.loss.actor, **counters,
-        "num_envs": num_envs, "steps": steps, "horizon": learner.config.imagination_horizon,
+        "num_envs": num_envs, "steps": steps, "horizon": learner.horizon,
         "discount": learner.discount, **compare(learner, fly(learner, config, num_envs, steps)),
     }  # fmt: skip
 
@@ -115,7 +115,7 @@ def fly(learner: DreamerLearner, config: DreamerConfig, num_envs: int, steps: in
 
 def compare(learner: DreamerLearner, flight: TensorDict) -> dict[str, Any]:
     """Return the means that the module's docstring names."""
-    model, critic, horizon = learner.agent.world_model, learner.agent.critic, learner.config.imagination_horizon
+    model, critic, horizon = learner.agent.world_model, learner.agent.critic, learner.horizon
     value = critic.value(join_features(flight["belief"], flight["state"])).squeeze(-1)  # (K, N)
     rows = []
     for k in range(0, len(flight) - horizon, 8):

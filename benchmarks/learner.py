@@ -32,9 +32,10 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig, make_dreamer
+from dreamer_racing.losses import LossConfig
 from dreamer_racing.machine import keep_freed_memory
-from dreamer_racing.modules import SIZES, Interface, get_size
+from dreamer_racing.modules import SIZES, Interface
 
 PRIVILEGED_DIM = 21
 PEERS = ("torchrl_small", "torchrl_large")
@@ -105,16 +106,10 @@ def measure(
     """Time updates of one configuration; return one record."""
     torch.set_num_threads(threads)
     torch.set_float32_matmul_precision("medium")
-    config = LearnerConfig(
-        *batch,
-        horizon,
-        world_model_loss=loss,
-        actor_loss=actor,
-        mixed_precision=mixed_precision,
-        compile="compile" in backend,
-        cuda_graph="graph" in backend,
-    )
-    learner = DreamerLearner(size, interface_of(image_size), config, device, seed=0)
+    config = LearnerConfig(mixed_precision=mixed_precision, compile="compile" in backend, cuda_graph="graph" in backend)
+    losses = LossConfig(world_model=loss, actor=actor)
+    interface = interface_of(image_size)
+    learner = make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0)
     replay = filled_replay(batch, device, image_size)
     samples = [seconds(replay.sample, device) for _ in range(5)]
     data = replay.sample()
@@ -221,9 +216,9 @@ def dry_update(
     size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, image_size: int = 64
 ) -> tuple[int, int, int]:
     """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
-    config = LearnerConfig(*batch, horizon, world_model_loss=loss, actor_loss=actor)
+    losses = LossConfig(world_model=loss, actor=actor)
     with torch.device("meta"):
-        learner = DreamerLearner(get_size(size), interface_of(image_size), config, "meta")
+        learner = make_dreamer(size, interface_of(image_size), losses, horizon=horizon, device="meta")
         records: dict[Any, Tensor] = {
             "pixels": torch.empty(*batch, image_size, image_size, 3, dtype=torch.uint8),
             ("privileged", "vector"): torch.empty(*batch, PRIVILEGED_DIM),

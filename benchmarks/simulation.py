@@ -48,7 +48,7 @@ from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
 
@@ -205,7 +205,7 @@ def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callabl
 
 def make_policy(env: DroneRacingEnv, size: str) -> DreamerPolicy:
     """Make an untrained agent's policy."""
-    return DreamerLearner(size, Interface.of(env), LearnerConfig(), str(env.device)).policy()
+    return make_dreamer(size, Interface.of(env), device=str(env.device)).policy()
 
 
 def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[str, Tensor]], Tensor]:

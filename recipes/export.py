@@ -20,10 +20,10 @@ from typing import Any, cast
 
 import hydra
 import torch
-from composing.arena import camera_of, is_race, trained_config
+from composing.arena import camera_of, trained_config
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.restoring import config_folder, find_trained, results_of
-from composing.schema import DreamerConfig, ExportConfig, register
+from composing.schema import DreamerConfig, ExportConfig, is_race, register
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv

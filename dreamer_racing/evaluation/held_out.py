@@ -5,12 +5,14 @@ Shapes: W windows of T records, C context records, H horizon, F features.
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.losses import imagine
+from dreamer_racing.losses import ActorLoss, imagine
 from dreamer_racing.modules.world_model import join_features
 
 SEEN = 16
@@ -43,7 +45,7 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
     Raises:
         ValueError: If the windows are too short.
     """
-    horizon = learner.config.imagination_horizon
+    horizon = learner.horizon
     if batch.shape[1] < SEEN + horizon:
         raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
     devices = [learner.device] if learner.device.type == "cuda" else []
@@ -107,7 +109,7 @@ def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], hori
     model = learner.agent.world_model
     features = imagine(model.rssm, learner.agent.actor, *start, horizon).features[1:]  # (H, W, F)
     continuation = model.continue_head.probability(features).squeeze(-1)  # (H, W)
-    if not learner.config.continuation:
+    if not cast(ActorLoss, learner.losses["actor"]).continuation:
         continuation = torch.ones_like(continuation)
     reached = torch.cat((torch.ones_like(continuation[:1]), continuation[:-1])).cumprod(0)
     reward = model.reward_head.mean(features).squeeze(-1) * reached

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -77,15 +75,6 @@ class BaselineLearner(ABC):
     @abstractmethod
     def _modules(self) -> dict[str, nn.Module]:
         """Return what is saved."""
-
-
-@contextmanager
-def seeded(seed: int | None) -> Iterator[None]:
-    """Draw initial weights by a seed, without a trace in the global generator; None draws them from that."""
-    with torch.random.fork_rng(devices=[], enabled=seed is not None):
-        if seed is not None:
-            torch.manual_seed(seed)
-        yield
 
 
 def detached(outputs: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -6,8 +6,8 @@ Shape legend: B batch, T time, A action.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
 
 import torch
@@ -17,115 +17,81 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep, Step
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.learner import Timer, untimed
-from dreamer_racing.losses import (
-    ACTOR_LOSSES,
-    CRITIC_LOSSES,
-    WORLD_MODEL_LOSSES,
-    ActorLoss,
-    ImaginedPPOConfig,
-    LossClass,
-    find_loss,
-)
+from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
 
 
-@dataclass(frozen=True)
+@dataclass
 class LearnerConfig:
-    """Numbers of the learner, all but the networks' sizes.
+    """Numbers of an update, beside those of its losses.
 
     Attributes:
-        batch_size: B, windows in a batch.
-        batch_length: T, records in a window.
-        imagination_horizon: H, imagined actions from each start.
         imagination_starts: Imagine from a random subset of so many records of the batch; None from all of them.
-        discount: γ.
-        lambda_: λ of the returns.
-        entropy_scale: Weight of the actor's entropy.
-        return_decay: Decay of the return percentiles.
-        dynamics_scale: Weight of the dynamics loss.
-        representation_scale: Weight of the representation loss.
-        free_nats: KL below which there is no gradient, nats.
-        kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
-        privileged_scale: Weight of decoding the privileged state, where the loss does.
-        barlow_scale: Weight of the redundancy reduction, where the loss has it.
-        continuation: Whether predicted ends of episodes cut imagined returns.
-        slow_critic_scale: Weight of the regularisation towards the slow critic.
-        slow_critic_rate: Fraction by which the slow critic moves at each update.
-        replay_value_scale: Weight of the critic's loss on replayed returns.
-        replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
-        compile: Compile the losses with ``torch.compile``; minutes at the first update.
-        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph.
-        mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32.
-        optimizer: Key of ``OPTIMIZERS``.
-        lr: Learning rate; the reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
-        behavior_lr: Learning rate of actor and critic; None for the same. A lower one lets the world model get ahead of
-            the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
-        warmup_updates: Updates over which the learning rate rises from zero.
         imagine_recent: Imagine from the batch's newest windows only, as far as they go, so that the actor learns where
             it flies now; the batch must say which they are (``recent``), as the replay does.
-        min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
-            first way of doing something has made it sure of itself.
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
-        ppo: Numbers of the actor loss of that name.
-        world_model_loss, actor_loss, critic_loss: Keys of the registries in ``dreamer_racing.losses``.
+        slow_critic_rate: Fraction by which the slow critic moves at each update.
+        compile: Compile the losses with ``torch.compile``; minutes at the first update.
+        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph.
+        mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
+            which the recipes replace by what the device does well, is False.
+        learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
+        behavior_learning_rate: Of actor and critic; None for the same. A lower one lets the world model get ahead of
+            the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
+        warmup_updates: Updates over which the learning rate rises from zero.
 
-    Reference: danijar/dreamerv3, ``configs.yaml``; horizon 16 from the paper, Section III.
+    Reference: danijar/dreamerv3, ``configs.yaml``.
     """
 
-    batch_size: int = 16
-    batch_length: int = 64
-    imagination_horizon: int = 16
-    imagination_starts: int | None = None
-    discount: float = 0.997
-    lambda_: float = 0.95
-    entropy_scale: float = 3e-4
-    return_decay: float = 0.99
-    dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
-    free_nats: float = 1.0
-    kl_mode: str = "separate"
-    privileged_scale: float = 1.0
-    barlow_scale: float = 0.05
-    continuation: bool = True
-    slow_critic_scale: float = 1.0
-    slow_critic_rate: float = 0.02
-    replay_value_scale: float = 0.3
-    replay_value_gradient: bool = True
+    imagination_starts: int | None = setting(None, COUNT)
+    imagine_recent: bool = False
+    average_rate: float | None = setting(None, POSITIVE_SHARE)
+    slow_critic_rate: float = setting(0.02, SHARE)
     compile: bool = False
     cuda_graph: bool = False
-    mixed_precision: bool = False
-    optimizer: str = "laprop"
-    lr: float = 4e-5
-    behavior_lr: float | None = None
-    warmup_updates: int = 1000
-    imagine_recent: bool = False
-    min_std: float = 0.1
-    average_rate: float | None = None
-    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)
-    world_model_loss: str = "reconstruction"
-    actor_loss: str = "reinforce"
-    critic_loss: str = "two_hot"
+    mixed_precision: bool | None = None
+    learning_rate: float = setting(4e-5, POSITIVE)
+    behavior_learning_rate: float | None = setting(None, POSITIVE)
+    warmup_updates: int = setting(1000, NOT_NEGATIVE)
 
 
 ParameterGroups = list[dict[str, Any]]
 """Parameters with their learning rates: ``[{"params": [...], "lr": ...}, ...]``."""
 
 
-def _laprop(groups: ParameterGroups, config: LearnerConfig) -> torch.optim.Optimizer:
-    """Make the 2025 reference's optimiser: LaProp with adaptive gradient clipping."""
+def make_optimizer(agent: Agent, losses: Mapping[str, LossModule], config: LearnerConfig) -> torch.optim.Optimizer:
+    """Make the 2025 reference's optimiser, LaProp with adaptive gradient clipping.
+
+    Its first group is the world model, its second actor and critic, each with what their losses have of their own; an
+    actor that its loss steps is in none.
+    """
     from torchrl.trainers.algorithms import DreamerV3Optimizer
 
-    return DreamerV3Optimizer(groups, lr=config.lr, warmup_steps=config.warmup_updates)
+    networks = trained_parameters(agent, losses)
+    rate = config.learning_rate
+    actor = [] if getattr(losses["actor"], "optimizer", None) is not None else networks["actor"]
+    groups: ParameterGroups = [
+        {"params": networks["world_model"], "lr": rate},
+        {"params": actor + networks["critic"], "lr": config.behavior_learning_rate or rate},
+    ]
+    return DreamerV3Optimizer(groups, lr=rate, warmup_steps=config.warmup_updates)
 
 
-OPTIMIZERS: dict[str, Callable[[ParameterGroups, LearnerConfig], torch.optim.Optimizer]] = {"laprop": _laprop}
-"""Optimiser factories by the name in ``LearnerConfig``; those of your own must clip gradients themselves."""
+def trained_parameters(agent: Agent, losses: Mapping[str, LossModule]) -> dict[str, list[nn.Parameter]]:
+    """Return the parameters of each network, with those that its loss has of its own."""
+    networks = dict(agent.named_children())
+    shared = set(agent.parameters())
+    own = {name: [p for p in loss.parameters() if p not in shared] for name, loss in losses.items()}
+    return {
+        name: [p for p in (*network.parameters(), *own[name]) if p.requires_grad] for name, network in networks.items()
+    }
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
@@ -159,67 +125,68 @@ def _plain(value: Any) -> Any:
 
 
 class DreamerLearner:
-    """World model, actor and critic with their losses and optimiser.
+    """One update of world model, actor and critic by their losses and an optimiser; all of them are given.
 
     Args:
-        size: A ``ModelSize`` or its name.
-        interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
-        config: Numbers of the learner.
-        device: Where the networks live and updates run.
-        seed: Seed of the initial weights; None takes them from the global generator. Later sampling always uses the
-            global generator of the device, which a checkpoint of yours should save.
+        agent: The networks, on the device where updates run.
+        losses: ``world_model``, ``actor`` and ``critic``, as ``make_losses`` makes them of the agent.
+        optimizer: As ``make_optimizer`` makes it: a group of the world model, and one of actor and critic. It must clip
+            gradients itself.
+        config: Numbers of the update.
 
     Attributes:
         latents: Belief and state of the last batch's records, ``[B, T]``, for the replay's context; on a CUDA device
             with ``cuda_graph`` the next update writes over them.
-        discount: γ as it is now, see ``adjust``.
         actor_waits: Whether an actor with an optimiser of its own stands still; settable.
 
     Example:
-        >>> learner = DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3), seed=0)
-        >>> policy = learner.policy()
-        >>> policy.in_keys
+        >>> agent = Agent(get_size("debug"), Interface())
+        >>> losses = make_losses(agent, LossConfig(), horizon=3)
+        >>> learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, LearnerConfig()))
+        >>> learner.policy().in_keys
         ['pixels', 'is_init', 'belief', 'state', 'previous_action']
     """
 
     def __init__(
         self,
-        size: ModelSize | str,
-        interface: Interface | None = None,
+        agent: Agent,
+        losses: Mapping[str, LossModule],
+        optimizer: torch.optim.Optimizer,
         config: LearnerConfig | None = None,
-        device: torch.device | str = "cpu",
-        seed: int | None = None,
     ) -> None:
-        self.size = get_size(size)
         self.config = config or LearnerConfig()
-        self.device = torch.device(device)
-        with torch.random.fork_rng(devices=[], enabled=seed is not None):
-            if seed is not None:
-                torch.manual_seed(seed)
-            world_model_loss = find_loss(WORLD_MODEL_LOSSES, self.config.world_model_loss)
-            losses: dict[str, LossClass] = {
-                "world_model": world_model_loss,
-                "actor": find_loss(ACTOR_LOSSES, self.config.actor_loss),
-                "critic": find_loss(CRITIC_LOSSES, self.config.critic_loss),
-            }
-            self.agent = Agent(self.size, interface or Interface(), world_model_loss.decodes).to(self.device)
-            self.agent.actor.min_std.fill_(self.config.min_std)
-            self.losses = nn.ModuleDict(
-                {name: loss.from_config(self.agent, self.config) for name, loss in losses.items()}
-            ).to(self.device)
-        self.averaged = None if self.config.average_rate is None else copy.deepcopy(self.agent).requires_grad_(False)
+        self.agent = agent
+        self.losses = nn.ModuleDict(losses)
+        self.optimizer = optimizer
+        self.device = next(agent.parameters()).device
+        self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
-        self.discount = self.config.discount
         self.actor_waits = False
-        self._networks = self._trained_parameters()
-        self._actor_optimizer: torch.optim.Optimizer | None = getattr(self.losses["actor"], "optimizer", None)
-        self.optimizer = OPTIMIZERS[self.config.optimizer](self._parameter_groups(), self.config)
-        self._rates = [group["lr"] for group in self._groups]
         self.updates = 0
+        self._networks = trained_parameters(agent, losses)
+        self._actor_optimizer: torch.optim.Optimizer | None = getattr(losses["actor"], "optimizer", None)
+        self._rates = [group["lr"] for group in self._groups]
         self._timed: Timer = untimed
-        self._compute = self.compute_losses
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
+        self._compute = (
+            torch.compile(self.compute_losses, dynamic=False) if self.config.compile else self.compute_losses
+        )
         self._step = self._make_step()
+
+    @property
+    def discount(self) -> float:
+        """γ of the actor's loss, as it is now; reading it waits for the device."""
+        return float(cast(ActorLoss, self.losses["actor"]).discount)
+
+    @property
+    def horizon(self) -> int:
+        """H, imagined actions from each start."""
+        return cast(ActorLoss, self.losses["actor"]).horizon
+
+    @property
+    def size(self) -> ModelSize:
+        """Of the networks."""
+        return self.agent.size
 
     def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make one gradient step of everything.
@@ -270,30 +237,29 @@ class DreamerLearner:
     def adjust(
         self,
         *,
-        rates: float = 1.0,
+        rates: float | None = None,
         discount: float | None = None,
         entropy_scale: float | None = None,
         min_std: float | None = None,
     ) -> None:
-        """Change what a run may have on a schedule, from the next update on; what is not named is as configured.
+        """Change what a run may have on a schedule, from the next update on; what is not named stays.
 
         Args:
-            rates: Share of the configured learning rates, of all optimisers.
+            rates: Share of the learning rates that the learner was made with, of all optimisers.
             discount: γ.
             entropy_scale: Weight of the actor's entropy.
             min_std: Smallest standard deviation of actions.
         """
-        self._set_min_std(self.config.min_std if min_std is None else min_std)
-        for group, rate in zip(self._groups, self._rates, strict=True):
-            group["lr"] = rate * rates
-        self.discount = self.config.discount if discount is None else discount
-        self._set_in_losses("discount", self.discount)
-        self._set_in_losses("entropy_scale", self.config.entropy_scale if entropy_scale is None else entropy_scale)
-
-    def _set_min_std(self, value: float) -> None:
-        for agent in (self.agent, self.averaged):
-            if agent is not None:
-                agent.actor.min_std.fill_(value)
+        if rates is not None:
+            for group, rate in zip(self._groups, self._rates, strict=True):
+                group["lr"] = rate * rates
+        if discount is not None:
+            self._set_in_losses("discount", discount)
+        if entropy_scale is not None:
+            self._set_in_losses("entropy_scale", entropy_scale)
+        if min_std is not None:
+            self.agent.actor.min_std.fill_(min_std)
+            self.flying_agent.actor.min_std.fill_(min_std)
 
     def _set_in_losses(self, name: str, value: float) -> None:
         """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""
@@ -314,18 +280,15 @@ class DreamerLearner:
 
     def autocast(self) -> torch.autocast:
         """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
-        return autocast(self.device, self.config.mixed_precision)
+        return autocast(self.device, bool(self.config.mixed_precision))
 
     def _make_step(self) -> Step:
         """Return the function that computes gradients, as fast as the configuration allows."""
-        config, step = self.config, self._backward
-        if config.compile:
-            self._compute = torch.compile(self.compute_losses, dynamic=False)
-        if not config.cuda_graph:
-            return step
+        if not self.config.cuda_graph:
+            return self._backward
         if self.device.type != "cuda":
             raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
-        return GraphedStep(step, nn.ModuleList([self.agent, self.losses]))
+        return GraphedStep(self._backward, nn.ModuleList([self.agent, self.losses]))
 
     def _backward(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
@@ -355,7 +318,7 @@ class DreamerLearner:
         imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
         imagination = imagined.pop("imagination")
         replay = batch.select("reward", "is_init", "terminated", "truncated")
-        replay.update(context if self.config.replay_value_gradient else context.detach())
+        replay.update(context)
         if self.config.imagination_starts is None:
             # Every record was a start: its first imagined return is a better value than the critic's.
             replay.set("bootstrap", imagination.get("lambda_return")[0].reshape(*batch.batch_size, 1))
@@ -470,26 +433,6 @@ class DreamerLearner:
                         f"{list(value.shape)}: it was trained {where}."
                     )
 
-    def _trained_parameters(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters of each network, with those that its loss has of its own."""
-        networks = dict(self.agent.named_children())
-        shared = set(self.agent.parameters())
-        own = {name: [p for p in loss.parameters() if p not in shared] for name, loss in self.losses.items()}
-        return {
-            name: [p for p in (*network.parameters(), *own[name]) if p.requires_grad]
-            for name, network in networks.items()
-        }
-
-    def _parameter_groups(self) -> ParameterGroups:
-        """Return the world model's parameters, and actor's and critic's, with their learning rates."""
-        networks, config = self._networks, self.config
-        behavior_lr = config.lr if config.behavior_lr is None else config.behavior_lr
-        actor = networks["actor"] if self._actor_optimizer is None else []  # else the loss steps it
-        return [
-            {"params": networks["world_model"], "lr": config.lr},
-            {"params": actor + networks["critic"], "lr": behavior_lr},
-        ]
-
     def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
         """Return the latents ``[N]`` to imagine from, with their ``terminated``."""
         starts = TensorDict(
@@ -509,6 +452,36 @@ class DreamerLearner:
     def _number_of_starts(self, batch: TensorDictBase) -> int:
         """Return how many records of a batch ``[B, T]`` imagination begins from."""
         return min(self.config.imagination_starts or batch.numel(), batch.numel())
+
+
+def make_dreamer(
+    size: ModelSize | str,
+    interface: Interface | None = None,
+    losses: LossConfig | None = None,
+    config: LearnerConfig | None = None,
+    *,
+    horizon: int = 16,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+) -> DreamerLearner:
+    """Compose a learner by the names of its parts: networks, losses, optimiser.
+
+    Args:
+        size: Of the networks, or its name.
+        interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
+        losses: Which they are, and their numbers.
+        config: Numbers of the update.
+        horizon: H, imagined actions from each start.
+        device: Where the networks live and updates run.
+        seed: Of the initial weights; None takes them from the global generator. Later sampling always uses the
+            global generator of the device, which a checkpoint of yours should save.
+    """
+    losses, config = losses or LossConfig(), config or LearnerConfig()
+    decodes = find_loss(WORLD_MODEL_LOSSES, losses.world_model).decodes
+    with seeded(seed):
+        agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std).to(device)
+        modules = {name: loss.to(device) for name, loss in make_losses(agent, losses, horizon).items()}
+    return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

@@ -16,8 +16,8 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
-from dreamer_racing.learners.learner import Timer, untimed
+from dreamer_racing.learners.baseline import BaselineLearner, detached
+from dreamer_racing.learners.learner import Timer, seeded, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -25,6 +25,7 @@ from dreamer_racing.learners.networks import (
     ObservationNetwork,
 )
 from dreamer_racing.modules import Interface
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, setting
 
 
 @dataclass
@@ -49,17 +50,17 @@ class PPOConfig:
     deviation are [choice].
     """
 
-    learning_rate: float = 1e-3
-    epochs: int = 5
-    minibatches: int = 8
-    clip_epsilon: float = 0.2
-    discount: float = 0.99
-    lambda_: float = 0.95
-    entropy_scale: float = 0.0
-    critic_scale: float = 0.5
-    reward_scale: float = 0.1
-    gradient_clip: float = 0.5
-    initial_std: float = 0.6
+    learning_rate: float = setting(1e-3, POSITIVE)
+    epochs: int = setting(5, COUNT)
+    minibatches: int = setting(8, COUNT)
+    clip_epsilon: float = setting(0.2, POSITIVE)
+    discount: float = setting(0.99, SHARE)
+    lambda_: float = setting(0.95, SHARE)
+    entropy_scale: float = setting(0.0, NOT_NEGATIVE)
+    critic_scale: float = setting(0.5, NOT_NEGATIVE)
+    reward_scale: float = setting(0.1, POSITIVE)
+    gradient_clip: float = setting(0.5, POSITIVE)
+    initial_std: float = setting(0.6, POSITIVE)
 
 
 class PPOLearner(BaselineLearner):

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from dreamer_racing.learners.baseline import BaselineLearner, detached, seeded
-from dreamer_racing.learners.learner import Timer, untimed
+from dreamer_racing.learners.baseline import BaselineLearner, detached
+from dreamer_racing.learners.learner import Timer, seeded, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -23,6 +23,7 @@ from dreamer_racing.learners.networks import (
     ObservationNetwork,
 )
 from dreamer_racing.modules import Interface
+from dreamer_racing.settings import COUNT, POSITIVE, SHARE, setting
 
 NO_WEIGHT = 1e-30  # beside a transition's 1: lost in float32, but a sum of it is not 0
 
@@ -44,13 +45,13 @@ class SACConfig:
     for batch size and replay ratio (there are many worlds), temperature and scale of rewards [choice].
     """
 
-    learning_rate: float = 3e-4
-    batch_size: int = 1024
-    replay_ratio: float = 16.0
-    discount: float = 0.99
-    target_rate: float = 0.005
-    initial_alpha: float = 0.05
-    reward_scale: float = 1.0
+    learning_rate: float = setting(3e-4, POSITIVE)
+    batch_size: int = setting(1024, COUNT)
+    replay_ratio: float = setting(16.0, POSITIVE)
+    discount: float = setting(0.99, SHARE)
+    target_rate: float = setting(0.005, SHARE)
+    initial_alpha: float = setting(0.05, POSITIVE)
+    reward_scale: float = setting(1.0, POSITIVE)
 
 
 class SACLearner(BaselineLearner):

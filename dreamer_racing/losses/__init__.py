@@ -1,6 +1,6 @@
 """Losses of the DreamerV3 learner, each a TorchRL ``LossModule`` that also works alone.
 
-A loss is chosen by name in ``LearnerConfig``. To add one, put a class with ``from_config(agent, config)`` under a new
+A loss is chosen by name in ``LossConfig``. To add one, put a class with ``from_config(agent, config)`` under a new
 name; it must read and write the keys that the class it replaces documents. See ``docs/losses.md``.
 """
 
@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
+from dreamer_racing.losses.config import ImaginedPPOConfig, LossConfig
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
-from dreamer_racing.losses.ppo_actor import ImaginedPPOConfig, PPOActorLoss
+from dreamer_racing.losses.ppo_actor import PPOActorLoss
 from dreamer_racing.losses.representation import (
     DecoderFreeLoss,
     InformedLoss,
@@ -24,20 +25,16 @@ from dreamer_racing.losses.representation import (
     redundancy_reduction,
 )
 from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
-
+from dreamer_racing.modules.agent import Agent
 
 T = TypeVar("T")
 
 
 class LossClass(Protocol):
-    """A loss that a learner can make."""
+    """A loss that can be made of an agent and numbers."""
 
-    def from_config(self, agent: Agent, config: LearnerConfig) -> LossModule:
-        """Make the loss of an agent with a learner's numbers."""
+    def from_config(self, agent: Agent, config: LossConfig, **own: Any) -> LossModule:
+        """Make the loss of an agent with the losses' numbers; an actor's is given its ``horizon`` too."""
         ...
 
 
@@ -79,6 +76,28 @@ def find_loss(registry: Mapping[str, T], name: str) -> T:
     return registry[name]
 
 
+def make_losses(agent: Agent, config: LossConfig, horizon: int = 16) -> dict[str, LossModule]:
+    """Make the three losses of an agent, by their names.
+
+    Args:
+        agent: The networks that they train; it must have decoders if the world model's loss ``decodes``.
+        config: Which they are, and their numbers.
+        horizon: H, imagined actions from each start.
+
+    Returns:
+        ``world_model``, ``actor`` and ``critic``, as ``DreamerLearner`` takes them.
+
+    Raises:
+        ValueError: If there is no loss of a name.
+    """
+    actor = find_loss(ACTOR_LOSSES, config.actor)
+    return {
+        "world_model": find_loss(WORLD_MODEL_LOSSES, config.world_model).from_config(agent, config),
+        "actor": actor.from_config(agent, config, horizon=horizon),
+        "critic": find_loss(CRITIC_LOSSES, config.critic).from_config(agent, config),
+    }
+
+
 __all__ = [
     "ACTOR_LOSSES",
     "CRITIC_LOSSES",
@@ -92,6 +111,7 @@ __all__ = [
     "ImaginedPPOConfig",
     "InformedLoss",
     "LossClass",
+    "LossConfig",
     "PPOActorLoss",
     "PrivilegedLoss",
     "ReconstructionLoss",
@@ -101,6 +121,7 @@ __all__ = [
     "imagine",
     "kl_losses",
     "lambda_return",
+    "make_losses",
     "redundancy_reduction",
     "replay_return",
 ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,15 +15,13 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import imagine, lambda_return
 from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import WorldModel
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
 
 
 class Judgement(NamedTuple):
@@ -109,13 +107,13 @@ class ActorLoss(LossModule):
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig, **own: Any) -> Self:
-        """Make the loss of an agent with a learner's numbers, and with arguments of a subclass's own."""
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return cls(
             agent.world_model,
             agent.actor,
             agent.critic,
-            horizon=config.imagination_horizon,
+            horizon=horizon,
             discount=config.discount,
             lambda_=config.lambda_,
             entropy_scale=config.entropy_scale,

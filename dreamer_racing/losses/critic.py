@@ -5,21 +5,19 @@ Shape legend: B batch, T time, N starts, H horizon, F features.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import lambda_return
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import join_features
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
 
 
 @torch.no_grad()
@@ -74,12 +72,13 @@ class CriticLoss(LossModule):
         lambda_: λ of the replayed returns.
         slow_scale: Weight of the regression on the slow copy's mean.
         replay_scale: Weight of the replayed returns.
+        replay_gradient: Whether the replayed returns' loss reaches whatever graph ``belief`` and ``state`` carry, and
+            so trains the world model too.
 
     Reads ``imagination`` as ``ActorLoss`` writes it, and a batch ``[B, T]`` of ``belief``, ``state``, ``reward``,
     ``is_init``, ``terminated``, ``truncated``, with an optional ``bootstrap`` ``(B, T, 1)``: values of the records,
     default the critic's own. Writes the scalars ``loss_critic``, ``loss_replay_critic``, ``value_mean`` and
-    ``value_error`` (mean absolute, of the imagined returns). The replay loss reaches whatever graph ``belief`` and
-    ``state`` carry: detach them to keep it from the world model.
+    ``value_error`` (mean absolute, of the imagined returns).
 
     Reference: DreamerV3, Eq. 10 and "Critic learning".
     """
@@ -95,6 +94,7 @@ class CriticLoss(LossModule):
         lambda_: float = 0.95,
         slow_scale: float = 1.0,
         replay_scale: float = 0.3,
+        replay_gradient: bool = True,
     ) -> None:
         super().__init__()
         self.critic = critic
@@ -102,16 +102,19 @@ class CriticLoss(LossModule):
         self.lambda_ = lambda_
         self.slow_scale = slow_scale
         self.replay_scale = replay_scale
+        self.replay_gradient = replay_gradient
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> CriticLoss:
-        """Make the loss of an agent with a learner's numbers."""
+    def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return cls(
             agent.critic,
             discount=config.discount,
             lambda_=config.lambda_,
             slow_scale=config.slow_critic_scale,
             replay_scale=config.replay_value_scale,
+            replay_gradient=config.replay_value_gradient,
+            **own,
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -137,6 +140,7 @@ class CriticLoss(LossModule):
     def _replay(self, tensordict: TensorDictBase) -> Tensor:
         """Return the unscaled loss on the replayed records, a scalar."""
         features = join_features(tensordict.get("belief"), tensordict.get("state"))
+        features = features if self.replay_gradient else features.detach()
         logits = self.critic(features)
         bootstrap = tensordict.get("bootstrap", None)
         if bootstrap is None:

@@ -12,53 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
 from dreamer_racing.losses.actor import ActorLoss
+from dreamer_racing.losses.config import ImaginedPPOConfig, LossConfig
 from dreamer_racing.losses.imagination import imagine
 from dreamer_racing.modules.actor import ActionDistribution
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.agent import Agent
 
 KL_TOLERANCE = 1.5
 """Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
 PACE_CHANGE, SLOWEST_PACE = 1.25, 0.01
 """Factor by which the learning rate then changes, and its smallest share [choice]."""
-
-
-@dataclass
-class ImaginedPPOConfig:
-    """Numbers of ``PPOActorLoss`` [choice, unless a source is named]; docs/experiments.md, entry 14, compares some.
-
-    Attributes:
-        updates: K, learner updates whose rollouts are kept before the actor learns from them.
-        epochs: Times that every imagined step is trained on.
-        minibatch: M, imagined steps of a gradient step.
-        clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
-        advantage_clip: Largest normalised advantage.
-        kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
-        kl_target: Divergence before an improvement's last gradient step, nats, to which the learning rate is steered:
-            1.5 times more, and the next improvement is made at a lower one, 1.5 times less, and at a higher one; None:
-            it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
-        learning_rate: Of Adam; the largest, where there is a ``kl_target``.
-        gradient_clip: Largest norm of the actor's gradient.
-    """
-
-    updates: int = 8
-    epochs: int = 3
-    minibatch: int = 4096
-    clip_epsilon: float = 0.2
-    advantage_clip: float = 5.0
-    kl_stop: float = 0.03
-    kl_target: float | None = None
-    learning_rate: float = 3e-4
-    gradient_clip: float = 0.5
 
 
 class Minibatch(NamedTuple):
@@ -119,9 +87,9 @@ class PPOActorLoss(ActorLoss):
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig, **own: Any) -> Self:
-        """Make the loss of an agent with a learner's numbers."""
-        return super().from_config(agent, config, ppo=config.ppo, **own)
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
+        return super().from_config(agent, config, horizon, ppo=config.ppo, **own)
 
     def prepare(self, starts: int) -> None:
         """Make room for K rollouts from so many starts each; what was kept of another shape is forgotten.

@@ -5,21 +5,19 @@ Shape legend: B batch, T time, E embedding, F features, P privileged numbers, M 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.world_model import WorldModelLoss
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.interface import PIXELS, PRIVILEGED, VECTOR
 from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import Posterior
 from dreamer_racing.modules.world_model import WorldModel
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
 
 
 class ReconstructionLoss(WorldModelLoss):
@@ -96,17 +94,10 @@ class PrivilegedLoss(WorldModelLoss):
         self.in_keys = [*self.in_keys, PRIVILEGED]
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
-        """Make the loss of an agent with a learner's numbers."""
-        return cls(
-            agent.world_model,
-            agent.interface.privileged_dim,
-            privileged_scale=config.privileged_scale,
-            dynamics_scale=config.dynamics_scale,
-            representation_scale=config.representation_scale,
-            free_nats=config.free_nats,
-            kl_mode=config.kl_mode,
-        )
+    def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
+        privileged = {"privileged_dim": agent.interface.privileged_dim, "privileged_scale": config.privileged_scale}
+        return super().from_config(agent, config, **privileged, **own)
 
     def represent(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, tensordict: TensorDictBase
@@ -189,16 +180,9 @@ class DecoderFreeLoss(WorldModelLoss):
         self.off_diagonal_scale = off_diagonal_scale
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
-        """Make the loss of an agent with a learner's numbers."""
-        return cls(
-            agent.world_model,
-            barlow_scale=config.barlow_scale,
-            dynamics_scale=config.dynamics_scale,
-            representation_scale=config.representation_scale,
-            free_nats=config.free_nats,
-            kl_mode=config.kl_mode,
-        )
+    def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
+        return super().from_config(agent, config, barlow_scale=config.barlow_scale, **own)
 
     def represent(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, tensordict: TensorDictBase

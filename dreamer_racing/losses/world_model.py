@@ -6,7 +6,7 @@ Shape legend: B batch, T time, L latents, K classes, E embedding.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 import torch.nn.functional as F
@@ -15,14 +15,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.contract import require_keys
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import Posterior, mix_uniform
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import WorldModel, join_features
-
-if TYPE_CHECKING:
-    from dreamer_racing.learners.dreamer import LearnerConfig
-    from dreamer_racing.modules.agent import Agent
 
 
 def separate_kl(kl: Tensor, free_nats: float) -> Tensor:
@@ -36,7 +34,7 @@ def per_latent_kl(kl: Tensor, free_nats: float) -> Tensor:
 
 
 KL_MODES: dict[str, Callable[[Tensor, float], Tensor]] = {"separate": separate_kl, "per_latent": per_latent_kl}
-"""How free nats apply to the KL of each latent, by the name in ``LearnerConfig``."""
+"""How free nats apply to the KL of each latent, by the name in ``LossConfig``."""
 
 
 def kl_losses(
@@ -126,14 +124,15 @@ class WorldModelLoss(LossModule):
         self.out_keys = [*self.represent_keys, *heads, "replay_context"]
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LearnerConfig) -> Self:
-        """Make the loss of an agent with a learner's numbers."""
+    def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return cls(
             agent.world_model,
             dynamics_scale=config.dynamics_scale,
             representation_scale=config.representation_scale,
             free_nats=config.free_nats,
             kl_mode=config.kl_mode,
+            **own,
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -1,6 +1,7 @@
 """The agent's networks; plain tensors inside, TensorDict only in ``DreamerPolicy``."""
 
 from dreamer_racing.modules.actor import ActionDistribution, Actor
+from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
 from dreamer_racing.modules.encoder import ImageEncoder, ObservationEncoder, VectorEncoder
@@ -17,6 +18,7 @@ __all__ = [
     "SIZES",
     "ActionDistribution",
     "Actor",
+    "Agent",
     "BlockGRUCell",
     "ContinueHead",
     "Critic",

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from torch import nn
 
-from dreamer_racing.modules import Actor, Critic, Interface, ModelSize, WorldModel
+from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.critic import Critic
+from dreamer_racing.modules.interface import Interface
+from dreamer_racing.modules.sizes import ModelSize
+from dreamer_racing.modules.world_model import WorldModel
 
 
 class Agent(nn.Module):
@@ -14,18 +18,21 @@ class Agent(nn.Module):
         size: Their widths.
         interface: What the agent sees and does.
         decode: Whether the world model has decoders of what is seen.
+        min_std: Smallest standard deviation of actions.
 
     Attributes:
+        size: As given.
         interface: As given.
         world_model: Predicts.
         actor: Acts.
         critic: Judges; holds its slow copy.
     """
 
-    def __init__(self, size: ModelSize, interface: Interface, decode: bool = True) -> None:
+    def __init__(self, size: ModelSize, interface: Interface, decode: bool = True, min_std: float = 0.1) -> None:
         super().__init__()
         head = (size.actor_critic_layers, size.units, size.norm)
+        self.size = size
         self.interface = interface
         self.world_model = WorldModel(size, interface, decode)
-        self.actor = Actor(size.features, interface.action_dim, *head)
+        self.actor = Actor(size.features, interface.action_dim, *head, min_std=min_std)
         self.critic = Critic(size.features, *head, size.bins)

@@ -7,7 +7,7 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from composing.schema import RECIPES, DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
+from composing.schema import RECIPES, DreamerConfig, PPORunConfig, RunConfig, SACRunConfig, is_race
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
@@ -16,7 +16,7 @@ from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.export.shipped_agent import AVERAGED, ShippedAgent, choose_weights, kept_weights
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
 from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface, get_size
@@ -24,18 +24,6 @@ from dreamer_racing.training.checkpoint import load_components, load_state
 from dreamer_racing.training.run import Report
 
 Environment = DroneRacingEnv | ControlSuiteEnv
-SUITES = ("race", "dmc")
-
-
-def is_race(config: RunConfig) -> bool:
-    """Whether the run races drones, rather than being tested on the Control Suite.
-
-    Raises:
-        ValueError: unknown suite.
-    """
-    if config.env.suite not in SUITES:
-        raise ValueError(f"env.suite={config.env.suite}: there are {', '.join(SUITES)}.")
-    return config.env.suite == "race"
 
 
 def scene_name(config: RunConfig) -> str:
@@ -122,28 +110,6 @@ def reward_terms(env: Environment) -> list[str]:
     return ["reward", *(name for name in ("reward_base", "body_rate_norm") if name in present)]
 
 
-def learner_config(config: DreamerConfig) -> LearnerConfig:
-    """The learner's numbers from the groups `model` and `loss`."""
-    model, loss = config.model, vars(config.loss).copy()
-    names = {name: loss.pop(name) for name in ("world_model", "actor", "critic")}
-    return LearnerConfig(
-        batch_size=model.batch_size,
-        batch_length=model.batch_length,
-        imagination_horizon=model.imagination_horizon,
-        imagination_starts=model.imagination_starts,
-        lr=model.learning_rate,
-        behavior_lr=model.behavior_learning_rate,
-        warmup_updates=model.warmup_updates,
-        imagine_recent=model.imagine_recent,
-        average_rate=model.average_rate,
-        compile=model.compile,
-        cuda_graph=model.cuda_graph,
-        mixed_precision=bool(model.mixed_precision),
-        **{f"{part}_loss": name for part, name in names.items()},
-        **loss,
-    )
-
-
 def scheduled(config: DreamerConfig, env_steps: int) -> dict[str, float]:
     """Arguments of `DreamerLearner.adjust` after so many env_steps of a run."""
     schedule, loss, progress = config.schedule, config.loss, env_steps / config.total_env_steps
@@ -160,7 +126,10 @@ def make_learner(config: RunConfig, interface: Interface, device: torch.device |
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
         shape = replace(get_size(config.model.size), sampled=config.model.sampled)
-        return DreamerLearner(shape, interface, learner_config(config), device, config.seed)
+        horizon = config.model.imagination_horizon
+        return make_dreamer(
+            shape, interface, config.loss, config.model, horizon=horizon, device=device, seed=config.seed
+        )
     assert isinstance(config, (PPORunConfig, SACRunConfig))
     size = NetworkSize(config.network.layers, config.network.units)
     if isinstance(config, SACRunConfig):

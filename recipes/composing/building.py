@@ -13,10 +13,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 
-from composing.arena import Environment, crash_causes, is_race, make_report, reward_terms, scene_name
+from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, choose_device, new_run_dir
-from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage
+from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv

@@ -5,16 +5,13 @@ Every message names the setting as the user writes it, its value, and what would
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import is_race
-from composing.schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig
-from dreamer_racing.envs.drone.quadrotor import MIN_CONTROL_RATE, at_control_rate, load_preset
+from composing.schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig, is_race
+from dreamer_racing.envs.drone.quadrotor import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
@@ -22,102 +19,9 @@ from dreamer_racing.losses import ImaginedPPOConfig
 from dreamer_racing.losses.ppo_actor import KL_TOLERANCE
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
+from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import latest_checkpoint
 from dreamer_racing.training.run import ReplayRatio
-
-
-class Range(NamedTuple):
-    """Allowed values of a setting: a whole interval, or one without its lower end."""
-
-    low: float
-    high: float = math.inf
-    open_below: bool = False
-
-    def __contains__(self, value: object) -> bool:
-        return isinstance(value, (int, float)) and (
-            self.low < value <= self.high if self.open_below else self.low <= value <= self.high
-        )
-
-    def __str__(self) -> str:
-        """Say it in words."""
-        below = f"above {self.low:g}" if self.open_below else f"at least {self.low:g}"
-        return below if self.high == math.inf else f"{below} and at most {self.high:g}"
-
-
-POSITIVE, SHARE, NOT_NEGATIVE = Range(0, open_below=True), Range(0, 1), Range(0)
-RANGES = {
-    "total_env_steps": Range(1),
-    "prefill": NOT_NEGATIVE,
-    "rollout_steps": Range(1),
-    "seed": Range(0, 2**32 - 1),
-    "env.num_envs": Range(1),
-    "env.episode_steps": Range(1),
-    "env.control_rate": Range(MIN_CONTROL_RATE),
-    "env.start_beyond_gate": SHARE,
-    "env.start_on_line": SHARE,
-    "env.miss_radius": NOT_NEGATIVE,
-    "model.batch_size": Range(1),
-    "model.batch_length": Range(2),
-    "model.replay_ratio": POSITIVE,
-    "model.learning_rate": POSITIVE,
-    "model.behavior_learning_rate": POSITIVE,
-    "model.warmup_updates": NOT_NEGATIVE,
-    "model.imagination_horizon": Range(1),
-    "model.imagination_starts": Range(1),
-    "model.average_rate": Range(0, 1, open_below=True),
-    "loss.discount": SHARE,
-    "loss.lambda_": SHARE,
-    "loss.entropy_scale": NOT_NEGATIVE,
-    "loss.min_std": Range(0, 1, open_below=True),
-    "schedule.wait_every": Range(1),
-    "loss.ppo.updates": Range(1),
-    "loss.ppo.epochs": Range(1),
-    "loss.ppo.minibatch": Range(1),
-    "loss.ppo.clip_epsilon": POSITIVE,
-    "loss.ppo.advantage_clip": POSITIVE,
-    "loss.ppo.kl_stop": POSITIVE,
-    "loss.ppo.kl_target": POSITIVE,
-    "loss.ppo.learning_rate": POSITIVE,
-    "loss.ppo.gradient_clip": POSITIVE,
-    "loss.dynamics_scale": NOT_NEGATIVE,
-    "loss.representation_scale": NOT_NEGATIVE,
-    "loss.free_nats": NOT_NEGATIVE,
-    "loss.privileged_scale": NOT_NEGATIVE,
-    "loss.barlow_scale": NOT_NEGATIVE,
-    "loss.replay_value_scale": NOT_NEGATIVE,
-    "network.layers": NOT_NEGATIVE,
-    "network.units": Range(1),
-    "ppo.learning_rate": POSITIVE,
-    "ppo.epochs": Range(1),
-    "ppo.minibatches": Range(1),
-    "ppo.clip_epsilon": POSITIVE,
-    "ppo.discount": SHARE,
-    "ppo.lambda_": SHARE,
-    "ppo.entropy_scale": NOT_NEGATIVE,
-    "ppo.critic_scale": NOT_NEGATIVE,
-    "ppo.reward_scale": POSITIVE,
-    "ppo.gradient_clip": POSITIVE,
-    "ppo.initial_std": POSITIVE,
-    "sac.learning_rate": POSITIVE,
-    "sac.batch_size": Range(1),
-    "sac.replay_ratio": POSITIVE,
-    "sac.discount": SHARE,
-    "sac.target_rate": SHARE,
-    "sac.initial_alpha": POSITIVE,
-    "sac.reward_scale": POSITIVE,
-    "replay.capacity": Range(1),
-    "replay.recent_share": SHARE,
-    "replay.recent_records": Range(1),
-    "replay.held_out": NOT_NEGATIVE,
-    "evaluation.every": NOT_NEGATIVE,
-    "evaluation.episodes": Range(1),
-    "evaluation.video_steps": Range(1),
-    "evaluation.start_noise": NOT_NEGATIVE,
-    "checkpoint.every": NOT_NEGATIVE,
-    "checkpoint.keep": Range(1),
-    "logger.every": NOT_NEGATIVE,
-}
-"""Allowed values by setting, of those that a recipe has; null is allowed where the schema allows it."""
 
 RACE_ONLY = {
     "env.control_rate": 50.0,
@@ -178,11 +82,8 @@ def check(config: RunConfig) -> None:
     Raises:
         ValueError: the message gives the numbers and the setting to change.
     """
+    check_settings(config)
     values = OmegaConf.structured(config)
-    for name, allowed in RANGES.items():
-        value = OmegaConf.select(values, name)
-        if value is not None and value not in allowed:
-            raise ValueError(f"{name}={value}: must be {allowed}.")
     on_cuda = config.env.device.partition(":")[0] == "cuda"
     if not on_cuda and config.env.device != "cpu":
         raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
@@ -302,15 +203,13 @@ def check_schedule(config: DreamerConfig) -> None:
     """
     targets = {
         "learning_rates": POSITIVE,
-        "discount": RANGES["loss.discount"],
-        "entropy_scale": RANGES["loss.entropy_scale"],
-        "min_std": RANGES["loss.min_std"],
-        "start_on_line": RANGES["env.start_on_line"],
+        **{name: allowed_values(config.loss, name) for name in ("discount", "entropy_scale", "min_std")},
+        "start_on_line": allowed_values(config.env, "start_on_line"),
     }
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and ramp.to not in allowed:
+        if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     if config.schedule.wait_for_model is not None:
         check_wait(config)

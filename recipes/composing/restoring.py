@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from composing.arena import is_race, restore_learner, restore_shipped, trained_config
+from composing.arena import restore_learner, restore_shipped, trained_config
 from composing.command_line import choose_device
-from composing.schema import EvaluateConfig, PerceptionConfig, RunConfig
+from composing.schema import EvaluateConfig, PerceptionConfig, RunConfig, is_race
 from dreamer_racing.export.actor_step import ActorStep
 from dreamer_racing.export.contract import hash_weights
 from dreamer_racing.export.shipped_agent import AVERAGED, TRAINED, ShippedAgent, agents_in, choose_weights, is_agent

@@ -7,9 +7,14 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
+from dreamer_racing.envs.drone.quadrotor import MIN_CONTROL_RATE
 from dreamer_racing.learners import PPOConfig, SACConfig
-from dreamer_racing.losses import ImaginedPPOConfig
+from dreamer_racing.learners.dreamer import LearnerConfig
+from dreamer_racing.losses import LossConfig
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, setting
 from dreamer_racing.training.schedule import Ramp
+
+SUITES = ("race", "dmc")
 
 
 @dataclass
@@ -18,12 +23,18 @@ class EnvConfig:
 
     suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful
-    num_envs: int = MISSING  # worlds flown side by side; missing: the recipe's own number
-    control_rate: float = 50.0  # actions a second, Hz
-    episode_steps: int | None = None  # control steps of a training episode; null: those of 20 s
-    start_beyond_gate: float = 0.0  # share of training episodes that begin behind a gate, to practise turns
-    start_on_line: float = 0.0  # share of training episodes that begin in flight on a planned racing line
-    miss_radius: float = 0.0  # m; training episodes end where a gate is missed by less than this; 0: they go on
+    num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
+    control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
+    episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
+    start_beyond_gate: float = setting(
+        0.0, SHARE
+    )  # share of training episodes that begin behind a gate, to practise turns
+    start_on_line: float = setting(
+        0.0, SHARE
+    )  # share of training episodes that begin in flight on a planned racing line
+    miss_radius: float = setting(
+        0.0, NOT_NEGATIVE
+    )  # m; training episodes end where a gate is missed by less than this; 0: they go on
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
@@ -33,47 +44,19 @@ class EnvConfig:
 
 
 @dataclass
-class ModelConfig:
+class ModelConfig(LearnerConfig):
     """Size of the networks and the numbers that go with it: `auto` chooses by device, what is missing by size."""
 
     size: str = MISSING
     sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
-    batch_size: int = MISSING  # windows in a batch
-    batch_length: int = MISSING  # records in a window
-    replay_ratio: float = MISSING  # records trained on per environment step
-    learning_rate: float = MISSING
-    behavior_learning_rate: float | None = None  # of actor and critic; null: the same
-    mixed_precision: bool | None = None  # bfloat16 where it does not matter; null: if the device computes in it
-    compile: bool = False  # torch.compile of the losses
-    cuda_graph: bool = False  # forward and backward as one CUDA graph
-    warmup_updates: int = MISSING  # over which the learning rate rises from zero
-    average_rate: float | None = None  # of the averaged weights, which fly evaluations and exports; null: none
-    imagination_horizon: int = MISSING
-    imagination_starts: int | None = MISSING  # records of the batch to imagine from; null: all
-    imagine_recent: bool = False  # from those of its newest windows only (replay.recent_share)
-
-
-@dataclass
-class LossConfig:
-    """Losses by the names of their registries in `dreamer_racing.losses`, and their weights."""
-
-    world_model: str = "reconstruction"
-    actor: str = "reinforce"  # reinforce | dynamics | ppo
-    critic: str = "two_hot"
-    discount: float = 0.997
-    lambda_: float = 0.95
-    entropy_scale: float = 3e-4
-    min_std: float = 0.1  # smallest standard deviation of actions
-    dynamics_scale: float = 1.0
-    representation_scale: float = 0.1
-    free_nats: float = 1.0
-    kl_mode: str = "separate"  # separate | per_latent
-    privileged_scale: float = 1.0  # of decoding the privileged state: losses informed and privileged
-    barlow_scale: float = 0.05  # of the redundancy reduction: loss decoder_free
-    continuation: bool = True  # predicted ends of episodes cut imagined returns
-    replay_value_scale: float = 0.3  # of the critic's loss on replayed returns; 0 turns it off
-    replay_value_gradient: bool = True  # whether that loss also trains the world model
-    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)  # numbers of actor=ppo
+    batch_size: int = setting(MISSING, COUNT)  # windows in a batch
+    batch_length: int = setting(MISSING, Range(2))  # records in a window
+    replay_ratio: float = setting(MISSING, POSITIVE)  # records trained on per environment step
+    imagination_horizon: int = setting(MISSING, COUNT)
+    # Those of an update that the size decides:
+    imagination_starts: int | None = setting(MISSING, COUNT)
+    learning_rate: float = setting(MISSING, POSITIVE)
+    warmup_updates: int = setting(MISSING, NOT_NEGATIVE)
 
 
 @dataclass
@@ -93,7 +76,7 @@ class LoggerConfig:
     """Where metrics go besides metrics.csv."""
 
     tensorboard: bool = True
-    every: int = 2_000  # env_steps between rows
+    every: int = setting(2_000, NOT_NEGATIVE)  # env_steps between rows
 
 
 class Storage(Enum):
@@ -107,7 +90,7 @@ class Storage(Enum):
 class ReplayConfig:
     """The replay buffer."""
 
-    capacity: int = 250_000  # records, 12.3 KB each at image_size 64
+    capacity: int = setting(250_000, COUNT)  # records, 12.3 KB each at image_size 64
     storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
     device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
 
@@ -116,9 +99,11 @@ class ReplayConfig:
 class SequenceReplayConfig(ReplayConfig):
     """The replay buffer of a world model."""
 
-    held_out: int = 1  # worlds whose records are never trained on, to measure the model; 0 of a single world
-    recent_share: float = 0.0  # of a batch's windows, drawn from the newest records
-    recent_records: int = 20_000  # how many those are
+    held_out: int = setting(
+        1, NOT_NEGATIVE
+    )  # worlds whose records are never trained on, to measure the model; 0 of a single world
+    recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
+    recent_records: int = setting(20_000, COUNT)  # how many those are
     context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
 
 
@@ -126,19 +111,21 @@ class SequenceReplayConfig(ReplayConfig):
 class EvaluationConfig:
     """Evaluation during training."""
 
-    every: int = 25_000  # env_steps; 0 never
-    episodes: int = 8
+    every: int = setting(25_000, NOT_NEGATIVE)  # env_steps; 0 never
+    episodes: int = setting(8, COUNT)
     stochastic: bool = False  # also fly the sampling policy
-    start_noise: float = 0.0  # of starts, as a multiple of the noise of training; 0: all begin at the start pose
-    video_steps: int = 500  # control steps in the video
+    start_noise: float = setting(
+        0.0, NOT_NEGATIVE
+    )  # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    video_steps: int = setting(500, COUNT)  # control steps in the video
 
 
 @dataclass
 class CheckpointConfig:
     """Checkpoints during training."""
 
-    every: int = 50_000  # env_steps
-    keep: int = 2
+    every: int = setting(50_000, NOT_NEGATIVE)  # env_steps
+    keep: int = setting(2, COUNT)
 
 
 @dataclass
@@ -152,7 +139,7 @@ class ScheduleConfig:
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None
-    wait_every: int = 5_000  # env_steps between two looks at those errors
+    wait_every: int = setting(5_000, COUNT)  # env_steps between two looks at those errors
 
 
 class Collection(Enum):
@@ -171,9 +158,9 @@ class RunConfig:
     decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
-    total_env_steps: int = 1_000_000  # control steps summed over environments
-    rollout_steps: int = MISSING  # control steps of every environment between updates
-    seed: int = 0
+    total_env_steps: int = setting(1_000_000, COUNT)  # control steps summed over environments
+    rollout_steps: int = setting(MISSING, COUNT)  # control steps of every environment between updates
+    seed: int = setting(0, Range(0, 2**32 - 1))
     device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
     run_dir: str | None = None  # null: runs/<algorithm>_<track>_<time>
     resume: str | None = None  # run directory or checkpoint to continue
@@ -190,8 +177,8 @@ class DreamerConfig(RunConfig):
 
     algorithm: str = "dreamer_v3"
     tuned: str = "auto"  # none: DreamerV3 as published | race: what races on a CPU | auto chooses, and says so
-    prefill: int = 4_000  # env_steps collected before the first update
-    rollout_steps: int = 8
+    prefill: int = setting(4_000, NOT_NEGATIVE)  # env_steps collected before the first update
+    rollout_steps: int = setting(8, COUNT)
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
@@ -204,8 +191,8 @@ class NetworkConfig:
     """Hidden layers of the baselines' actor and critic: `auto` chooses by what they see."""
 
     size: str = MISSING  # auto | paper | small
-    layers: int = MISSING
-    units: int = MISSING
+    layers: int = setting(MISSING, NOT_NEGATIVE)
+    units: int = setting(MISSING, COUNT)
 
 
 @dataclass
@@ -213,7 +200,7 @@ class PPORunConfig(RunConfig):
     """`recipes/ppo.py`."""
 
     algorithm: str = "ppo"
-    rollout_steps: int = 32
+    rollout_steps: int = setting(32, COUNT)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
@@ -223,8 +210,8 @@ class SACRunConfig(RunConfig):
     """`recipes/sac.py`."""
 
     algorithm: str = "sac"
-    prefill: int = 10_000  # env_steps collected before the first update
-    rollout_steps: int = 1
+    prefill: int = setting(10_000, NOT_NEGATIVE)  # env_steps collected before the first update
+    rollout_steps: int = setting(1, COUNT)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     sac: SACConfig = field(default_factory=SACConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
@@ -325,6 +312,17 @@ class PlotConfig:
     flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
     over: str = "distance"  # axis of the speed profile: distance | time
     dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
+
+
+def is_race(config: RunConfig) -> bool:
+    """Whether the run races drones, rather than being tested on the Control Suite.
+
+    Raises:
+        ValueError: unknown suite.
+    """
+    if config.env.suite not in SUITES:
+        raise ValueError(f"env.suite={config.env.suite}: there are {', '.join(SUITES)}.")
+    return config.env.suite == "race"
 
 
 def register() -> None:

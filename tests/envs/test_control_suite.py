@@ -13,8 +13,8 @@ from torchrl.envs.utils import check_env_specs
 import dreamer_racing.envs.control_suite as dmc_module
 from dreamer_racing.envs.control_suite import TASKS, ControlSuiteEnv
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.modules.interface import Interface
+from tests.dreamers import learner_of
 
 suite = dmc_module.suite  # imported by the package, which chooses the OpenGL library first
 
@@ -320,7 +320,7 @@ def test_learner_updates_from_a_collected_batch(opengl: None) -> None:
     env = ControlSuiteEnv("cartpole_swingup", 2, seed=0)
     interface = Interface.of(env)
     assert (interface.action_dim, interface.pixels, interface.vector_dim, interface.privileged_dim) == (1, True, 0, 0)
-    learner = DreamerLearner("debug", interface, LearnerConfig(imagination_horizon=3), seed=0)
+    learner = learner_of("debug", interface, seed=0, horizon=3)
     policy = learner.policy()
     wrapped = TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
     collector = Collector(wrapped, policy, frames_per_batch=16, total_frames=16)

@@ -9,16 +9,17 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.evaluation.held_out import SEEN, correlation, held_out_metrics
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import Interface
+from tests.dreamers import learner_of
 
 HORIZON, DISCOUNT = 2, 0.9
 REWARD, VALUE, CONTINUATION = 0.25, 10.0, 0.5  # what the constant heads predict
 
 
 def make_learner(**config) -> DreamerLearner:
-    config = LearnerConfig(imagination_horizon=HORIZON, discount=DISCOUNT, **config)
-    return DreamerLearner("debug", Interface(pixels=False, vector_dim=3), config, seed=0)
+    config = dict(horizon=HORIZON, discount=DISCOUNT, **config)
+    return learner_of("debug", Interface(pixels=False, vector_dim=3), seed=0, **config)
 
 
 def make_batch(windows: int, length: int = SEEN + HORIZON) -> TensorDict:

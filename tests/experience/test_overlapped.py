@@ -14,8 +14,8 @@ from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
-from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import Interface
+from tests.dreamers import learner_of
 
 PATIENCE = 30.0  # seconds, after which a test has failed
 
@@ -136,7 +136,7 @@ def test_an_error_of_the_collector_is_not_lost() -> None:
 
 def test_rollouts_of_a_race_follow_each_other() -> None:
     env = DroneRacingEnv("circle", 2, from_pixels=False, privileged=False, seed=0, episode_steps=7, num_threads=1)
-    policy = DreamerLearner("debug", Interface.of(env), seed=0).policy()
+    policy = learner_of("debug", Interface.of(env), seed=0).policy()
     acting = acting_copy(policy)
     flying = TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
     collector = Collector(flying, acting, frames_per_batch=2 * 5, total_frames=-1)

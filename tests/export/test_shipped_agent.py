@@ -20,10 +20,10 @@ from dreamer_racing.export.onnx_actor import OnnxActor
 from dreamer_racing.export.parity import MIN_STEPS, Flight
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, choose_weights, is_agent, load_agent
 from dreamer_racing.export.weights_file import read_weights, write_weights
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training.checkpoint import RunCheckpoints
+from tests.dreamers import learner_of
 
 WORLDS = {"track": "circle", "num_envs": 1, "camera": Camera(32, 32, tilt=30.0), "control_rate": 25.0, "num_threads": 1}
 
@@ -78,7 +78,7 @@ def test_the_choice_of_weights() -> None:
 
 
 def test_the_averaged_weights_fly_where_they_are_kept(tmp_path: Path) -> None:
-    learner = DreamerLearner("debug", config=LearnerConfig(average_rate=0.1), seed=1)
+    learner = learner_of(seed=1, average_rate=0.1)
     for parameter in learner.averaged.parameters():
         parameter.add_(1.0)
     RunCheckpoints(tmp_path, {"learner": learner}).save(env_steps=40)
@@ -92,7 +92,7 @@ def test_the_averaged_weights_fly_where_they_are_kept(tmp_path: Path) -> None:
 
 
 def test_an_agent_is_restored_whatever_its_losses_were(tmp_path: Path) -> None:
-    learner = DreamerLearner("debug", seed=1)
+    learner = learner_of(seed=1)
     RunCheckpoints(tmp_path, {"learner": learner}).save(env_steps=40)
     agent, metadata = load_agent(tmp_path, Interface())
     assert metadata["env_steps"] == 40 and agent.world_model.decoder is None

@@ -8,7 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner
+from tests.dreamers import learner_of
 
 
 def batch(device: str, windows: int = 2, steps: int = 4) -> TensorDict:
@@ -26,7 +27,7 @@ def batch(device: str, windows: int = 2, steps: int = 4) -> TensorDict:
 
 
 def make(device: str, **settings: object) -> DreamerLearner:
-    return DreamerLearner("debug", config=LearnerConfig(imagination_horizon=3, **settings), device=device, seed=0)
+    return learner_of(device=device, seed=0, horizon=3, **settings)
 
 
 @pytest.mark.slow
@@ -50,7 +51,7 @@ def test_a_cuda_graph_needs_a_cuda_device() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    "settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}, {"actor_loss": "dynamics"}], ids=str
+    "settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}, {"actor": "dynamics"}], ids=str
 )
 def test_graphed_updates_learn_as_eager_ones(settings: dict[str, object]) -> None:
     settings = {"lr": 1e-3, "warmup_updates": 0, **settings}

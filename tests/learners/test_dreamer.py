@@ -6,12 +6,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
 from dreamer_racing.modules import SIZES, Interface
+from tests.dreamers import learner_of
 
-CONFIG = LearnerConfig(imagination_horizon=4, lr=1e-3, warmup_updates=0)
+CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
 
 
 def make_batch(batch: int = 3, time: int = 6) -> TensorDict:
@@ -38,7 +38,7 @@ def make_batch(batch: int = 3, time: int = 6) -> TensorDict:
 
 
 def test_update_returns_scalar_tensors_and_moves_every_network():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     before = copy.deepcopy(learner.agent.state_dict())
     batch = make_batch()
     metrics = learner.update(batch)
@@ -57,7 +57,7 @@ def test_update_returns_scalar_tensors_and_moves_every_network():
 
 def test_losses_fall_on_a_fixed_batch():
     torch.manual_seed(0)
-    learner = DreamerLearner("debug", config=replace(CONFIG, lr=3e-3), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"learning_rate": 3e-3})
     batch = make_batch()
     first = learner.update(batch)
     for _ in range(100):
@@ -71,7 +71,7 @@ def test_losses_fall_on_a_fixed_batch():
 @pytest.mark.parametrize("shared", [True, False])
 def test_gradients_do_not_leak_between_networks(shared):
     """The actor's and the imagined critic's losses stay theirs; the replayed one enters the model only if asked to."""
-    learner = DreamerLearner("debug", config=replace(CONFIG, replay_value_gradient=shared), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"replay_value_gradient": shared})
     with torch.no_grad():
         learner.agent.critic.head.mlp.output.weight.normal_()
     losses = learner.compute_losses(make_batch())
@@ -93,10 +93,10 @@ def test_gradients_do_not_leak_between_networks(shared):
 
 def test_resume_equals_never_having_stopped():
     batch = make_batch()
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     learner.update(batch)
     saved = copy.deepcopy(learner.state_dict())
-    resumed = DreamerLearner("debug", config=CONFIG, seed=1)
+    resumed = learner_of(seed=1, **CONFIG)
     resumed.load_state_dict(saved)
     assert resumed.updates == 1
     results = []
@@ -111,34 +111,32 @@ def test_resume_equals_never_having_stopped():
 
 
 def test_return_normaliser_is_saved():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     learner.losses["actor"].return_normalizer.high.fill_(7.0)
-    resumed = DreamerLearner("debug", config=CONFIG, seed=0)
+    resumed = learner_of(seed=0, **CONFIG)
     resumed.load_state_dict(learner.state_dict())
     assert resumed.losses["actor"].return_normalizer.scale().item() == 7.0
 
 
 def test_state_survives_a_file(tmp_path):
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     learner.update(make_batch())
     torch.save(learner.state_dict(), tmp_path / "learner.pt")
-    DreamerLearner("debug", config=CONFIG).load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=True))
+    learner_of(**CONFIG).load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=True))
 
 
 def test_state_of_another_size_is_refused_with_what_to_do():
-    learner = DreamerLearner("debug", config=CONFIG)
-    other = DreamerLearner(replace(SIZES["debug"], name="wider", units=32), config=CONFIG)
+    learner = learner_of(**CONFIG)
+    other = learner_of(replace(SIZES["debug"], name="wider", units=32), **CONFIG)
     with pytest.raises(ValueError, match=r"'debug'.*'wider'.*units 16 there, 32 here.*model=debug") as error:
         other.load_state_dict(learner.state_dict())
     assert "\n" not in str(error.value)
 
 
-def learner_of(world_model_loss, seed, **interface):
+def made_with(world_model_loss, seed, **interface):
     if WORLD_MODEL_LOSSES[world_model_loss].reads_privileged:
         interface["privileged_dim"] = 21
-    return DreamerLearner(
-        "debug", Interface(**interface), replace(CONFIG, world_model_loss=world_model_loss), seed=seed
-    )
+    return learner_of("debug", Interface(**interface), seed=seed, **CONFIG | {"world_model": world_model_loss})
 
 
 def assert_refused(saved, learner, words):
@@ -159,9 +157,9 @@ def assert_refused(saved, learner, words):
 )
 def test_state_of_another_loss_is_refused(first, second):
     for there, here in ((first, second), (second, first)):
-        saved = learner_of(there, 1)
+        saved = made_with(there, 1)
         saved.updates = 7
-        assert_refused(saved, learner_of(here, 2), r"beyond this learner's, and lacks .* trained with another loss")
+        assert_refused(saved, made_with(here, 2), r"beyond this learner's, and lacks .* trained with another loss")
 
 
 @pytest.mark.parametrize(
@@ -174,12 +172,12 @@ def test_state_of_another_loss_is_refused(first, second):
     ids=["actions", "pixels", "numbers"],
 )
 def test_state_of_another_environment_is_refused(there, here):
-    assert_refused(learner_of("reconstruction", 1, **there), learner_of("reconstruction", 2, **here), "environment")
+    assert_refused(made_with("reconstruction", 1, **there), made_with("reconstruction", 2, **here), "environment")
 
 
 def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
     """Names and shapes of all that depends on the images' size, as checkpoints have them since the first."""
-    learner = DreamerLearner("debug", config=CONFIG, seed=1)
+    learner = learner_of(seed=1, **CONFIG)
     saved = learner.state_dict()
     shapes = {key: list(value.shape) for key, value in saved["agent"].items() if value.ndim > 1}
     expected = {
@@ -196,7 +194,7 @@ def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
         assert shapes[f"world_model.{key}"] == shape, key
     assert not [key for key in shapes if ".encoder." in key or ".decoder." in key if key[12:] not in expected]
     del saved["image_size"]  # which older checkpoints do not have
-    resumed = DreamerLearner("debug", config=CONFIG, seed=2)
+    resumed = learner_of(seed=2, **CONFIG)
     resumed.load_state_dict(saved)
     for key, value in resumed.agent.state_dict().items():
         assert torch.equal(value, saved["agent"][key]), key
@@ -204,9 +202,9 @@ def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
 
 @pytest.mark.parametrize("loss", ["reconstruction", "decoder_free"])
 def test_state_of_another_image_size_is_refused(loss):
-    small, large = learner_of(loss, 1, image_size=32), learner_of(loss, 2, image_size=96)
+    small, large = made_with(loss, 1, image_size=32), made_with(loss, 2, image_size=96)
     assert_refused(small, large, "images of 32 × 32 pixels, not 96 × 96: choose env.image_size=32")
-    older = small.state_dict() | {"agent": learner_of(loss, 3).agent.state_dict()}
+    older = small.state_dict() | {"agent": made_with(loss, 3).agent.state_dict()}
     del older["image_size"]
     with pytest.raises(ValueError, match="64 × 64 pixels, not 96 × 96"):
         large.load_state_dict(older)
@@ -214,7 +212,7 @@ def test_state_of_another_image_size_is_refused(loss):
 
 @pytest.mark.parametrize("image_size", [32, 96])
 def test_every_image_size_updates(image_size):
-    learner = learner_of("reconstruction", 0, image_size=image_size)
+    learner = made_with("reconstruction", 0, image_size=image_size)
     batch = make_batch()
     batch["pixels"] = batch["pixels"].repeat(1, 1, 2, 2, 1)[:, :, :image_size, :image_size]
     metrics = learner.update(batch)
@@ -227,15 +225,15 @@ def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
     torch.manual_seed(3)
     expected = torch.rand(1)
     torch.manual_seed(3)
-    first = DreamerLearner("debug", config=CONFIG, seed=0)
+    first = learner_of(seed=0, **CONFIG)
     assert torch.equal(torch.rand(1), expected)
-    second = DreamerLearner("debug", config=CONFIG, seed=0)
+    second = learner_of(seed=0, **CONFIG)
     for name, value in first.agent.state_dict().items():
         assert torch.equal(value, second.agent.state_dict()[name]), name
 
 
 def test_imagination_may_start_from_a_subset():
-    learner = DreamerLearner("debug", config=replace(CONFIG, imagination_starts=5), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"imagination_starts": 5})
     seen = []
     learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
     metrics = learner.update(make_batch())
@@ -244,7 +242,7 @@ def test_imagination_may_start_from_a_subset():
 
 
 def test_every_terminal_record_is_a_start_of_no_weight():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     seen = []
     learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
     learner.update(make_batch())
@@ -254,7 +252,7 @@ def test_every_terminal_record_is_a_start_of_no_weight():
 
 
 def test_open_loop_video():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     images = learner.open_loop(make_batch(), context=2)
     assert images.shape == (3, 6, 64, 64, 3)
     assert images.dtype == torch.uint8
@@ -275,7 +273,7 @@ def spoil_gradient(batch, learner):
     ids=["nan", "inf", "-inf", "gradient"],
 )
 def test_what_would_spoil_the_networks_is_refused(spoil):
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     before, batch = copy.deepcopy(learner.agent.state_dict()), make_batch()
     spoil(batch, learner)
     with pytest.raises(NonFiniteLossError, match="not finite") as error:
@@ -287,7 +285,7 @@ def test_what_would_spoil_the_networks_is_refused(spoil):
 
 
 def test_policy_shares_the_parameters():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     policy = learner.policy(deterministic=True)
     assert policy.deterministic
     assert policy.actor is learner.agent.actor
@@ -303,11 +301,11 @@ def test_losses_are_chosen_by_name(monkeypatch):
             return super().forward(tensordict)
 
     monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss)
-    learner = DreamerLearner("debug", config=replace(CONFIG, actor_loss="bold"), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"actor": "bold"})
     assert isinstance(learner.losses["actor"], BoldActorLoss)
     learner.update(make_batch())
     with pytest.raises(ValueError, match="'timid'.*reinforce"):
-        DreamerLearner("debug", config=replace(CONFIG, actor_loss="timid"))
+        learner_of(**CONFIG | {"actor": "timid"})
 
 
 @pytest.mark.parametrize("recurrence", ["block", "dense"])
@@ -323,7 +321,7 @@ def test_every_variant_updates(recurrence, norm):
         strided=norm == "layer",
         cnn_kernel=4 if norm == "layer" else 5,
     )
-    learner = DreamerLearner(size, config=CONFIG, seed=0)
+    learner = learner_of(size, seed=0, **CONFIG)
     assert learner.update(make_batch())["loss"].isfinite()
 
 
@@ -332,7 +330,7 @@ def test_mixed_precision_is_close_to_full(recurrence):
     size = replace(SIZES["debug"], name="variant", recurrence=recurrence, blocks=2, norm="rms")
     results = []
     for mixed_precision in (False, True):
-        learner = DreamerLearner(size, config=replace(CONFIG, mixed_precision=mixed_precision), seed=0)
+        learner = learner_of(size, seed=0, **CONFIG | {"mixed_precision": mixed_precision})
         torch.manual_seed(0)
         results.append(learner.update(make_batch()))
         assert all(parameter.dtype == torch.float32 for parameter in learner.agent.parameters())
@@ -342,17 +340,17 @@ def test_mixed_precision_is_close_to_full(recurrence):
 
 
 def test_rates_are_the_settings_of_the_learner_that_goes_on():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     learner.update(make_batch())
-    other = DreamerLearner("debug", config=replace(CONFIG, lr=1e-5, behavior_lr=1e-6, warmup_updates=7), seed=1)
+    other = learner_of(seed=1, **CONFIG | {"learning_rate": 1e-5, "behavior_learning_rate": 1e-6, "warmup_updates": 7})
     other.load_state_dict(copy.deepcopy(learner.state_dict()))
     assert [group["lr"] for group in other.optimizer.param_groups] == [1e-5, 1e-6]
     assert {group["warmup_steps"] for group in other.optimizer.param_groups} == {7}
     assert other.updates == 1
 
 
-def test_what_is_scheduled_reaches_optimiser_and_losses_and_returns_to_what_is_configured():
-    learner = DreamerLearner("debug", config=replace(CONFIG, lr=1e-3, behavior_lr=4e-4), seed=0)
+def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
+    learner = learner_of(seed=0, **CONFIG | {"learning_rate": 1e-3, "behavior_learning_rate": 4e-4})
 
     def settings() -> list[float]:
         actor, critic = learner.losses["actor"], learner.losses["critic"]
@@ -363,12 +361,13 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_returns_to_what_is_c
     assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
     learner.update(make_batch())
     learner.adjust()
-    configured = CONFIG.discount
-    assert settings() == pytest.approx([1e-3, 4e-4, configured, configured, configured, CONFIG.entropy_scale])
+    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    learner.adjust(rates=1.0)
+    assert settings() == pytest.approx([1e-3, 4e-4, 0.9, 0.9, 0.9, 0.1])
 
 
 def test_a_discount_of_zero_leaves_only_the_next_reward():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
     learner.adjust(discount=0.0)
     context = learner.losses["world_model"](make_batch()).pop("replay_context")
@@ -378,7 +377,7 @@ def test_a_discount_of_zero_leaves_only_the_next_reward():
 
 
 def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
-    learner = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
     assert learner.evaluation_policy().actor is learner.averaged.actor
     assert learner.policy().actor is learner.agent.actor
     before = {name: value.clone() for name, value in learner.averaged.named_parameters()}
@@ -391,43 +390,43 @@ def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
         learner.update(make_batch())
     for name, value in learner.averaged.named_parameters():
         torch.testing.assert_close(value, torch.lerp(before[name], trained[name].detach(), 0.25))
-    resumed = DreamerLearner("debug", config=replace(CONFIG, average_rate=0.25), seed=1)
+    resumed = learner_of(seed=1, **CONFIG | {"average_rate": 0.25})
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     for name, value in resumed.averaged.named_parameters():
         assert torch.equal(value, dict(learner.averaged.named_parameters())[name]), name
 
 
 def test_without_averages_the_trained_weights_fly():
-    learner = DreamerLearner("debug", config=CONFIG, seed=0)
+    learner = learner_of(seed=0, **CONFIG)
     assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor
 
 
 def test_imagination_begins_in_the_newest_windows_where_it_is_told_to():
-    config = replace(CONFIG, imagination_starts=8, imagine_recent=True)
-    learner, batch = DreamerLearner("debug", config=config, seed=0), make_batch(batch=4, time=6)
+    config = dict(CONFIG, imagination_starts=8, imagine_recent=True)
+    learner, batch = learner_of(seed=0, **config), make_batch(batch=4, time=6)
     batch["recent"] = torch.tensor([False, False, True, True]).unsqueeze(-1).expand(4, 6)
     latents = TensorDict({"belief": torch.zeros(4, 6, 32), "state": torch.zeros(4, 6, 16)}, [4, 6])
     latents["belief"][2:] = 1.0
     for _ in range(10):
         assert learner._choose_starts(latents, batch)["belief"].min() == 1.0
-    learner.config = replace(config, imagination_starts=20)  # more than the 12 there are: the others fill up
+    learner.config = replace(learner.config, imagination_starts=20)  # more than the 12 there are: the others fill up
     assert learner._choose_starts(latents, batch)["belief"][:, 0].sum() == 12
 
 
 def test_the_smallest_deviation_is_scheduled_saved_and_flown():
-    learner = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=0)
+    learner = learner_of(seed=0, **CONFIG | {"min_std": 0.4, "average_rate": 0.1})
     features = torch.zeros(1, 48)
     assert learner.agent.actor(features).std.min() >= 0.4
     learner.adjust(min_std=0.2)
     with torch.no_grad():
         learner.agent.actor.mlp.output.bias.fill_(-50.0)
     assert learner.agent.actor(features).std.max().item() == pytest.approx(0.2)
-    restored = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4, average_rate=0.1), seed=1)
+    restored = learner_of(seed=1, **CONFIG | {"min_std": 0.4, "average_rate": 0.1})
     restored.load_state_dict(copy.deepcopy(learner.state_dict()))
     for agent in (restored.agent, restored.averaged):
         assert agent.actor.min_std.item() == pytest.approx(0.2)
     older = learner.state_dict()
     del older["agent"]["actor.min_std"]
-    other = DreamerLearner("debug", config=replace(CONFIG, min_std=0.4), seed=1)
+    other = learner_of(seed=1, **CONFIG | {"min_std": 0.4})
     other.load_state_dict(older)
     assert other.agent.actor.min_std.item() == pytest.approx(0.4)

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, find_loss, kl_losses
 from dreamer_racing.modules import Interface
+from tests.dreamers import learner_of
 
 PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -73,8 +73,8 @@ def test_custom_loss_trains_the_prior_and_not_the_heads(example):
 
 
 def test_custom_actor_updates_and_reports(example):
-    config = LearnerConfig(actor_loss="cautious", imagination_horizon=5)
-    metrics = DreamerLearner("debug", config=config, seed=0).update(example["batch"])
+    config = {"actor": "cautious", "horizon": 5}
+    metrics = learner_of(seed=0, **config).update(example["batch"])
     assert metrics["loss_actor"].isfinite()
     torch.testing.assert_close(metrics["danger"], 1 - metrics["continuation"])
 
@@ -86,7 +86,7 @@ def test_page_names_every_loss_and_key():
             assert re.search(rf"^\| `{name}` \| `{loss.__name__}` \|", PAGE, re.MULTILINE), name
     interface = Interface(vector_dim=3, privileged_dim=5)
     for name in WORLD_MODEL_LOSSES:
-        learner = DreamerLearner("debug", interface, LearnerConfig(world_model_loss=name))
+        learner = learner_of("debug", interface, world_model=name)
         for loss in learner.losses.values():
             for key in (*loss.in_keys, *loss.out_keys):
                 assert str(key).replace("'", '"') in quoted or key in quoted, (name, key)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, DecoderFreeLoss, ImaginedPPOConfig
 from dreamer_racing.losses.actor import frozen
 from dreamer_racing.modules import RSSM, Interface, WorldModel
+from tests.dreamers import learner_of
 
 PRIVILEGED_DIM = 5
 PPO = ImaginedPPOConfig(updates=1)
-CONFIG = LearnerConfig(imagination_horizon=3, lr=1e-3, warmup_updates=0, free_nats=0.0, ppo=PPO)
+CONFIG = {"horizon": 3, "learning_rate": 1e-3, "warmup_updates": 0, "free_nats": 0.0, "ppo": PPO}
 
 
 def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
@@ -39,9 +38,7 @@ def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
 
 
 def make_learner(**options) -> DreamerLearner:
-    learner = DreamerLearner(
-        "debug", Interface(privileged_dim=PRIVILEGED_DIM), config=replace(CONFIG, **options), seed=0
-    )
+    learner = learner_of("debug", Interface(privileged_dim=PRIVILEGED_DIM), seed=0, **CONFIG | options)
     torch.manual_seed(0)
     # Two-hot heads are zero at first, which would hide what lies below them.
     for head in (learner.agent.world_model.reward_head, learner.agent.critic.head):
@@ -69,7 +66,7 @@ def untouched(module: nn.Module) -> bool:
 
 @pytest.mark.parametrize("name", WORLD_MODEL_LOSSES)
 def test_world_model_loss_trains_all_of_the_world_model_and_nothing_else(name):
-    learner = make_learner(world_model_loss=name)
+    learner = make_learner(world_model=name)
     losses = learner.losses["world_model"](make_batch())
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert reached(learner.agent.world_model) == trainable(learner.agent.world_model)
@@ -80,7 +77,7 @@ def test_world_model_loss_trains_all_of_the_world_model_and_nothing_else(name):
 
 @pytest.mark.parametrize("name", ACTOR_LOSSES)
 def test_actor_loss_trains_all_of_the_actor_and_nothing_else(name):
-    learner = make_learner(actor_loss=name)
+    learner = make_learner(actor=name)
     agent = learner.agent
     torch.manual_seed(0)
     starts = TensorDict(
@@ -98,7 +95,7 @@ def test_actor_loss_trains_all_of_the_actor_and_nothing_else(name):
         assert reached(agent.actor) == trainable(agent.actor)
     else:
         before = {name: value.clone() for name, value in agent.actor.named_parameters()}
-        loss.improve(learner.config.ppo.updates)
+        loss.improve(PPO.updates)
         moved = {name for name, value in agent.actor.named_parameters() if not torch.equal(value, before[name])}
         assert moved == trainable(agent.actor)
     assert untouched(agent.world_model)
@@ -119,7 +116,7 @@ def test_dynamics_gradient_comes_through_the_model_and_reinforce_does_without():
         [6],
     )
     for name, expected in (("dynamics", False), ("reinforce", True)):
-        learner = make_learner(actor_loss=name, entropy_scale=0.0, continuation=False)
+        learner = make_learner(actor=name, entropy_scale=0.0, continuation=False)
         cell = learner.agent.world_model.rssm.cell
         cell.project_action = lambda action, project=cell.project_action: project(action.detach())
         learner.losses["actor"](starts)["loss_actor"].backward()
@@ -136,12 +133,12 @@ def behaviour_losses(learner: DreamerLearner) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("actor_loss", ACTOR_LOSSES)
 def test_replayed_returns_train_the_world_model_only_if_asked_to(actor_loss):
-    learner = make_learner(actor_loss=actor_loss, replay_value_gradient=False)
+    learner = make_learner(actor=actor_loss, replay_value_gradient=False)
     losses = behaviour_losses(learner)
     (losses["loss_critic"] + losses["loss_replay_critic"] + losses["loss_actor"]).backward()
     assert untouched(learner.agent.world_model)
 
-    learner = make_learner(actor_loss=actor_loss, replay_value_gradient=True)
+    learner = make_learner(actor=actor_loss, replay_value_gradient=True)
     behaviour_losses(learner)["loss_replay_critic"].backward()
     found = reached(learner.agent.world_model)
     # What makes the latents, not what is predicted from them.
@@ -163,7 +160,7 @@ def test_slow_critic_never_gets_a_gradient(shared):
 
 def test_targets_of_the_critic_carry_no_gradient():
     """Returns and values that the critic is taught are numbers: nothing flows through them."""
-    learner = make_learner(actor_loss="dynamics")
+    learner = make_learner(actor="dynamics")
     losses = behaviour_losses(learner)
     losses["loss_critic"].backward()
     assert untouched(learner.agent.actor)
@@ -193,14 +190,14 @@ def test_embedding_is_a_fixed_target_of_the_decoder_free_loss():
     [("privileged", "privileged_decoder"), ("informed", "privileged_decoder"), ("decoder_free", "projector")],
 )
 def test_parameters_of_a_loss_are_trained_and_saved(name, own):
-    learner = make_learner(world_model_loss=name)
+    learner = make_learner(world_model=name)
     module = getattr(learner.losses["world_model"], own)
     before = [parameter.detach().clone() for parameter in module.parameters()]
     for _ in range(2):
         learner.update(make_batch())
     assert not any(torch.equal(old, new) for old, new in zip(before, module.parameters(), strict=True))
 
-    restored = make_learner(world_model_loss=name)
+    restored = make_learner(world_model=name)
     restored.load_state_dict(learner.state_dict())
     pairs = zip(module.parameters(), getattr(restored.losses["world_model"], own).parameters(), strict=True)
     assert all(torch.equal(saved, loaded) for saved, loaded in pairs)
@@ -228,7 +225,7 @@ def test_frozen_restores_flags_after_an_error():
 
 
 def test_actor_through_the_dynamics_leaves_the_flags_as_they_were():
-    learner = make_learner(actor_loss="dynamics")
+    learner = make_learner(actor="dynamics")
     before = trainable(learner.agent)
     assert "world_model.rssm.initial_belief" not in before
     learner.update(make_batch())

@@ -22,10 +22,17 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Model
 from torchrl.objectives.dreamer_v3 import categorical_kl_balanced
 from torchrl.objectives.utils import ValueEstimators
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
-from dreamer_racing.losses import CriticLoss, DynamicsActorLoss, ReconstructionLoss, ReinforceLoss, kl_losses
+from dreamer_racing.losses import (
+    CriticLoss,
+    DynamicsActorLoss,
+    LossConfig,
+    ReconstructionLoss,
+    ReinforceLoss,
+    kl_losses,
+)
 from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
 from dreamer_racing.modules.agent import Agent
+from tests.dreamers import learner_of
 
 SIZE = SIZES["debug"]
 HORIZON = 333
@@ -424,8 +431,8 @@ def test_replay_critic_loss_with_crashes():
 @pytest.mark.parametrize("actor_loss", ["reinforce", "dynamics"])
 def test_whole_objective(actor_loss):
     """One update's losses and the gradient of every parameter against ``DreamerV3Loss``, end to end."""
-    config = LearnerConfig(imagination_horizon=5, discount=DISCOUNT, actor_loss=actor_loss)
-    learner, batch = DreamerLearner("debug", config=config, seed=0), make_batch()
+    config = {"horizon": 5, "discount": DISCOUNT, "actor": actor_loss}
+    learner, batch = learner_of(seed=0, **config), make_batch()
     torch.manual_seed(0)
     stir(learner.agent)
     stock = copy.deepcopy(learner.agent)
@@ -434,7 +441,7 @@ def test_whole_objective(actor_loss):
         stock_model_loss(stock.world_model),
         actor,
         stock_value_loss(stock.critic),
-        replay_value_loss_weight=config.replay_value_scale * 6 / 7,  # as in test_replay_critic_loss_without_crashes
+        replay_value_loss_weight=LossConfig.replay_value_scale * 6 / 7,  # as in test_replay_critic_loss_without_crashes
         continuation_horizon=HORIZON,
     )
     torch.manual_seed(6)

@@ -9,13 +9,14 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal, kl_divergence
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import ImaginedPPOConfig, imagine
 from dreamer_racing.losses.ppo_actor import Minibatch, clipped_objective, normal_divergence
 from dreamer_racing.modules.actor import ActionDistribution
+from tests.dreamers import learner_of
 
 PPO = ImaginedPPOConfig(updates=3, epochs=2, minibatch=16, learning_rate=1e-2)
-CONFIG = LearnerConfig(imagination_horizon=4, actor_loss="ppo", ppo=PPO, lr=1e-3, warmup_updates=0, entropy_scale=0.0)
+CONFIG = {"horizon": 4, "actor": "ppo", "ppo": PPO, "learning_rate": 1e-3, "warmup_updates": 0, "entropy_scale": 0.0}
 
 
 def make_starts(number: int = 6) -> TensorDict:
@@ -33,7 +34,7 @@ def make_starts(number: int = 6) -> TensorDict:
 
 def make_learner(**changes) -> DreamerLearner:
     """With heads that say something: fresh ones predict zero, and nothing is better than anything else."""
-    learner = DreamerLearner("debug", config=replace(CONFIG, **changes), seed=0)
+    learner = learner_of(seed=0, **CONFIG | changes)
     generator = torch.Generator().manual_seed(0)
     for head in (learner.agent.world_model.reward_head, learner.agent.critic.head):
         torch.nn.init.normal_(head.mlp.output.weight, generator=generator)
@@ -188,7 +189,7 @@ def test_advantages_are_normalised_under_their_weights():
 
 
 def test_a_checkpoint_between_two_improvements_loses_nothing():
-    from tests.test_learner import make_batch
+    from tests.learners.test_dreamer import make_batch
 
     numbers = replace(PPO, kl_target=1e-9)
     learner = make_learner(ppo=numbers)
@@ -225,9 +226,9 @@ def test_rollouts_of_another_number_of_starts_begin_anew():
 
 
 @pytest.mark.parametrize("changes", [{"ppo": replace(PPO, updates=2)}, {"ppo": replace(PPO, updates=7)},
-                                     {"imagination_horizon": 3}], ids=["fewer", "more", "shorter"])  # fmt: skip
+                                     {"horizon": 3}], ids=["fewer", "more", "shorter"])  # fmt: skip
 def test_a_checkpoint_of_other_rollouts_is_continued_without_them(changes):
-    from tests.test_learner import make_batch
+    from tests.learners.test_dreamer import make_batch
 
     learner = make_learner()
     for _ in range(4):
@@ -240,9 +241,8 @@ def test_a_checkpoint_of_other_rollouts_is_continued_without_them(changes):
 
 
 def test_a_gradient_that_is_not_finite_leaves_the_actor_as_it_was():
-    from tests.test_learner import make_batch
-
     from dreamer_racing.learners.finite_guard import NonFiniteLossError
+    from tests.learners.test_dreamer import make_batch
 
     learner = make_learner()
     for _ in range(2):

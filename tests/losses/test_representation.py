@@ -11,11 +11,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.objectives import LossModule
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import (
     WORLD_MODEL_LOSSES,
     DecoderFreeLoss,
     InformedLoss,
+    LossConfig,
     PrivilegedLoss,
     ReconstructionLoss,
     WorldModelLoss,
@@ -24,6 +24,7 @@ from dreamer_racing.losses import (
 from dreamer_racing.modules import SIZES, Interface, WorldModel, join_features, symlog
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast
+from tests.dreamers import learner_of
 
 PRIVILEGED_DIM = 5
 VECTOR_DIM = 6
@@ -64,7 +65,7 @@ def make_loss(name: str, sight: str = "pixels", **options) -> WorldModelLoss:
     torch.manual_seed(0)
     loss_class = WORLD_MODEL_LOSSES[name]
     agent = Agent(SIZES["debug"], SIGHTS[sight], loss_class.decodes)
-    return loss_class.from_config(agent, LearnerConfig(**options))
+    return loss_class.from_config(agent, LossConfig(**options))
 
 
 def observed(loss: WorldModelLoss, batch: TensorDict, seed: int = 2):
@@ -275,7 +276,7 @@ def test_scales_multiply_their_losses():
 @pytest.mark.parametrize("name", ["privileged", "informed"])
 def test_no_privileged_numbers_is_an_error_that_says_what_to_do(name):
     with pytest.raises(ValueError, match=r"(Privileged|Informed)Loss needs privileged numbers.*privileged=True"):
-        DreamerLearner("debug", Interface(), LearnerConfig(world_model_loss=name))
+        learner_of("debug", Interface(), world_model=name)
 
 
 def test_reconstruction_without_decoders_is_an_error_that_says_what_to_do():
@@ -290,6 +291,6 @@ def test_unknown_kl_mode_is_an_error_that_lists_the_known_ones():
 
 @pytest.mark.parametrize("name", ADDED)
 def test_only_losses_that_decode_have_decoders(name):
-    world_model = DreamerLearner("debug", SIGHTS["both"], LearnerConfig(world_model_loss=name)).agent.world_model
+    world_model = learner_of("debug", SIGHTS["both"], world_model=name).agent.world_model
     decodes = name in ("reconstruction", "informed")
     assert (world_model.decoder is not None) == (world_model.vector_decoder is not None) == decodes

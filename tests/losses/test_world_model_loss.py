@@ -5,9 +5,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
 from dreamer_racing.losses import ReconstructionLoss, kl_losses
 from dreamer_racing.modules import Interface, WorldModel
+from tests.dreamers import learner_of
 
 
 def make_batch(batch: int = 2, time: int = 4, image_size: int = 64) -> TensorDict:
@@ -118,11 +118,10 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
 
 
 def test_a_window_begins_with_the_first_records_context():
-    from tests.test_learner import make_batch
-
     from dreamer_racing.modules.stored_latents import CONTEXT
+    from tests.learners.test_dreamer import make_batch
 
-    learner = DreamerLearner("debug", seed=0)
+    learner = learner_of(seed=0)
     loss, batch = learner.losses["world_model"], make_batch()
     batch["is_init"] = torch.zeros_like(batch["is_init"])
     belief, state = torch.rand(3, 6, 32) * 2 - 1, torch.eye(4)[torch.randint(4, (3, 6, 4))].flatten(2)
@@ -144,13 +143,12 @@ def test_a_window_begins_with_the_first_records_context():
 
 def test_a_refreshed_context_is_what_the_next_window_begins_with():
     """From the learner's update through the replay into the next sample."""
-    from tests.test_replay import CountingEnv, collect
-
     from dreamer_racing.experience.replay import make_replay
     from dreamer_racing.modules.stored_latents import CONTEXT
+    from tests.experience.test_replay import CountingEnv, collect
 
-    config = LearnerConfig(imagination_horizon=2, imagination_starts=4, lr=1e-3, warmup_updates=0)
-    learner = DreamerLearner("debug", config=config, seed=0)
+    config = {"horizon": 2, "imagination_starts": 4, "learning_rate": 1e-3, "warmup_updates": 0}
+    learner = learner_of(seed=0, **config)
     rollout = collect(CountingEnv(2, end=0.0, image_shape=(64, 64, 3)), steps=9, batches=1)[0]
     rollout["next", "belief"], rollout["next", "state"] = torch.zeros(2, 9, 32), torch.zeros(2, 9, 16)
     replay = make_replay(20, 2, 1, 10, latents=learner.latent_format)

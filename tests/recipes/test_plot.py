@@ -10,11 +10,11 @@ from types import ModuleType
 
 import pytest
 from omegaconf import OmegaConf
-from tests.test_figures import flat_dream, random_flight
 
 from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.curves import read_curves
 from tests.figures.test_curves import write_run
+from tests.figures.test_flights import flat_dream, random_flight
 from tests.running_recipes import recipe_module
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "plot.py"

@@ -1,0 +1,87 @@
+"""Every number of the losses, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
+
+
+@dataclass
+class ImaginedPPOConfig:
+    """Numbers of ``PPOActorLoss`` [choice, unless a source is named]; docs/experiments.md, entry 14, compares some.
+
+    Attributes:
+        updates: K, learner updates whose rollouts are kept before the actor learns from them.
+        epochs: Times that every imagined step is trained on.
+        minibatch: M, imagined steps of a gradient step.
+        clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
+        advantage_clip: Largest normalised advantage.
+        kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
+        kl_target: Divergence before an improvement's last gradient step, nats, to which the learning rate is steered:
+            1.5 times more, and the next improvement is made at a lower one, 1.5 times less, and at a higher one; None:
+            it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
+        learning_rate: Of Adam; the largest, where there is a ``kl_target``.
+        gradient_clip: Largest norm of the actor's gradient.
+    """
+
+    updates: int = setting(8, COUNT)
+    epochs: int = setting(3, COUNT)
+    minibatch: int = setting(4096, COUNT)
+    clip_epsilon: float = setting(0.2, POSITIVE)
+    advantage_clip: float = setting(5.0, POSITIVE)
+    kl_stop: float = setting(0.03, POSITIVE)
+    kl_target: float | None = setting(None, POSITIVE)
+    learning_rate: float = setting(3e-4, POSITIVE)
+    gradient_clip: float = setting(0.5, POSITIVE)
+
+
+@dataclass
+class LossConfig:
+    """Losses by the names of their registries in ``dreamer_racing.losses``, and their numbers.
+
+    Attributes:
+        world_model: ``reconstruction``, ``informed``, ``privileged``, ``decoder_free``, ``reward_only``, or
+            ``module:Class`` of your own, as for the other two.
+        actor: ``reinforce``, ``dynamics`` or ``ppo``.
+        critic: ``two_hot``.
+        discount: γ.
+        lambda_: λ of the returns.
+        entropy_scale: Weight of the actor's entropy.
+        return_decay: Decay of the return percentiles.
+        min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
+            first way of doing something has made it sure of itself.
+        dynamics_scale: Weight of the dynamics loss.
+        representation_scale: Weight of the representation loss.
+        free_nats: KL below which there is no gradient, nats.
+        kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
+        privileged_scale: Weight of decoding the privileged state: losses ``informed`` and ``privileged``.
+        barlow_scale: Weight of the redundancy reduction: loss ``decoder_free``.
+        continuation: Whether predicted ends of episodes cut imagined returns.
+        slow_critic_scale: Weight of the regularisation towards the slow critic.
+        replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.
+        replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
+        ppo: Numbers of ``actor=ppo``.
+
+    Reference: danijar/dreamerv3, ``configs.yaml``.
+    """
+
+    world_model: str = "reconstruction"
+    actor: str = "reinforce"
+    critic: str = "two_hot"
+    discount: float = setting(0.997, SHARE)
+    lambda_: float = setting(0.95, SHARE)
+    entropy_scale: float = setting(3e-4, NOT_NEGATIVE)
+    return_decay: float = setting(0.99, SHARE)
+    min_std: float = setting(0.1, POSITIVE_SHARE)
+    dynamics_scale: float = setting(1.0, NOT_NEGATIVE)
+    representation_scale: float = setting(0.1, NOT_NEGATIVE)
+    free_nats: float = setting(1.0, NOT_NEGATIVE)
+    kl_mode: str = "separate"
+    privileged_scale: float = setting(1.0, NOT_NEGATIVE)
+    barlow_scale: float = setting(0.05, NOT_NEGATIVE)
+    continuation: bool = True
+    slow_critic_scale: float = setting(1.0, NOT_NEGATIVE)
+    replay_value_scale: float = setting(0.3, NOT_NEGATIVE)
+    replay_value_gradient: bool = True
+    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)

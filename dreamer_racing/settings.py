@@ -1,0 +1,60 @@
+"""Numbers that a person sets: what values they may have is said beside each, and checked in one place."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+ALLOWED = "allowed"
+
+
+class Range(NamedTuple):
+    """Allowed values of a setting: a whole interval, or one without its lower end."""
+
+    low: float
+    high: float = math.inf
+    open_below: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, (int, float)) and (
+            self.low < value <= self.high if self.open_below else self.low <= value <= self.high
+        )
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        below = f"above {self.low:g}" if self.open_below else f"at least {self.low:g}"
+        return below if self.high == math.inf else f"{below} and at most {self.high:g}"
+
+
+POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)
+SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
+COUNT = Range(1)
+
+
+def setting(default: Any, allowed: Range) -> Any:
+    """Return a dataclass field with a default and the values that it may have; None is allowed where its type is."""
+    return dataclasses.field(default=default, metadata={ALLOWED: allowed})
+
+
+def allowed_values(config: Any, name: str) -> Range | None:
+    """Return what a setting of a dataclass, or of an object of one, may be; None: anything of its type."""
+    return next((field.metadata.get(ALLOWED) for field in dataclasses.fields(config) if field.name == name), None)
+
+
+def check_settings(config: Any, prefix: str = "") -> None:
+    """Refuse a number out of its range, of a dataclass and of those within it.
+
+    Args:
+        config: an object of a dataclass.
+        prefix: of the settings' names, for the message.
+
+    Raises:
+        ValueError: the message gives the setting, its value, and what is allowed.
+    """
+    for field in dataclasses.fields(config):
+        value, allowed = getattr(config, field.name), field.metadata.get(ALLOWED)
+        if dataclasses.is_dataclass(value):
+            check_settings(value, f"{prefix}{field.name}.")
+        elif allowed is not None and value is not None and value not in allowed:
+            raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}.")
