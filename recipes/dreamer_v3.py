@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import ClassVar, cast
 
 import hydra
-from composing.arena import make_env, make_learner, scheduled
+from composing.arena import clock_times, make_env, make_learner, scheduled
 from composing.building import (
     assemble,
     claim,
@@ -37,6 +37,7 @@ from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.run import ReplayRun
 from dreamer_racing.training.signals import GracefulExit
 
@@ -61,8 +62,16 @@ class DreamerRun(ReplayRun):
     config: DreamerConfig
     learner: DreamerLearner
     lag: ModelLag
+    passes: PassShare
 
     remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
+
+    def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
+        """Take note of the gates passed too."""
+        episodes = super().take_in(rollout)
+        if len(episodes):
+            self.metrics.push({"episode/pass_share": self.passes.update(episodes)})
+        return episodes
 
     def measure(self) -> None:
         """Say the learning rates after warm-up, and measure the world model on records never trained on, too."""
@@ -100,10 +109,11 @@ class DreamerRun(ReplayRun):
     def keep_to_schedule(self) -> None:
         """Set everything that is scheduled to its value at this share of the run."""
         self.learner.actor_waits = self.lag.waits
-        self.learner.adjust(**scheduled(self.config, self.counters["env_steps"]))
-        schedule, progress = self.config.schedule, self.counters["env_steps"] / self.config.total_env_steps
-        if schedule.start_on_line.to is not None:
-            share = schedule.start_on_line.at(self.config.env.start_on_line, progress)
+        times = clock_times(self.config, self.counters["env_steps"], self.passes)
+        self.learner.adjust(**scheduled(self.config, times))
+        ramp = self.config.schedule.start_on_line
+        if ramp.to is not None:
+            share = ramp.at(self.config.env.start_on_line, times[ramp.by])
             cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
@@ -198,6 +208,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         curriculum,
         OverlappedRollouts(collector, acting, policy) if overlapped else None,
         lag=ModelLag(config.schedule.wait_for_model),
+        passes=PassShare(),
         ratio=replay_ratio(config),
         replay=make_run_replay(
             config,

@@ -31,8 +31,8 @@ class DroneRacingEnv(EnvBase):
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and of the randomisation of physics and looks.
         worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `looks`, `num_threads`, `backend`, `start_beyond_gate`, `start_noise`, `start_on_line`, `miss_radius`,
-            `control_rate`.
+            `looks`, `num_threads`, `backend`, `start_beyond_gate`, `start_noise`, `start_on_line`,
+            `start_before_crash`, `miss_radius`, `control_rate`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
+from dreamer_racing.envs.race.crash_memory import CrashMemory
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
@@ -48,6 +49,8 @@ class RaceWorlds:
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
+        start_before_crash: share of training episodes that begin where an earlier one was 0.4-2 s before its crash; see
+            `CrashMemory`.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
         miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
             and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
@@ -84,6 +87,7 @@ class RaceWorlds:
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
         start_on_line: float = 0.0,
+        start_before_crash: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
         control_rate: float | None = None,
@@ -128,6 +132,8 @@ class RaceWorlds:
         if not 0.0 <= start_on_line <= 1.0:
             raise ValueError(f"start_on_line={start_on_line}: a share of episodes lies between 0 and 1.")
         self._starts = self._make_starts(start_beyond_gate, start_noise, 0.0 if evaluation else start_on_line)
+        memory = CrashMemory(num_envs, start_before_crash, self.parameters.control_dt, self.device, self.dtype)
+        self._crashes = memory if start_before_crash and not evaluation else None
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
@@ -162,6 +168,8 @@ class RaceWorlds:
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         start = self._starts.sample(self.num_envs, self.evaluation)
+        if self._crashes is not None:
+            start = self._crashes.begin(mask, start, self._generator)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
         self._images = None
@@ -196,7 +204,11 @@ class RaceWorlds:
         """Fly one control step and judge it; nothing here waits for a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
         path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
-        return self.race.step(path, self.simulator.state.body_rates, invalid)
+        outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
+        if self._crashes is not None:
+            crashed, steps = outcome.terminated, self.race.step_count
+            self._crashes.note(self.simulator.state, self.race.target_gate, crashed, steps)
+        return outcome
 
     def _capture(self, action: Tensor) -> GraphedFunction:
         """Capture physics, race and images of a step as one CUDA graph, and leave the worlds as they were.
@@ -242,6 +254,7 @@ class RaceWorlds:
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
+            **({} if self._crashes is None else {"crashes": self._crashes.state_dict()}),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -264,6 +277,8 @@ class RaceWorlds:
             )
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
+        if self._crashes is not None and "crashes" in state_dict:  # else it begins empty
+            self._crashes.load_state_dict(state_dict["crashes"])
         self._images = None
         self._generator.set_state(generator)
 

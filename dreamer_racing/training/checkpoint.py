@@ -165,11 +165,8 @@ class RunCheckpoints:
         """
         source = latest_checkpoint(self.directory if path is None else path)
         self._last_saved = None
-        lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
-        if not lacking:
-            return _restore(self._checkpoint, source, map_location)
-        there = {name: part for name, part in self.components.items() if name not in lacking}
-        return _restore(_bind({**there, "random_state": RandomState()}), source, map_location)
+        parts = {**self.components, "random_state": RandomState()}
+        return load_components(source, parts, map_location, may_lack)
 
     def _remove_later(self, newest: Path) -> None:
         for path in self._rotation.checkpoints():
@@ -212,7 +209,10 @@ class BestCheckpoint:
 
 
 def load_components(
-    path: str | Path, components: Mapping[str, Any], map_location: torch.device | str = "cpu"
+    path: str | Path,
+    components: Mapping[str, Any],
+    map_location: torch.device | str = "cpu",
+    may_lack: Collection[str] = (),
 ) -> dict[str, Any]:
     """Restores some parts of a checkpoint, for example ``{"learner": learner}`` for an evaluation.
 
@@ -220,6 +220,7 @@ def load_components(
         path: run directory, folder of checkpoints, or one checkpoint.
         components: the parts by the names they were saved under.
         map_location: as in `RunCheckpoints.load`.
+        may_lack: as in `RunCheckpoints.load`.
 
     Returns:
         The metadata of the checkpoint, with ``env_steps``.
@@ -228,7 +229,10 @@ def load_components(
         FileNotFoundError: if there is no complete checkpoint.
         CheckpointError: if a part is missing or does not fit.
     """
-    return _restore(_bind(components), latest_checkpoint(path), map_location)
+    source = latest_checkpoint(path)
+    lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
+    there = {name: part for name, part in components.items() if name not in lacking}
+    return _restore(_bind(there), source, map_location)
 
 
 def load_state(

@@ -87,8 +87,12 @@ class Run:
         """Make the updates that are due after a rollout; after none, those that an interrupted run still owes."""
         raise NotImplementedError
 
-    def take_in(self, rollout: TensorDictBase) -> None:
-        """Account for the episodes that ended in a rollout, and let the curriculum set the b₂ of what comes."""
+    def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
+        """Account for the episodes that ended in a rollout, and let the curriculum set the b₂ of what comes.
+
+        Returns:
+            Those episodes, batch ``[E]`` of ``EpisodeTracker.update``.
+        """
         self.counters["env_steps"] += rollout.numel()
         episodes = self.tracker.update(rollout)
         self.counters["episodes"] += len(episodes)
@@ -96,6 +100,7 @@ class Run:
         if self.curriculum:
             self.env.body_rate_weight = self.curriculum.update(episodes["return"])
             self.metrics.push({"curriculum/body_rate_weight": self.env.body_rate_weight})
+        return episodes
 
     def measure(self) -> None:
         """Take the clock's readings."""
@@ -152,10 +157,10 @@ class ReplayRun(Run):
         """Updates that the replay ratio still owes for the environment steps made since the prefill."""
         return max(0, self.ratio.updates(self.counters["env_steps"]) - self.counters["updates"])
 
-    def take_in(self, rollout: TensorDictBase) -> None:
+    def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
         """Store a rollout too."""
         self.replay.extend(rollout)
-        super().take_in(rollout)
+        return super().take_in(rollout)
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Make the updates that are due."""

@@ -21,7 +21,9 @@ from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.training.checkpoint import load_components, load_state
+from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.run import Report
+from dreamer_racing.training.schedule import Clock
 
 Environment = DroneRacingEnv | ControlSuiteEnv
 
@@ -63,6 +65,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             privileged=reads_privileged,
             start_beyond_gate=env.start_beyond_gate,
             start_on_line=env.start_on_line,
+            start_before_crash=env.start_before_crash,
             miss_radius=env.miss_radius,
             device=env.device,
             looks=env.looks,
@@ -110,16 +113,21 @@ def reward_terms(env: Environment) -> list[str]:
     return ["reward", *(name for name in ("reward_base", "body_rate_norm") if name in present)]
 
 
-def scheduled(config: DreamerConfig, env_steps: int) -> dict[str, float]:
-    """Arguments of `DreamerLearner.adjust` after so many env_steps of a run."""
-    schedule, loss, progress = config.schedule, config.loss, env_steps / config.total_env_steps
+def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[Clock, float]:
+    """What the clocks of schedules say after so many env_steps of a run."""
+    return {Clock.run: env_steps / config.total_env_steps, Clock.passes: passes.best}
+
+
+def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, float]:
+    """Arguments of `DreamerLearner.adjust` at what the clocks say."""
+    schedule, loss = config.schedule, config.loss
     now = {
         "rates": (schedule.learning_rates, 1.0),
         "discount": (schedule.discount, loss.discount),
         "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
         "min_std": (schedule.min_std, loss.min_std),
     }
-    return {name: ramp.at(value, progress) for name, (ramp, value) in now.items()}
+    return {name: ramp.at(value, times[ramp.by]) for name, (ramp, value) in now.items()}
 
 
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
@@ -196,9 +204,12 @@ def restore_learner(
     env.close()
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
-    load_components(checkpoint, {"learner": learner, "counters": counters}, map_location=device)
+    passes = PassShare()
+    parts = {"learner": learner, "counters": counters, "passes": passes}
+    load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
     if isinstance(learner, DreamerLearner):
-        learner.adjust(**scheduled(cast(DreamerConfig, config), counters["env_steps"]))
+        config = cast(DreamerConfig, config)
+        learner.adjust(**scheduled(config, clock_times(config, counters["env_steps"], passes)))
     return learner, counters
 
 

@@ -211,14 +211,14 @@ def assemble(
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
-    parts |= {"replay": own["replay"]} if "replay" in own else {}
-    parts |= {"lag": own["lag"]} if "lag" in own else {}
+    parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
     checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
     clock = RunClock(counters)
     if config.resume:
-        clock.total = checkpoints.load(config.resume, may_lack=("lag",)).get("wall_clock", 0.0)
+        clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
-    best = BestCheckpoint(directory, {"learner": learner, "counters": counters})
+    flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
+    best = BestCheckpoint(directory, flown)
     for folder in (directory, best.directory):
         OmegaConf.save(OmegaConf.structured(config), folder / "config.yaml")
     kept = [override for override in overrides if not override.startswith("resume=")]

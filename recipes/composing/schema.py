@@ -26,15 +26,13 @@ class EnvConfig:
     num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
     control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
     episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
-    start_beyond_gate: float = setting(
-        0.0, SHARE
-    )  # share of training episodes that begin behind a gate, to practise turns
-    start_on_line: float = setting(
-        0.0, SHARE
-    )  # share of training episodes that begin in flight on a planned racing line
-    miss_radius: float = setting(
-        0.0, NOT_NEGATIVE
-    )  # m; training episodes end where a gate is missed by less than this; 0: they go on
+    # share of training episodes that begin behind a gate, to practise turns
+    start_beyond_gate: float = setting(0.0, SHARE)
+    start_before_crash: float = setting(0.0, SHARE)  # share that begin 0.4-2 s before the crash of an earlier one
+    # share of training episodes that begin in flight on a planned racing line
+    start_on_line: float = setting(0.0, SHARE)
+    # m; training episodes end where a gate is missed by less than this; 0: they go on
+    miss_radius: float = setting(0.0, NOT_NEGATIVE)
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
@@ -99,9 +97,8 @@ class ReplayConfig:
 class SequenceReplayConfig(ReplayConfig):
     """The replay buffer of a world model."""
 
-    held_out: int = setting(
-        1, NOT_NEGATIVE
-    )  # worlds whose records are never trained on, to measure the model; 0 of a single world
+    # worlds whose records are never trained on, to measure the model; 0 of a single world
+    held_out: int = setting(1, NOT_NEGATIVE)
     recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
     recent_records: int = setting(20_000, COUNT)  # how many those are
     context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
@@ -114,9 +111,8 @@ class EvaluationConfig:
     every: int = setting(25_000, NOT_NEGATIVE)  # env_steps; 0 never
     episodes: int = setting(8, COUNT)
     stochastic: bool = False  # also fly the sampling policy
-    start_noise: float = setting(
-        0.0, NOT_NEGATIVE
-    )  # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    start_noise: float = setting(0.0, NOT_NEGATIVE)
     video_steps: int = setting(500, COUNT)  # control steps in the video
 
 
