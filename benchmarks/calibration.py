@@ -38,7 +38,7 @@ from dreamer_racing.losses import imagine
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.world_model import join_features
-from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 NEAR, HALF_VIEW = 3.0, math.radians(40.0)  # m and rad to either side: where a gate counts as seen
 WRONG_GATE = 2.0  # m: an error that means another gate
@@ -66,7 +66,7 @@ def measure(checkpoint: Path, num_envs: int, steps: int) -> dict[str, Any]:
     Raises:
         ValueError: the checkpoint is of another algorithm.
     """
-    config = trained_config(checkpoint.parent.parent)
+    config = trained_config(RunDirectory.of(checkpoint).path)
     if not isinstance(config, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which imagines nothing.")
     torch.manual_seed(0)

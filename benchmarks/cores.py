@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 
 from measuring import print_table, write_json
 
+from dreamer_racing.training.directory import RunDirectory
+
 RECIPE = Path(__file__).parent.parent / "recipes" / "dreamer_v3.py"
 COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "least", "most", "times", "collect", "learn")
 LEARNING = ("sample", "world_model", "imagine", "optimise", "improve")
@@ -89,7 +91,7 @@ def measure(way: Way, cores: list[int], env_steps: int, overrides: list[str]) ->
         done = subprocess.run(command, env=environment, preexec_fn=bind, capture_output=True, text=True)
         if done.returncode:
             raise SystemExit(f"{way} ended with status {done.returncode}:\n{done.stderr[-2000:]}")
-        rows = list(csv.DictReader((run_dir / "metrics.csv").open()))
+        rows = list(csv.DictReader(RunDirectory(run_dir).metrics.open()))
     rows = [row for row in rows if int(row["env_steps"]) > env_steps / 2 and row["wall_clock"]]
     if len(rows) < 3:
         raise SystemExit(f"--env-steps {env_steps} leaves {len(rows)} rows of metrics in the second half: give more.")

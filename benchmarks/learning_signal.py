@@ -41,7 +41,7 @@ from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.training.checkpoint import load_components
-from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from
@@ -80,7 +80,7 @@ def measure(checkpoint: Path, updates: int, pairs: int) -> Iterator[dict[str, An
     Raises:
         ValueError: it is of another algorithm.
     """
-    config = trained_config(checkpoint.parent.parent)
+    config = trained_config(RunDirectory.of(checkpoint).path)
     if not isinstance(config, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
     config.device, config.replay.device = "cpu", "auto"  # wherever it was trained

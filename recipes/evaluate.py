@@ -28,6 +28,7 @@ from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import onboard_beside_map, write_video
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
+from dreamer_racing.training.directory import RunDirectory
 
 PROTOCOLS = ("nominal", "full")
 RESULT = "evaluation.json"
@@ -45,7 +46,7 @@ def main(config: DictConfig) -> None:
         check(settings)
         restored = restore(settings)
         StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
-        directory = fresh_directory(settings.run_dir or restored.run_dir / "evaluation", RESULT)
+        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, RESULT)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
     if report:
@@ -117,7 +118,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
         print(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
         if result.preset == trained.env.preset:
             write_flight(directory, result, config.video_steps)
-        path = directory / "evaluations" / f"{result.name}.json"
+        path = RunDirectory(directory).evaluations / f"{result.name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(result.evaluation.to_json())
     return results
@@ -126,10 +127,10 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
 def write_flight(directory: Path, result: Result, video_steps: int) -> None:
     """Draw the first flight of a condition from above; film it, if the agent sees and acts without noise."""
     trajectory = result.evaluation.trajectories[0]
-    plot_top_down(result.track, trajectory, directory / "plots" / f"{result.name}.png")
+    plot_top_down(result.track, trajectory, RunDirectory(directory).plots / f"{result.name}.png")
     if trajectory.pixels is not None and result.mode == "deterministic":
         frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
-        write_video(directory / "videos" / f"{result.name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+        write_video(RunDirectory(directory).videos / f"{result.name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
 
 def describe(results: list[Result], preset: str) -> dict[str, Any]:
@@ -141,10 +142,10 @@ def describe(results: list[Result], preset: str) -> dict[str, Any]:
 def write_markdown(directory: Path, results: list[Result], provenance: dict[str, Any]) -> None:
     """Write the table of conditions with its two plots."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
-    plot_conditions(results, directory / "plots" / "conditions.png", title)
+    plot_conditions(results, RunDirectory(directory).plots / "conditions.png", title)
     for preset in dict.fromkeys(result.preset for result in results):
         flown = {r.mode: r.evaluation for r in results if r.preset == preset and r.condition == "nominal"}
-        plot_crashes(flown, directory / "plots" / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
+        plot_crashes(flown, RunDirectory(directory).plots / f"crashes_{preset}.png", f"{title}, nominal, {preset}")
     meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
     plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
     text = f"{heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"

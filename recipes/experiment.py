@@ -28,7 +28,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.training.directory import CHECKPOINTS, finished_env_steps, latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.lock import RunLock
 
 RECIPES = Path(__file__).resolve().parent
@@ -105,13 +105,13 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
     recipe = [sys.executable, str(RECIPES / f"{config.algorithm}.py")]
     try:
-        latest_checkpoint(run_dir / CHECKPOINTS)
+        latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:
         return [*recipe, f"run_dir={run_dir}", *overrides]
     refuse_other_settings(run_dir, overrides)
     if tuned := tuned_by_recipe(run_dir, overrides):
         wanted = cast(RunConfig, hydra.compose(config.algorithm, [*overrides, tuned]))
-    if finished_env_steps(run_dir) >= wanted.total_env_steps:
+    if RunDirectory(run_dir).finished_env_steps() >= wanted.total_env_steps:
         return None
     return [*recipe, f"resume={run_dir}", f"total_env_steps={wanted.total_env_steps}"]
 
@@ -120,7 +120,7 @@ def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
     """The override that a run's recipe chose for tuned=auto, which brings a length of its own."""
     if "tuned" in settings_of(overrides):
         return None
-    saved = settings_of(OmegaConf.load(run_dir / "overrides.yaml"))
+    saved = settings_of(OmegaConf.load(RunDirectory(run_dir).overrides))
     return f"tuned={saved['tuned']}" if "tuned" in saved else None
 
 
@@ -130,7 +130,7 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
     Raises:
         ValueError: the message names the overrides that differ.
     """
-    saved, wanted = settings_of(OmegaConf.load(run_dir / "overrides.yaml")), settings_of(overrides)
+    saved, wanted = settings_of(OmegaConf.load(RunDirectory(run_dir).overrides)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:

@@ -50,6 +50,7 @@ from dreamer_racing.export.shipped_agent import (
     load_agent,
 )
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.directory import RunDirectory
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
 OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that say nothing of what was learned
@@ -162,8 +163,13 @@ def describe(
 ) -> dict[str, Any]:
     """Return what agent.json says: where the agent comes from, and how well it flies."""
     source = contract["source"]
-    if config.commit is None:
-        print("commit of the training: not noted, for commit= does not say it")
+    history = history_of(checkpoint)
+    commit = config.commit or (history[-1]["commit"] if history else None)
+    if commit is None:
+        print("commit of the training: not noted, for neither the run nor commit= says it")
+    training = {"command": training_command(trained, checkpoint), "commit": commit, "seed": trained.seed}
+    if len(history) > 1:  # begun or continued with other settings, perhaps
+        training["starts"] = history
     return {
         "algorithm": trained.algorithm,
         "track": trained.track,
@@ -172,15 +178,26 @@ def describe(
         "control_rate": trained.env.control_rate,
         "env_steps": source["env_steps"],
         "weights": source["weights"],
-        "training": {"command": training_command(trained, checkpoint), "commit": config.commit, "seed": trained.seed},
+        "training": training,
         "evaluation": read_evaluation(config, trained, checkpoint, hash_weights(step)),
     }
+
+
+def history_of(checkpoint: Path) -> list[dict[str, Any]]:
+    """Return the starts that a run has noted, their overrides without what is of one machine."""
+    run_dir = config_folder(checkpoint)
+    starts = RunDirectory(run_dir).read_starts() or RunDirectory(run_dir.parent).read_starts()  # best/ lies in the run
+    return [
+        start | {"overrides": [text for text in start["overrides"] if override_key(text) not in OF_A_MACHINE]}
+        for start in starts
+    ]
 
 
 def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
     """Return the command that trains such an agent, without what is of one machine; None if the run did not keep it."""
     run_dir = config_folder(checkpoint)
-    kept = [folder / "overrides.yaml" for folder in (run_dir, run_dir.parent)]  # the best of a run lies inside of it
+    # The best of a run lies inside of it.
+    kept = [RunDirectory(folder).overrides for folder in (run_dir, run_dir.parent)]
     path = next((path for path in kept if path.exists()), None)
     if path is None:
         return None
@@ -197,7 +214,7 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track; the message says how to make one.
     """
-    path = Path(config.evaluation or results_of(checkpoint) / "evaluation" / "evaluation.json")
+    path = Path(config.evaluation or RunDirectory(results_of(checkpoint)).evaluation / "evaluation.json")
     how = f"Make it with: python recipes/evaluate.py checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")

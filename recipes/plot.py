@@ -35,7 +35,7 @@ from dreamer_racing.figures.runs import (
     first_readable,
     read_runs,
 )
-from dreamer_racing.training.directory import ensure_writable
+from dreamer_racing.training.directory import RunDirectory, ensure_writable
 
 register()
 
@@ -222,7 +222,7 @@ def stored_flights(run: RunData, which: str) -> list[Path]:
 def named_flight(file: str | Path) -> Flight:
     """Read a flight with its track; the run's and the evaluation's names are its title."""
     trajectory, track = read_trajectory(file)
-    run = Path(file).absolute().parent.parent.name
+    run = RunDirectory.of(Path(file).absolute()).path.name
     return Flight(f"{run}, {stage_name(file)}", load_track(track), trajectory)
 
 

@@ -21,6 +21,7 @@ from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import side_by_side, write_video
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.training.directory import RunDirectory
 
 CONTEXT, DREAM = 10, 40  # control steps the model sees, then predicts on its own, in the video
 
@@ -48,7 +49,7 @@ class EvaluationReport:
         num_envs: int = 8,
         seed: int = 0,
     ) -> None:
-        self.directory = Path(directory)
+        self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
@@ -92,20 +93,21 @@ class EvaluationReport:
         Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that imagines
         images, `<name>_dream.npz`.
         """
-        for folder in ("evaluations", "plots", "videos"):
-            (self.directory / folder).mkdir(parents=True, exist_ok=True)
-        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
+        into = self.directory
+        for folder in (into.evaluations, into.plots, into.videos):
+            folder.mkdir(parents=True, exist_ok=True)
+        (into.evaluations / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
-        write_trajectory(self.directory / "evaluations" / f"{name}_trajectory.csv", trajectory, self._track)
-        plot_top_down(self._base.track, trajectory, self.directory / "plots" / f"{name}.png")
+        write_trajectory(into.evaluations / f"{name}_trajectory.csv", trajectory, self._track)
+        plot_top_down(self._base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return
         frames = trajectory.pixels[: self.video_steps]
         if isinstance(self._learner, DreamerLearner):
             frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
             if (dream := record_dream(self._learner, trajectory)) is not None:
-                dream.save(self.directory / "evaluations" / f"{name}_dream.npz")
-        write_video(self.directory / "videos" / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+                dream.save(into.evaluations / f"{name}_dream.npz")
+        write_video(into.videos / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
     def close(self) -> None:
         """Free the evaluation's simulator."""
@@ -126,7 +128,7 @@ class ReturnReport:
     def __init__(
         self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
     ) -> None:
-        self.directory = Path(directory)
+        self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
@@ -176,11 +178,12 @@ class ReturnReport:
         return torch.cat(returns), torch.cat(lengths), frames
 
     def _write(self, name: str, numbers: dict[str, Any], frames: list[Tensor]) -> None:
-        for folder in ("evaluations", "videos"):
-            (self.directory / folder).mkdir(parents=True, exist_ok=True)
-        (self.directory / "evaluations" / f"{name}.json").write_text(json.dumps(numbers, indent=2))
+        into = self.directory
+        for folder in (into.evaluations, into.videos):
+            folder.mkdir(parents=True, exist_ok=True)
+        (into.evaluations / f"{name}.json").write_text(json.dumps(numbers, indent=2))
         if frames:
-            write_video(self.directory / "videos" / f"{name}.mp4", torch.stack(frames), fps=30)
+            write_video(into.videos / f"{name}.mp4", torch.stack(frames), fps=30)
 
     def close(self) -> None:
         """Free the evaluation's simulators."""

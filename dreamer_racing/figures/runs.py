@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import yaml
 
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
 T = TypeVar("T")
@@ -107,7 +108,7 @@ def find_runs(places: Sequence[str | Path]) -> list[Path]:
 
 def _runs_below(folder: Path) -> Iterator[Path]:
     for path, folders, files in os.walk(folder):
-        if "config.yaml" in files or "metrics.csv" in files:
+        if RunDirectory(Path(path)).config.name in files or RunDirectory(Path(path)).metrics.name in files:
             folders.clear()
             yield Path(path)
         folders.sort()
@@ -126,7 +127,7 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
     runs, problems = [], []
     for directory in directories:
         try:
-            run = RunData(directory, _read_config(directory), read_metrics(directory / "metrics.csv", wanted))
+            run = RunData(directory, _read_config(directory), read_metrics(RunDirectory(directory).metrics, wanted))
         except FileNotFoundError as error:
             problems.append(f"{directory.name} left out: it has no {Path(error.filename).name}")
         except (ValueError, OSError) as error:
@@ -139,7 +140,7 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
 
 
 def _read_config(directory: Path) -> dict[str, Any]:
-    path = directory / "config.yaml"
+    path = RunDirectory(directory).config
     try:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -213,14 +214,16 @@ def evaluation_files(directory: Path, ending: str) -> dict[int, Path]:
     Returns:
         The files by env_steps, rising; those of stochastic policies are left out.
     """
-    files = sorted((directory / "evaluations").glob(f"*{ending}"))
+    files = sorted(RunDirectory(directory).evaluations.glob(f"*{ending}"))
     return {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
 
 
 def evaluation_score(directory: Path, env_steps: int) -> tuple[float, float]:
     """Say how good an evaluation was: gates per episode, then the return; the worst if its numbers are missing."""
     try:
-        numbers = json.loads((directory / "evaluations" / f"{env_steps:09d}.json").read_text(encoding="utf-8"))
+        numbers = json.loads(
+            (RunDirectory(directory).evaluations / f"{env_steps:09d}.json").read_text(encoding="utf-8")
+        )
         return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
     except (OSError, ValueError, KeyError, TypeError):
         return -math.inf, -math.inf
@@ -250,6 +253,6 @@ def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: l
         more = len(failures) - 1
         others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
         reason = textwrap.shorten(str(failure).replace(f"{first.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
-        line = f"{first.parent.parent.name} without {first.name}{others}: {reason}"
+        line = f"{RunDirectory.of(first).path.name} without {first.name}{others}: {reason}"
         problems += [line] if line not in problems else []
     return found

@@ -25,7 +25,14 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from dreamer_racing.training.directory import CHECKPOINTS, PREFIX, ensure_writable, is_complete, latest_checkpoint
+from dreamer_racing.training.directory import (
+    CHECKPOINTS,
+    PREFIX,
+    RunDirectory,
+    ensure_writable,
+    is_complete,
+    latest_checkpoint,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -190,7 +197,7 @@ class BestCheckpoint:
     """
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any]) -> None:
-        self.directory = Path(run_dir).absolute() / "best"
+        self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
         self.score: float | None = None
         with contextlib.suppress(FileNotFoundError):

@@ -6,7 +6,11 @@ import json
 import logging
 import os
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from torchrl.checkpoint import Checkpoint
 
@@ -14,7 +18,116 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "checkpoints"
 PREFIX = "checkpoint"
-FINISHED = "finished.json"
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """The folder of a run, or of its best checkpoint, which is laid out alike.
+
+    Args:
+        path: the folder.
+
+    Example:
+        >>> RunDirectory(Path("runs/example")).metrics
+        PosixPath('runs/example/metrics.csv')
+    """
+
+    path: Path
+
+    @classmethod
+    def of(cls, checkpoint: Path) -> RunDirectory:
+        """Return that of the run which left a checkpoint."""
+        return cls(checkpoint.parent.parent)
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of checkpoints, everything that a run goes on from."""
+        return self.path / CHECKPOINTS
+
+    @property
+    def best(self) -> RunDirectory:
+        """Networks as they were at the best evaluation, with the configuration."""
+        return RunDirectory(self.path / "best")
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration of the latest start."""
+        return self.path / "config.yaml"
+
+    @property
+    def overrides(self) -> Path:
+        """What it was composed from, a YAML list."""
+        return self.path / "overrides.yaml"
+
+    @property
+    def starts(self) -> Path:
+        """Every start of the run, a line of JSON each: see ``note_start``."""
+        return self.path / "starts.jsonl"
+
+    @property
+    def metrics(self) -> Path:
+        """Table over env_steps."""
+        return self.path / "metrics.csv"
+
+    @property
+    def evaluations(self) -> Path:
+        """Folder of what evaluations during training measured."""
+        return self.path / "evaluations"
+
+    @property
+    def plots(self) -> Path:
+        """Folder of pictures."""
+        return self.path / "plots"
+
+    @property
+    def videos(self) -> Path:
+        """Folder of films."""
+        return self.path / "videos"
+
+    @property
+    def evaluation(self) -> Path:
+        """Folder of an evaluation after training, with ``evaluation.json``."""
+        return self.path / "evaluation"
+
+    @property
+    def nonfinite_batch(self) -> Path:
+        """The batch whose loss was not finite."""
+        return self.path / "nonfinite_batch.pt"
+
+    @property
+    def finished(self) -> Path:
+        """What says that all that the run was asked for is done, evaluation and metrics included."""
+        return self.path / "finished.json"
+
+    def latest_checkpoint(self) -> Path:
+        """As the function of that name."""
+        return latest_checkpoint(self.path)
+
+    def mark_finished(self, env_steps: int) -> None:
+        """Note that all is done."""
+        partial = self.finished.with_name(f".{self.finished.name}.partial")
+        partial.write_text(json.dumps({"env_steps": env_steps}) + "\n", encoding="utf-8")
+        os.replace(partial, self.finished)
+
+    def finished_env_steps(self) -> int:
+        """Return the env_steps that the run was finished at; 0 if it was not."""
+        try:
+            return int(json.loads(self.finished.read_text(encoding="utf-8"))["env_steps"])
+        except FileNotFoundError:
+            return 0
+
+    def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
+        """Note that the run was begun, or continued at so many env_steps, with which overrides at which commit."""
+        line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}
+        with self.starts.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", **line}) + "\n")
+
+    def read_starts(self) -> list[dict[str, Any]]:
+        """Return every start that was noted; none of runs of older versions."""
+        try:
+            return [json.loads(line) for line in self.starts.read_text(encoding="utf-8").splitlines()]
+        except FileNotFoundError:
+            return []
 
 
 def latest_checkpoint(path: str | Path) -> Path:
@@ -39,21 +152,6 @@ def latest_checkpoint(path: str | Path) -> Path:
         f"No complete checkpoint at {path}: the path {found}. Give a run directory (with a subfolder "
         f"'{CHECKPOINTS}'), a folder of '{PREFIX}-<env_steps>' folders, or one of these."
     )
-
-
-def mark_finished(run_dir: str | Path, env_steps: int) -> None:
-    """Note in a run directory that all that the run was asked for is done, evaluation and metrics included."""
-    partial = Path(run_dir) / f".{FINISHED}.partial"
-    partial.write_text(json.dumps({"env_steps": env_steps}) + "\n", encoding="utf-8")
-    os.replace(partial, Path(run_dir) / FINISHED)
-
-
-def finished_env_steps(run_dir: str | Path) -> int:
-    """Return the env_steps that a run was finished at; 0 if it was not."""
-    try:
-        return int(json.loads((Path(run_dir) / FINISHED).read_text(encoding="utf-8"))["env_steps"])
-    except FileNotFoundError:
-        return 0
 
 
 def ensure_writable(directory: str | Path) -> Path:

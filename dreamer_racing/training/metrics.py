@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from dreamer_racing.training.directory import RunDirectory
+
 logger = logging.getLogger(__name__)
 X_AXIS = "env_steps"
 
@@ -51,7 +53,7 @@ class MetricsLog:
     ) -> None:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
-        self.path = run_dir / "metrics.csv"
+        self.path = RunDirectory(run_dir).metrics
         self.loggers = list(loggers)
         if tensorboard:
             from torchrl.record.loggers.tensorboard import TensorboardLogger

@@ -21,7 +21,7 @@ from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import finished_env_steps, latest_checkpoint, mark_finished
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
@@ -65,7 +65,7 @@ class Run:
     """The parts of a run, in the order in which data flows through them; a recipe adds its own and its learning."""
 
     config: Any  # the recipe's RunConfig
-    directory: Path
+    directory: RunDirectory
     env: EnvBase
     collector: Collector
     rollouts: Iterator[TensorDictBase]
@@ -133,7 +133,7 @@ class Run:
     def last_good(self) -> str:
         """Which checkpoint is left when training breaks off."""
         try:
-            return f"the last good checkpoint is {latest_checkpoint(self.directory)}"
+            return f"the last good checkpoint is {self.directory.latest_checkpoint()}"
         except FileNotFoundError:
             return "there is no checkpoint yet"
 
@@ -192,7 +192,7 @@ def train(run: Run) -> None:
         GracefulExit() as stop,
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
-        if finished_env_steps(run.directory) >= config.total_env_steps:
+        if run.directory.finished_env_steps() >= config.total_env_steps:
             bar.write(
                 f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"
             )
@@ -216,13 +216,13 @@ def train(run: Run) -> None:
                 run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
-            bar.write(f"{stop.signal_name} {at}: saving; continue with resume={run.directory}")
+            bar.write(f"{stop.signal_name} {at}: saving; continue with resume={run.directory.path}")
         saved = run.save()
         if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
             bar.write(run.evaluate())
         run.metrics.write(counters["env_steps"])
         if not stop.requested:
-            mark_finished(run.directory, counters["env_steps"])
+            run.directory.mark_finished(counters["env_steps"])
         bar.write(f"checkpoint: {saved}")
     if stop.signal_name:
         raise SystemExit(128 + signal.Signals[stop.signal_name])

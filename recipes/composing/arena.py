@@ -21,6 +21,7 @@ from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.training.checkpoint import load_components, load_state
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.run import Report
 from dreamer_racing.training.schedule import Clock
@@ -151,10 +152,10 @@ def trained_config(run_dir: Path) -> RunConfig:
     Raises:
         ValueError: by an unknown algorithm.
     """
-    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
+    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
     algorithm = saved.get("algorithm", DreamerConfig.algorithm)
     if algorithm not in RECIPES:
-        raise ValueError(f"{run_dir / 'config.yaml'}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
+        raise ValueError(f"{RunDirectory(run_dir).config}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
     return cast(RunConfig, OmegaConf.to_object(with_schema(saved, algorithm)))
 
 

@@ -3,6 +3,7 @@
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -25,12 +26,13 @@ from dreamer_racing.learners.learner import Learner
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
+    git_commit,
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import ensure_writable
+from dreamer_racing.training.directory import RunDirectory, ensure_writable
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
@@ -206,29 +208,30 @@ def assemble(
         rollouts: an iterator over the collector; None for its own.
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
-    directory = lock.directory
+    directory = RunDirectory(lock.directory)
     tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
-    checkpoints = RunCheckpoints(directory, parts, config.checkpoint.keep)
+    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep)
     clock = RunClock(counters)
     if config.resume:
         clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
-    best = BestCheckpoint(directory, flown)
-    for folder in (directory, best.directory):
-        OmegaConf.save(OmegaConf.structured(config), folder / "config.yaml")
+    best = BestCheckpoint(directory.path, flown)
+    for place in (directory, directory.best):
+        OmegaConf.save(OmegaConf.structured(config), place.config)
     kept = [override for override in overrides if not override.startswith("resume=")]
-    OmegaConf.save(OmegaConf.create(kept), directory / "overrides.yaml")
+    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
+    directory.note_start(counters["env_steps"], kept, git_commit(Path(__file__).parent))
     metrics = MetricsLog(
-        directory,
+        directory.path,
         tensorboard=config.logger.tensorboard,
         resume_env_steps=counters["env_steps"] if config.resume else None,
     )
-    print(f"run directory: {directory}")
+    print(f"run directory: {directory.path}")
     return kind(
         config=config,
         directory=directory,
@@ -240,7 +243,7 @@ def assemble(
         learner=learner,
         report=make_report(
             config,
-            directory,
+            directory.path,
             learner,
             config.evaluation.episodes,
             config.evaluation.video_steps,

@@ -20,7 +20,7 @@ from dreamer_racing.losses.ppo_actor import KL_TOLERANCE
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
-from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.run import ReplayRatio
 
 RACE_ONLY = {
@@ -60,7 +60,7 @@ def refuse_to_replace(config: RunConfig) -> None:
         return
     assert config.run_dir is not None
     try:
-        newest = latest_checkpoint(Path(config.run_dir) / "checkpoints")
+        newest = latest_checkpoint(RunDirectory(Path(config.run_dir)).checkpoints)
     except FileNotFoundError:
         return
     raise ValueError(

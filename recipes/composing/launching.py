@@ -20,7 +20,7 @@ from dreamer_racing.machine import (
     keep_freed_memory,
     out_of_memory_advice,
 )
-from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.run import train
 
 TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
@@ -57,7 +57,7 @@ def launch(
     try:
         train(run)
     except NonFiniteLossError as error:
-        torch.save(error.batch.to("cpu").to_dict(), run.directory / "nonfinite_batch.pt")
+        torch.save(error.batch.to("cpu").to_dict(), run.directory.nonfinite_batch)
         raise SystemExit(
             f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
             f"kept in {run.directory / 'nonfinite_batch.pt'}; {run.last_good}. Continue from there with a lower "
@@ -77,7 +77,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     Raises:
         ValueError: it is another algorithm's run, or an override would make another run of it.
     """
-    run_dir = latest_checkpoint(resume).parent.parent
+    run_dir = RunDirectory.of(latest_checkpoint(resume)).path
     known = saved_config(algorithm, run_dir)
     for override in overrides:
         name, value = override_key(override), override.partition("=")[2]
@@ -94,8 +94,8 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
 def begun_with(algorithm: str, run_dir: Path) -> list[str]:
     """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
     schema = OmegaConf.structured(RECIPES[algorithm])
-    overrides = [str(override) for override in OmegaConf.load(run_dir / "overrides.yaml")]
-    if "tuned" in schema and "tuned" not in OmegaConf.load(run_dir / "config.yaml"):
+    overrides = [str(override) for override in OmegaConf.load(RunDirectory(run_dir).overrides)]
+    if "tuned" in schema and "tuned" not in OmegaConf.load(RunDirectory(run_dir).config):
         overrides = merge_overrides(overrides, ["tuned=none"])  # begun before there was a choice
     known = [override for override in overrides if is_known(override_key(override), schema)]
     if unknown := [override for override in overrides if override not in known]:
@@ -109,7 +109,7 @@ def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
     Raises:
         ValueError: it is another algorithm's run.
     """
-    saved = cast(DictConfig, OmegaConf.load(run_dir / "config.yaml"))
+    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")

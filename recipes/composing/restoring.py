@@ -16,7 +16,7 @@ from dreamer_racing.export.shipped_agent import AVERAGED, TRAINED, ShippedAgent,
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer
 from dreamer_racing.machine import command_line, provenance
-from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, ensure_writable, latest_checkpoint
 
 AGENTS = Path(__file__).parents[2] / "agents"
 """Where the agents that ship lie, each in a folder of its name."""
@@ -129,12 +129,12 @@ def find_trained(name: str) -> Path:
 
 def config_folder(checkpoint: Path) -> Path:
     """Where the configuration of a checkpoint or an agent lies."""
-    return checkpoint if is_agent(checkpoint) else checkpoint.parent.parent
+    return checkpoint if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
 def results_of(checkpoint: Path) -> Path:
     """Where results of a checkpoint or an agent go."""
-    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else checkpoint.parent.parent
+    return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:

@@ -280,7 +280,7 @@ class ExportConfig:
     output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
     agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
     evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
-    commit: str | None = None  # with agent=: that it was trained at, to be noted
+    commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
     steps: int = 200  # of a recorded flight, over which the export must fly as the original does
     renderer: str = "auto"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.training.directory import latest_checkpoint, mark_finished
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.lock import RunLock
 from tests.running_recipes import ROOT, compose, recipe_module, rows
 
@@ -40,7 +40,7 @@ def leave_run(directory: Path, env_steps: int, overrides: list[str], finished: b
     Checkpoint().save(path, metadata={"env_steps": env_steps})
     OmegaConf.save(OmegaConf.create([f"run_dir={directory}", *overrides]), directory / "overrides.yaml")
     if finished:
-        mark_finished(directory, env_steps)
+        RunDirectory(directory).mark_finished(env_steps)
     return directory
 
 
@@ -56,7 +56,7 @@ def test_a_run_starts_with_what_was_given_and_what_its_variant_adds(tmp_path: Pa
 def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path) -> None:
     run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]
-    mark_finished(run_dir, 1_000_000)
+    RunDirectory(run_dir).mark_finished(1_000_000)
     assert next_command(tmp_path, *CHOSEN) is None
     assert next_command(tmp_path, *CHOSEN, "total_env_steps=900000") is None
 
@@ -70,7 +70,7 @@ def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
         Path(command[1].removeprefix("run_dir=")), 1_100_000, [*command[2:], "tuned=race"], finished=False
     )
     assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1200000"]
-    mark_finished(run_dir, 1_200_000)
+    RunDirectory(run_dir).mark_finished(1_200_000)
     assert next_command(tmp_path, *chosen) is None
 
 

@@ -1,0 +1,31 @@
+"""What lies where in a run directory, and the history that it keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dreamer_racing.training.directory import RunDirectory
+
+
+def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    assert RunDirectory.of(run.checkpoints / "checkpoint-000000000100") == run
+    assert RunDirectory.of(run.best.checkpoints / "checkpoint-000000000100") == run.best
+    assert run.best.config == tmp_path / "best" / "config.yaml"
+
+
+def test_every_start_is_kept(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    assert run.read_starts() == []
+    run.note_start(0, ["track=circle"], "abc")
+    run.note_start(4000, ["track=circle", "loss.discount=0.98"], None)
+    first, second = run.read_starts()
+    assert (first["env_steps"], first["overrides"], first["commit"]) == (0, ["track=circle"], "abc")
+    assert (second["env_steps"], second["overrides"][-1], second["commit"]) == (4000, "loss.discount=0.98", None)
+
+
+def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    assert run.finished_env_steps() == 0
+    run.mark_finished(1200)
+    assert run.finished_env_steps() == 1200
