@@ -20,7 +20,7 @@ from typing import Any, cast
 
 import hydra
 import torch
-from composing.arena import camera_of, trained_config
+from composing.arena import trained_config, worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.restoring import config_folder, find_trained, results_of
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
@@ -104,16 +104,12 @@ def export(config: ExportConfig) -> None:
 def prepare(config: ExportConfig, trained: DreamerConfig, checkpoint: Path) -> tuple[ActorStep, dict[str, Any], Flight]:
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
-        trained.track,
-        1,
+        num_envs=1,
         from_pixels=trained.env.from_pixels,
-        preset=trained.env.preset,
-        control_rate=trained.env.control_rate,
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
-        camera=camera_of(trained),
-        renderer=config.renderer,
         num_threads=1,
+        **worlds_of(trained) | {"renderer": config.renderer},
     )
     try:
         if is_agent(checkpoint):

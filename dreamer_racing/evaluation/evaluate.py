@@ -252,7 +252,7 @@ def evaluate(
     """
     control_dt = _check(env, episodes)
     num_envs = env.batch_size[0]
-    shares = [episodes // num_envs + (index < episodes % num_envs) for index in range(num_envs)]
+    shares = deal(episodes, num_envs)
     logs = [_EpisodeLog(control_dt) for _ in range(num_envs)]
     flown: list[list[Episode]] = [[] for _ in range(num_envs)]
     with set_exploration_type(exploration_type):
@@ -273,6 +273,11 @@ def evaluate(
     waves = range(max(shares))
     ordered = [flown[index][wave] for wave in waves for index in range(num_envs) if wave < shares[index]]
     return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt))
+
+
+def deal(episodes: int, worlds: int) -> list[int]:
+    """Return how many of some episodes each world has: one more or less, so that how they go has no say in it."""
+    return [episodes // worlds + (index < episodes % worlds) for index in range(worlds)]
 
 
 def _check(env: EnvBase, episodes: int) -> float:

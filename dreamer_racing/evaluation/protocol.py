@@ -7,37 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
-
-import torch
-from tensordict import TensorDictBase
-from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
+from typing import Any
 
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
-from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
-from dreamer_racing.evaluation.evaluate import Evaluation, evaluate
+from dreamer_racing.evaluation.course import Course, RacingPolicy
+from dreamer_racing.evaluation.evaluate import Evaluation, deal
 
 EPISODES = 100
 """The fewest episodes of each condition that the protocol asks for."""
 
 PRESETS = ("easy", "faithful")
 MODES = ("deterministic", "stochastic")
-
-
-class RacingPolicy(Protocol):
-    """What is flown: a module on tensordicts of batch size [N] that writes ``action``."""
-
-    deterministic: bool
-    """Whether it takes modes instead of samples; may be set at any time."""
-
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, and what the policy remembers."""
-        ...
-
-    def make_primer(self) -> TensorDictPrimer:
-        """Make the transform that adds what the policy remembers to an environment."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -153,7 +134,7 @@ def run_protocol(
             if condition.needs_images and not worlds.get("from_pixels", True):
                 continue
             races = list(condition.races(track, seed))
-            shares = [episodes // len(races) + (index < episodes % len(races)) for index in range(len(races))]
+            shares = deal(episodes, len(races))
             for mode in MODES:
                 parts = [
                     fly(
@@ -188,18 +169,11 @@ def fly(
         num_envs: episodes flown side by side.
         recording: arguments of `evaluate`: ``num_trajectories``, ``max_recorded_steps``, ``record_pixels``.
     """
-    base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, **worlds)
-    env = TransformedEnv(base, Compose(InitTracker(), policy.make_primer()))
-    policy.deterministic = deterministic
-    weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
-
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
-        return policy(tensordict.to(weight.device)).to(base.device)
-
+    course = Course(policy, worlds, min(num_envs, episodes))
     try:
-        return evaluate(env, act, episodes, **{"max_recorded_steps": base.worlds.race.episode_steps, **recording})
+        return course.evaluate(episodes, deterministic, **recording)
     finally:
-        env.close(raise_if_closed=False)
+        course.close()
 
 
 def results_table(results: Sequence[Result], condition: str = "condition") -> str:

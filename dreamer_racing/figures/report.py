@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
+from torchrl.envs import EnvBase
 
-from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.evaluation.course import Course, act, with_memory
 from dreamer_racing.evaluation.dreams import record_dream
-from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
+from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
 from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import side_by_side, write_video
@@ -53,12 +53,9 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self._learner = learner
-        self._seed = seed
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
-        self._policy = learner.evaluation_policy()
-        self._base = DroneRacingEnv(num_envs=min(num_envs, episodes), evaluation=True, seed=seed, **worlds)
-        self._env = TransformedEnv(self._base, Compose(InitTracker(), self._policy.make_primer()))
+        self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, min(num_envs, episodes))
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -79,13 +76,7 @@ class EvaluationReport:
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        self._policy.deterministic = deterministic
-        self._base.worlds.seed(self._seed)
-        return evaluate(self._env, self._act, self.episodes, max_recorded_steps=self._base.worlds.race.episode_steps)
-
-    def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act on the learner's device, with the environment on the CPU."""
-        return self._policy(tensordict.to(self._learner.device)).to("cpu")
+        return self._course.evaluate(self.episodes, deterministic)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
@@ -99,7 +90,7 @@ class EvaluationReport:
         (into.evaluations / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
         write_trajectory(into.evaluations / f"{name}_trajectory.csv", trajectory, self._track)
-        plot_top_down(self._base.track, trajectory, into.plots / f"{name}.png")
+        plot_top_down(self._course.base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return
         frames = trajectory.pixels[: self.video_steps]
@@ -111,7 +102,7 @@ class EvaluationReport:
 
     def close(self) -> None:
         """Free the evaluation's simulator."""
-        self._env.close(raise_if_closed=False)
+        self._course.close()
 
 
 class ReturnReport:
@@ -133,7 +124,7 @@ class ReturnReport:
         self.video_steps = video_steps
         self._learner = learner
         self._policy = learner.evaluation_policy()
-        self._env = TransformedEnv(env, Compose(InitTracker(), self._policy.make_primer()))
+        self._env = with_memory(env, self._policy)
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -159,15 +150,14 @@ class ReturnReport:
     def _act(self) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Return the episodes' returns and lengths ``(episodes,)`` and the images of world 0's first episode."""
         num_envs = self._env.batch_size[0]
-        left = torch.tensor([self.episodes // num_envs + (i < self.episodes % num_envs) for i in range(num_envs)])
+        left = torch.tensor(deal(self.episodes, num_envs))
         total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
         returns, lengths, frames, filming = [], [], [], True
         tensordict = self._env.reset()
         while (left > 0).any():
             if filming and "pixels" in tensordict:
                 frames.append(tensordict["pixels"][0].clone())
-            acted = self._policy(tensordict.to(self._learner.device)).to("cpu")
-            step, tensordict = self._env.step_and_maybe_reset(acted)
+            step, tensordict = self._env.step_and_maybe_reset(act(self._policy, tensordict))
             total, length = total + step["next", "reward"].view(-1), length + 1
             done = step["next", "done"].view(-1)
             counted = done & (left > 0)

@@ -78,9 +78,13 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             f"loss.world_model={loss} decodes the race's privileged state, which env=dmc does not "
             "have: choose another loss, e.g. loss=reconstruction."
         )
-    return ControlSuiteEnv(
-        config.task, num_envs, from_pixels=env.from_pixels, image_size=env.image_size, seed=config.seed
-    )
+    return make_suite(config, num_envs, config.seed)
+
+
+def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
+    """Make worlds of the Control Suite, to train in or to evaluate."""
+    env = config.env
+    return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, image_size=env.image_size, seed=seed)
 
 
 def make_report(
@@ -99,7 +103,7 @@ def make_report(
             options["num_envs"] = episodes
             print(f"evaluation: {episodes} worlds, one for each episode, so that every agent meets the same starts")
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
-    env = ControlSuiteEnv(config.task, min(8, episodes), from_pixels=config.env.from_pixels, seed=config.seed + 1)
+    env = make_suite(config, min(8, episodes), config.seed + 1)
     return ReturnReport(directory, learner, env, episodes, video_steps)
 
 

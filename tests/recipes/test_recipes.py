@@ -554,3 +554,11 @@ def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest
     config = recipe_module("composing.arena").with_schema(saved, "dreamer_v3")
     assert config.model.size == "debug" and "decay_updates" not in config.model
     assert "settings of another version, left out: old=1, model.decay_updates=8" in capsys.readouterr().out
+
+
+def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
+    overrides = ["env=dmc", "task=cartpole_swingup", "env.image_size=96", "model=debug", "device=cpu", "seed=3"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    evaluated = recipe_module("composing.arena").make_suite(config, 1, 4)
+    assert evaluated.observation_spec["pixels"].shape == (1, 96, 96, 3)
+    evaluated.close()

@@ -1,0 +1,70 @@
+"""Where a policy is flown: worlds to evaluate in, with what the policy needs beside observations.
+
+Shapes: N environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, cast
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, TransformedEnv
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.evaluation.evaluate import Evaluation, evaluate
+
+
+class RacingPolicy(Protocol):
+    """What is flown: a module on tensordicts of batch size [N] that writes ``action``."""
+
+    deterministic: bool
+    """Whether it takes modes instead of samples; may be set at any time."""
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, and what the policy remembers."""
+        ...
+
+    def make_primer(self) -> TensorDictPrimer:
+        """Make the transform that adds what the policy remembers to an environment."""
+        ...
+
+
+def with_memory(env: EnvBase, policy: RacingPolicy) -> TransformedEnv:
+    """Give an environment what a policy reads beside observations: where episodes begin, and what it remembers."""
+    return TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
+
+
+def act(policy: RacingPolicy, tensordict: TensorDictBase) -> TensorDictBase:
+    """Act wherever the policy lives, with an environment on the CPU."""
+    weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
+    return policy(tensordict.to(weight.device)).to("cpu")
+
+
+class Course:
+    """Worlds on the CPU to evaluate a policy in, as often as wanted; each time it meets the same starts and drones.
+
+    Args:
+        policy: what is flown, on whichever device it is.
+        worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (0 if they do not say) ...
+        num_envs: N, episodes flown side by side.
+    """
+
+    def __init__(self, policy: RacingPolicy, worlds: Mapping[str, Any], num_envs: int) -> None:
+        worlds = {"seed": 0, **worlds}
+        self.base = DroneRacingEnv(num_envs=num_envs, evaluation=True, **worlds)
+        self._policy = policy
+        self._seed = worlds["seed"]
+        self._env = with_memory(self.base, policy)
+
+    def evaluate(self, episodes: int, deterministic: bool = True, **recording: Any) -> Evaluation:
+        """Fly so many episodes; ``recording`` are arguments of ``evaluate``, recorded to their ends if it says none."""
+        self._policy.deterministic = deterministic
+        self.base.worlds.seed(self._seed)
+        recording = {"max_recorded_steps": self.base.worlds.race.episode_steps, **recording}
+        return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), episodes, **recording)
+
+    def close(self) -> None:
+        """Free the simulators."""
+        self._env.close(raise_if_closed=False)
