@@ -30,8 +30,10 @@ from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from composing.arena import make_env, restore_learner, trained_config
+from composing.arena import make_env
 from composing.building import make_curriculum, make_run_replay
+from composing.restoring import restore_learner
+from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
 from dreamer_racing.experience.replay import StreamReplay

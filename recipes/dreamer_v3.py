@@ -13,19 +13,20 @@ from pathlib import Path
 from typing import ClassVar, cast
 
 import hydra
-from composing.arena import clock_times, make_env, make_learner, scheduled
+from composing.arena import make_env
 from composing.building import (
     assemble,
     claim,
     make_collector,
     make_curriculum,
-    make_run_replay,
+    make_sequence_replay,
     resolve_common,
     seed_generators,
 )
 from composing.checks import check_dreamer, replay_ratio
 from composing.command_line import CONFIG_DIR, choose_device, computes_bfloat16
 from composing.launching import launch
+from composing.learners import clock_times, make_agent, scheduled
 from composing.schema import Collection, DreamerConfig, register
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -34,7 +35,9 @@ from torch import Tensor
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer import DreamerLearner, make_optimizer
+from dreamer_racing.learners.learner import seeded
+from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.pass_share import PassShare
@@ -190,38 +193,25 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     check_dreamer(config)
     lock = claim(config)
     env = make_env(config)
-    learner = cast(DreamerLearner, make_learner(config, Interface.of(env), config.device))
+    with seeded(config.seed):
+        agent = make_agent(config, Interface.of(env))
+        losses = make_losses(agent, config.loss, config.model.imagination_horizon)
+    learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, config.model), config.model)
     seed_generators(config.seed)
+    curriculum = make_curriculum(config)
     policy = learner.policy()
     overlapped = config.collection is Collection.overlapped
     acting = acting_copy(policy) if overlapped else policy
     collector = make_collector(config, env, acting)
-    curriculum = make_curriculum(config)
-    return assemble(
-        DreamerRun,
-        config,
-        overrides,
-        lock,
-        env,
-        learner,
-        collector,
-        curriculum,
-        OverlappedRollouts(collector, acting, policy) if overlapped else None,
-        lag=ModelLag(config.schedule.wait_for_model),
-        passes=PassShare(),
-        ratio=replay_ratio(config),
-        replay=make_run_replay(
-            config,
-            env,
-            curriculum,
-            config.model.batch_size,
-            config.model.batch_length,
-            latents=learner.latent_format if config.replay.context else None,
-            recent_share=config.replay.recent_share,
-            recent_records=config.replay.recent_records,
-            held_out=config.replay.held_out,
-        ),
-    )
+    rollouts = OverlappedRollouts(collector, acting, policy) if overlapped else None
+    latents = learner.latent_format if config.replay.context else None
+    parts = {
+        "replay": make_sequence_replay(config, env, curriculum, latents),
+        "ratio": replay_ratio(config),
+        "lag": ModelLag(config.schedule.wait_for_model),
+        "passes": PassShare(),
+    }
+    return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,10 @@ from typing import Any, cast
 
 import hydra
 import torch
-from composing.arena import trained_config, worlds_of
+from composing.arena import worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.restoring import config_folder, find_trained, results_of
+from composing.saved import trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
 from omegaconf import DictConfig, OmegaConf
 

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import hydra
-from composing.arena import make_env, make_learner
+from composing.arena import make_env
 from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
 from composing.checks import check
 from composing.launching import launch
+from composing.learners import make_learner
 from composing.schema import PPORunConfig, register
 from omegaconf import DictConfig
 from tensordict import TensorDictBase

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import hydra
-from composing.arena import make_env, make_learner
+from composing.arena import make_env
 from composing.building import (
     assemble,
     claim,
@@ -23,6 +23,7 @@ from composing.building import (
 )
 from composing.checks import check, check_replay, replay_ratio
 from composing.launching import launch
+from composing.learners import make_learner
 from composing.schema import SACRunConfig, register
 from omegaconf import DictConfig
 

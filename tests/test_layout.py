@@ -6,6 +6,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "dreamer_racing"
 
@@ -55,3 +57,61 @@ def test_circles_are_found():
 
 def test_no_module_imports_one_that_imports_it():
     assert [" → ".join(way) for way in circles({name: imported(name) for name in MODULES})] == []
+
+
+def functions(folder: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Every function of a folder's modules, with a name for messages."""
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                yield f"{path.relative_to(ROOT)}: {node.name}", node
+
+
+def length(function: ast.FunctionDef) -> int:
+    """Lines, without those of the docstring."""
+    docstring = ast.get_docstring(function, clean=False)
+    return function.end_lineno - function.lineno + 1 - (docstring.count("\n") + 1 if docstring else 0)
+
+
+@pytest.mark.parametrize("folder", ["dreamer_racing", "recipes"])
+def test_functions_are_short(folder):
+    """But for kernels, which warp compiles whole."""
+    lengths = {name: length(function) for name, function in functions(folder) if not name.endswith("make_kernels")}
+    assert {name: lines for name, lines in lengths.items() if lines > 60} == {}
+    assert sorted(lengths.values())[int(0.9 * len(lengths))] <= 24
+
+
+def test_few_plain_modules_stand_at_the_top():
+    top = {path.name for path in PACKAGE.glob("*.py")} - {"__init__.py"}
+    assert top == {"machine.py", "settings.py"}
+
+
+def test_recipes_are_what_a_person_starts():
+    for path in (ROOT / "recipes").glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert '\nif __name__ == "__main__":\n    main()\n' in text and "@hydra.main(" in text, path
+
+
+def is_setter(node: ast.AST) -> bool:
+    return any(
+        isinstance(mark, ast.Attribute) and mark.attr == "setter" for mark in getattr(node, "decorator_list", [])
+    )
+
+
+@pytest.mark.parametrize("folder", ["dreamer_racing", "recipes"])
+def test_every_module_and_all_that_is_public_says_what_it_is(folder):
+    """Public: without an underscore, in a module or in a public class; a setter says what its property does."""
+    silent = []
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        homes = [tree, *(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_")]
+        public = [node for home in homes for node in home.body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+        silent += [
+            f"{path.relative_to(ROOT)}: {getattr(node, 'name', 'module')}"
+            for node in (tree, *(node for node in public if node.name[0] != "_"))
+            if not ast.get_docstring(node)
+            and not any(
+                isinstance(d, ast.Attribute) and d.attr == "setter" for d in getattr(node, "decorator_list", [])
+            )
+        ]
+    assert silent == []

@@ -112,13 +112,8 @@ def load(
     track, parameters = load_track(track), load_preset(preset)
     if control_rate is not None:
         parameters = at_control_rate(parameters, control_rate)
-    if time_limit is None:
-        time_limit = EVALUATION_TIME if evaluation else EPISODE_TIME
-    episode_steps = round(time_limit / parameters.control_dt)
-    if episode_steps < 1:
-        raise ValueError(
-            f"time_limit={time_limit} s: at least one control step of {parameters.control_dt} s is needed."
-        )
+    default_time = EVALUATION_TIME if evaluation else EPISODE_TIME
+    episode_steps = _steps_of(default_time if time_limit is None else time_limit, parameters.control_dt)
     camera = camera or Camera()
     generator = torch.Generator()
     physics = make_physics(track, parameters, camera, generator)
@@ -134,6 +129,14 @@ def load(
     )
     # no time_limit here: control.Environment would give a crash in the last step the discount of a truncation
     return control.Environment(physics, task, control_timestep=parameters.control_dt, **(environment_kwargs or {}))
+
+
+def _steps_of(time_limit: float, control_dt: float) -> int:
+    """Return the control steps of an episode; refuse one without any."""
+    episode_steps = round(time_limit / control_dt)
+    if episode_steps < 1:
+        raise ValueError(f"time_limit={time_limit} s: at least one control step of {control_dt} s is needed.")
+    return episode_steps
 
 
 def make_physics(

@@ -117,35 +117,44 @@ class RaceWorlds:
             load_looks(looks),
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
-        episode_time = EVALUATION_TIME if evaluation else EPISODE_TIME
-        self.race = Race(
-            self.track,
-            num_envs,
-            weights=weights or RewardWeights(),
-            episode_steps=episode_steps or round(episode_time / self.parameters.control_dt),
-            laps=self.track.laps if evaluation else None,
-            control_dt=self.parameters.control_dt,
-            device=self.device,  # in float32: a micrometre is enough for gates, at half the time
-            miss_radius=0.0 if evaluation else miss_radius,
-        )
+        self.race = self._make_race(weights, episode_steps, miss_radius)
         self._vector = RaceVector(self.track, self.device, self.dtype)
-        if not 0.0 <= start_on_line <= 1.0:
-            raise ValueError(f"start_on_line={start_on_line}: a share of episodes lies between 0 and 1.")
-        self._starts = self._make_starts(start_beyond_gate, start_noise, 0.0 if evaluation else start_on_line)
-        memory = CrashMemory(num_envs, start_before_crash, self.parameters.control_dt, self.device, self.dtype)
-        self._crashes = memory if start_before_crash and not evaluation else None
+        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line)
+        self._crashes = self._make_crash_memory(start_before_crash)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
 
+    def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
+        """Make the rules, of training or of evaluation."""
+        episode_time = EVALUATION_TIME if self.evaluation else EPISODE_TIME
+        return Race(
+            self.track,
+            self.num_envs,
+            weights=weights or RewardWeights(),
+            episode_steps=episode_steps or round(episode_time / self.parameters.control_dt),
+            laps=self.track.laps if self.evaluation else None,
+            control_dt=self.parameters.control_dt,
+            device=self.device,  # in float32: a micrometre is enough for gates, at half the time
+            miss_radius=0.0 if self.evaluation else miss_radius,
+        )
+
     def _make_starts(self, beyond_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
+        if not 0.0 <= on_line <= 1.0:
+            raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
+        on_line = 0.0 if self.evaluation else on_line
         line = None
         if on_line:
             line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE)
         return StartSampler(
             self.track, self._generator, self.device, self.dtype, beyond_gate, noise, on_line=on_line, line=line
         )
+
+    def _make_crash_memory(self, share: float) -> CrashMemory | None:
+        """Make what lets training episodes begin before crashes, if any are to."""
+        memory = CrashMemory(self.num_envs, share, self.parameters.control_dt, self.device, self.dtype)
+        return memory if share and not self.evaluation else None
 
     @property
     def start_on_line(self) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -300,32 +300,22 @@ def make_replay(
         >>> replay.batch_size, len(replay)
         (16, 0)
     """
+    stream_length = _stream_length(capacity, num_envs, batch_length)
     if not 0.0 <= recent_share <= 1.0:
         raise ValueError(f"recent_share={recent_share}: a share lies between 0 and 1.")
     if not 0 <= held_out < num_envs:
         raise ValueError(f"held_out={held_out} of num_envs={num_envs} streams: at least one must be left to sample.")
-    stream_length = capacity // num_envs
-    if stream_length < batch_length:
-        raise ValueError(
-            f"capacity={capacity} gives each of num_envs={num_envs} streams {stream_length} records, less than one "
-            f"window of batch_length={batch_length}: the capacity must be at least {num_envs * batch_length}."
-        )
     slots = stream_length * num_envs
     if storage == "memmap":
         records = StreamMemmapStorage(slots, scratch_dir=scratch_dir, existsok=True)
     else:
         records = StreamTensorStorage(slots, device=storage_device or device)
     writer = StreamWriter(num_envs, stream_length)
+    recent = None if recent_records is None else recent_records // num_envs
     replay = StreamReplay(
         storage=records,
         writer=writer,
-        sampler=StreamSampler(
-            writer,
-            batch_length,
-            recent_share,
-            None if recent_records is None else recent_records // num_envs,
-            held_out,
-        ),
+        sampler=StreamSampler(writer, batch_length, recent_share, recent, held_out),
         generator=torch.Generator().manual_seed(seed),
         transform=transform,
         batch_size=batch_size,
@@ -335,9 +325,22 @@ def make_replay(
         prefetch=prefetch,
     )
     if records.device != torch.empty((), device=device).device:
-        # Copies from pinned memory do not wait for the device.
-        pinned = torch.device(device).type == "cuda" and records.device.type == "cpu"
-        replay.append_transform(
-            lambda sample: (sample.pin_memory() if pinned else sample).to(device, non_blocking=pinned)
-        )
+        replay.append_transform(_delivery(records.device, torch.device(device)))
     return replay
+
+
+def _stream_length(capacity: int, num_envs: int, batch_length: int) -> int:
+    """Return how many records each stream keeps; refuse streams that could not hold one window."""
+    stream_length = capacity // num_envs
+    if stream_length < batch_length:
+        raise ValueError(
+            f"capacity={capacity} gives each of num_envs={num_envs} streams {stream_length} records, less than one "
+            f"window of batch_length={batch_length}: the capacity must be at least {num_envs * batch_length}."
+        )
+    return stream_length
+
+
+def _delivery(kept_on: torch.device, device: torch.device) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return what brings samples to a device; copies from pinned memory do not wait for it."""
+    pinned = device.type == "cuda" and kept_on.type == "cpu"
+    return lambda sample: (sample.pin_memory() if pinned else sample).to(device, non_blocking=pinned)

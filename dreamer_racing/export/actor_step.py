@@ -261,19 +261,24 @@ def export_actor(
             "torch.export": TorchActor(full, torch.export.load(program).module()),
         }
         deviation = check_parity(actors, flight, seed)
-        full["verification"] = {
-            "steps": len(flight.observations),
-            "episodes": flight.episodes,
-            "action_deviation_max": deviation,
-            "action_deviation_allowed": ACTION_TOLERANCE,
-            "latent_flips": 0,
-        }
+        full["verification"] = _verification(flight, deviation)
         _write_json(partial / CONTRACT, full)
         for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return deviation
+
+
+def _verification(flight: Flight, deviation: dict[str, float]) -> dict[str, Any]:
+    """Return what the contract says about a comparison that was passed."""
+    return {
+        "steps": len(flight.observations),
+        "episodes": flight.episodes,
+        "action_deviation_max": deviation,
+        "action_deviation_allowed": ACTION_TOLERANCE,
+        "latent_flips": 0,
+    }
 
 
 def write_step(step: ActorStep, onnx: Path, program: Path) -> None:

@@ -480,7 +480,7 @@ def make_dreamer(
     decodes = find_loss(WORLD_MODEL_LOSSES, losses.world_model).decodes
     with seeded(seed):
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std).to(device)
-        modules = {name: loss.to(device) for name, loss in make_losses(agent, losses, horizon).items()}
+        modules = make_losses(agent, losses, horizon)
     return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
 
 

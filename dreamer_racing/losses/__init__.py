@@ -77,7 +77,7 @@ def find_loss(registry: Mapping[str, T], name: str) -> T:
 
 
 def make_losses(agent: Agent, config: LossConfig, horizon: int = 16) -> dict[str, LossModule]:
-    """Make the three losses of an agent, by their names.
+    """Make the three losses of an agent, by their names, on its device.
 
     Args:
         agent: The networks that they train; it must have decoders if the world model's loss ``decodes``.
@@ -90,12 +90,13 @@ def make_losses(agent: Agent, config: LossConfig, horizon: int = 16) -> dict[str
     Raises:
         ValueError: If there is no loss of a name.
     """
-    actor = find_loss(ACTOR_LOSSES, config.actor)
-    return {
+    device = next(agent.parameters()).device
+    losses = {
         "world_model": find_loss(WORLD_MODEL_LOSSES, config.world_model).from_config(agent, config),
-        "actor": actor.from_config(agent, config, horizon=horizon),
+        "actor": find_loss(ACTOR_LOSSES, config.actor).from_config(agent, config, horizon=horizon),
         "critic": find_loss(CRITIC_LOSSES, config.critic).from_config(agent, config),
     }
+    return {name: loss.to(device) for name, loss in losses.items()}
 
 
 __all__ = [

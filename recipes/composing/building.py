@@ -1,7 +1,7 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -36,7 +36,7 @@ from dreamer_racing.training.directory import RunDirectory, ensure_writable
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
-from dreamer_racing.training.run import Run
+from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
 
@@ -170,6 +170,24 @@ def make_run_replay(
     )
 
 
+def make_sequence_replay(
+    config: DreamerConfig, env: Environment, curriculum: BodyRateCurriculum | None, latents: LatentFormat | None
+) -> StreamReplay:
+    """Make the replay of a world model, with the latents beside its records if they are kept."""
+    asked = config.replay
+    return make_run_replay(
+        config,
+        env,
+        curriculum,
+        config.model.batch_size,
+        config.model.batch_length,
+        latents=latents,
+        recent_share=asked.recent_share,
+        recent_records=asked.recent_records,
+        held_out=asked.held_out,
+    )
+
+
 def claim(config: RunConfig) -> RunLock:
     """Take a run directory before anything large is made.
 
@@ -180,6 +198,21 @@ def claim(config: RunConfig) -> RunLock:
     lock = RunLock(ensure_writable(config.run_dir))
     refuse_to_replace(config)
     return lock
+
+
+def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
+    """Keep what a run is started with, beside it and beside its best checkpoint."""
+    for place in (directory, directory.best):
+        OmegaConf.save(OmegaConf.structured(config), place.config)
+    kept = [override for override in overrides if not override.startswith("resume=")]
+    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
+    directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
+
+
+def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Report:
+    """Make the evaluation of a run during training."""
+    asked = config.evaluation
+    return make_report(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
 
 def assemble(
@@ -221,11 +254,7 @@ def assemble(
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
-    for place in (directory, directory.best):
-        OmegaConf.save(OmegaConf.structured(config), place.config)
-    kept = [override for override in overrides if not override.startswith("resume=")]
-    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
-    directory.note_start(counters["env_steps"], kept, git_commit(Path(__file__).parent))
+    write_configuration(directory, config, overrides, counters["env_steps"])
     metrics = MetricsLog(
         directory.path,
         tensorboard=config.logger.tensorboard,
@@ -241,14 +270,7 @@ def assemble(
         tracker=tracker,
         curriculum=curriculum,
         learner=learner,
-        report=make_report(
-            config,
-            directory.path,
-            learner,
-            config.evaluation.episodes,
-            config.evaluation.video_steps,
-            config.evaluation.start_noise,
-        ),
+        report=make_run_report(config, directory.path, learner),
         metrics=metrics,
         checkpoints=checkpoints,
         best=best,

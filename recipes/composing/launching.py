@@ -3,17 +3,15 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import is_known, with_schema
 from composing.checks import check_overrides
 from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
-from composing.schema import RECIPES
+from composing.saved import begun_with, changed_settings, saved_config
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
@@ -89,54 +87,3 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
             )
     merged = merge_overrides([*begun_with(algorithm, run_dir), f"run_dir={run_dir}"], overrides)
     return hydra.compose(algorithm, merged), merged
-
-
-def begun_with(algorithm: str, run_dir: Path) -> list[str]:
-    """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
-    schema = OmegaConf.structured(RECIPES[algorithm])
-    overrides = [str(override) for override in OmegaConf.load(RunDirectory(run_dir).overrides)]
-    if "tuned" in schema and "tuned" not in OmegaConf.load(RunDirectory(run_dir).config):
-        overrides = merge_overrides(overrides, ["tuned=none"])  # begun before there was a choice
-    known = [override for override in overrides if is_known(override_key(override), schema)]
-    if unknown := [override for override in overrides if override not in known]:
-        print(f"overrides of another version, left out: {', '.join(unknown)}")
-    return [override for override in known if override_key(override) != "run_dir"]
-
-
-def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
-    """What a run was last trained with, resolved; what older runs do not say is at its default.
-
-    Raises:
-        ValueError: it is another algorithm's run.
-    """
-    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
-    trained_by = saved.get("algorithm", algorithm)
-    if trained_by != algorithm:
-        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    return with_schema(saved, algorithm)
-
-
-def changed_settings(config: DictConfig) -> list[str]:
-    """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
-    before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
-
-    def word(value: Any) -> str:
-        return "null" if value is None else str(value)
-
-    return [
-        f"{name}={word(value)} (was {word(before.get(name))})"
-        for name, value in flat_settings(config).items()
-        if value != before.get(name) and name not in ("resume", "run_dir")
-    ]
-
-
-def flat_settings(config: DictConfig) -> dict[str, Any]:
-    """Values by dotted name."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        name = str(key)
-        if isinstance(value, DictConfig):
-            flat |= {f"{name}.{inner}": leaf for inner, leaf in flat_settings(value).items()}
-        else:
-            flat[name] = value
-    return flat

@@ -1,22 +1,42 @@
 """What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
-from composing.arena import restore_learner, restore_shipped, trained_config
+from composing.arena import Environment, make_env
 from composing.command_line import choose_device
-from composing.schema import EvaluateConfig, PerceptionConfig, RunConfig, is_race
+from composing.learners import clock_times, make_learner, scheduled
+from composing.saved import trained_config
+from composing.schema import (
+    DreamerConfig,
+    EvaluateConfig,
+    PerceptionConfig,
+    RunConfig,
+    is_race,
+)
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.actor_step import ActorStep
 from dreamer_racing.export.contract import hash_weights
-from dreamer_racing.export.shipped_agent import AVERAGED, TRAINED, ShippedAgent, agents_in, choose_weights, is_agent
+from dreamer_racing.export.shipped_agent import (
+    AVERAGED,
+    TRAINED,
+    ShippedAgent,
+    agents_in,
+    choose_weights,
+    is_agent,
+    kept_weights,
+)
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.machine import command_line, provenance
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.checkpoint import load_components, load_state
 from dreamer_racing.training.directory import RunDirectory, ensure_writable, latest_checkpoint
+from dreamer_racing.training.pass_share import PassShare
 
 AGENTS = Path(__file__).parents[2] / "agents"
 """Where the agents that ship lie, each in a folder of its name."""
@@ -158,3 +178,50 @@ def heading(title: str, provenance: dict[str, Any]) -> str:
     facts = {name: value for name, value in provenance.items() if name != "command" and value is not None}
     text = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
     return f"# {title}\n\n```bash\n{provenance['command']}\n```\n\n{text}.\n"
+
+
+def restore_learner(
+    config: RunConfig, checkpoint: Path, device: torch.device, weights: str = "auto"
+) -> tuple[Learner, dict[str, int]]:
+    """Bring back the learner of a checkpoint of a run, and the run's counters.
+
+    Raises:
+        ValueError: the checkpoint does not have the weights asked for.
+    """
+    config.env.device = "cpu"  # wherever it was trained
+    chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
+    if isinstance(config, DreamerConfig):
+        config.model.compile = config.model.cuda_graph = False
+        config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
+    env = _probe(config)
+    interface = Interface.of(env)
+    env.close()
+    learner = make_learner(config, interface, device)
+    counters: dict[str, int] = {}
+    passes = PassShare()
+    parts = {"learner": learner, "counters": counters, "passes": passes}
+    load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
+    if isinstance(learner, DreamerLearner):
+        config = cast(DreamerConfig, config)
+        learner.adjust(**scheduled(config, clock_times(config, counters["env_steps"], passes)))
+    return learner, counters
+
+
+def restore_shipped(config: RunConfig, folder: Path, device: torch.device) -> ShippedAgent:
+    """Bring back an agent that ships, for the environment of its configuration.
+
+    Raises:
+        FileNotFoundError: a file of it is missing.
+        ValueError: it was trained in an environment of another camera or control rate.
+    """
+    config.env.device = "cpu"
+    env = _probe(config)
+    try:
+        return ShippedAgent.load(folder, cast(DroneRacingEnv, env), device)
+    finally:
+        env.close()
+
+
+def _probe(config: RunConfig) -> Environment:
+    """Make a single world, to look at what an agent sees in it."""
+    return make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # a line takes seconds

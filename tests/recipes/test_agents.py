@@ -158,19 +158,19 @@ def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monk
 
 @pytest.mark.slow
 def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path: Path) -> None:
-    arena = recipe_module("composing.arena")
+    restoring = recipe_module("composing.restoring")
     shutil.copytree(run_dir, tmp_path / "run")
     checkpoint = latest_checkpoint(tmp_path / "run")
     (path,) = checkpoint.glob("components/*-learner/state.pt")
     state = torch.load(path, weights_only=True)
     assert state.pop("averaged")
     torch.save(state, path)
-    config, cpu = arena.trained_config(tmp_path / "run"), torch.device("cpu")
+    config, cpu = restoring.trained_config(tmp_path / "run"), torch.device("cpu")
     with pytest.raises(ValueError, match=f"weights=averaged: {checkpoint} holds the trained weights only"):
-        arena.restore_learner(config, checkpoint, cpu, "averaged")
-    assert arena.restore_learner(config, checkpoint, cpu)[0].averaged is None
-    assert arena.restore_learner(config, latest_checkpoint(run_dir), cpu)[0].averaged is not None
-    assert arena.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
+        restoring.restore_learner(config, checkpoint, cpu, "averaged")
+    assert restoring.restore_learner(config, checkpoint, cpu)[0].averaged is None
+    assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu)[0].averaged is not None
+    assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
 
 
 def test_the_agents_that_ship_are_whole_and_small() -> None:

@@ -551,7 +551,7 @@ def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:
 
 def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
     saved = OmegaConf.create({"algorithm": "dreamer_v3", "model": {"size": "debug", "decay_updates": 8}, "old": 1})
-    config = recipe_module("composing.arena").with_schema(saved, "dreamer_v3")
+    config = recipe_module("composing.saved").with_schema(saved, "dreamer_v3")
     assert config.model.size == "debug" and "decay_updates" not in config.model
     assert "settings of another version, left out: old=1, model.decay_updates=8" in capsys.readouterr().out
 

@@ -1,0 +1,102 @@
+"""Configurations of runs, read back: typed as this version knows them, and compared."""
+
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from composing.command_line import merge_overrides, override_key
+from composing.schema import RECIPES, DreamerConfig, RunConfig
+from dreamer_racing.training.directory import RunDirectory
+
+
+def trained_config(run_dir: Path) -> RunConfig:
+    """Read back the configuration that a run was trained with.
+
+    Raises:
+        ValueError: by an unknown algorithm.
+    """
+    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
+    algorithm = saved.get("algorithm", DreamerConfig.algorithm)
+    if algorithm not in RECIPES:
+        raise ValueError(f"{RunDirectory(run_dir).config}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
+    return cast(RunConfig, OmegaConf.to_object(with_schema(saved, algorithm)))
+
+
+def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
+    """Type a saved configuration: what it does not say is at its default, what is unknown here is left out."""
+    schema = OmegaConf.structured(RECIPES[algorithm])
+    if unknown := drop_unknown(saved, schema):
+        print(f"settings of another version, left out: {', '.join(unknown)}")
+    return cast(DictConfig, OmegaConf.merge(schema, saved))
+
+
+def is_known(name: str, schema: DictConfig) -> bool:
+    """Whether a schema has a setting or a group of this dotted name."""
+    first, _, rest = name.partition(".")
+    if first not in set(schema.keys()):
+        return False
+    inner = schema._get_node(first)
+    return not rest or (isinstance(inner, DictConfig) and is_known(rest, inner))
+
+
+def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> list[str]:
+    """Remove from a saved configuration what a schema does not have; return `name=value` of each."""
+    unknown = [name for name in map(str, saved) if name not in set(schema.keys())]  # `in` overlooks what is missing
+    dropped = [f"{prefix}{name}={saved.pop(name)}" for name in unknown]
+    for name in map(str, saved):
+        inner, known = saved[name], schema._get_node(name)
+        if isinstance(inner, DictConfig) and isinstance(known, DictConfig):
+            dropped += drop_unknown(inner, known, f"{prefix}{name}.")
+    return dropped
+
+
+def begun_with(algorithm: str, run_dir: Path) -> list[str]:
+    """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
+    schema = OmegaConf.structured(RECIPES[algorithm])
+    overrides = [str(override) for override in OmegaConf.load(RunDirectory(run_dir).overrides)]
+    if "tuned" in schema and "tuned" not in OmegaConf.load(RunDirectory(run_dir).config):
+        overrides = merge_overrides(overrides, ["tuned=none"])  # begun before there was a choice
+    known = [override for override in overrides if is_known(override_key(override), schema)]
+    if unknown := [override for override in overrides if override not in known]:
+        print(f"overrides of another version, left out: {', '.join(unknown)}")
+    return [override for override in known if override_key(override) != "run_dir"]
+
+
+def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
+    """What a run was last trained with, resolved; what older runs do not say is at its default.
+
+    Raises:
+        ValueError: it is another algorithm's run.
+    """
+    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
+    trained_by = saved.get("algorithm", algorithm)
+    if trained_by != algorithm:
+        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
+    return with_schema(saved, algorithm)
+
+
+def changed_settings(config: DictConfig) -> list[str]:
+    """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
+    before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
+
+    def word(value: Any) -> str:
+        return "null" if value is None else str(value)
+
+    return [
+        f"{name}={word(value)} (was {word(before.get(name))})"
+        for name, value in flat_settings(config).items()
+        if value != before.get(name) and name not in ("resume", "run_dir")
+    ]
+
+
+def flat_settings(config: DictConfig) -> dict[str, Any]:
+    """Values by dotted name."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = str(key)
+        if isinstance(value, DictConfig):
+            flat |= {f"{name}.{inner}": leaf for inner, leaf in flat_settings(value).items()}
+        else:
+            flat[name] = value
+    return flat
