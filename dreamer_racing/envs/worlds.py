@@ -49,6 +49,7 @@ class RaceWorlds:
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
+        line_spread: of the noise around that line, as a multiple of its own; see `StartSampler`.
         start_before_crash: share of training episodes that begin where an earlier one was 0.4-2 s before its crash; see
             `CrashMemory`.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
@@ -87,6 +88,7 @@ class RaceWorlds:
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
         start_on_line: float = 0.0,
+        line_spread: float = 1.0,
         start_before_crash: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
@@ -119,7 +121,7 @@ class RaceWorlds:
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
         self._vector = RaceVector(self.track, self.device, self.dtype)
-        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line)
+        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line, line_spread)
         self._crashes = self._make_crash_memory(start_before_crash)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
@@ -139,7 +141,7 @@ class RaceWorlds:
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
 
-    def _make_starts(self, beyond_gate: float, noise: float, on_line: float) -> StartSampler:
+    def _make_starts(self, beyond_gate: float, noise: float, on_line: float, line_spread: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
         if not 0.0 <= on_line <= 1.0:
             raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
@@ -148,7 +150,15 @@ class RaceWorlds:
         if on_line:
             line = plan_racing_line(self.track, without_randomisation(self.parameters), START_LINE)
         return StartSampler(
-            self.track, self._generator, self.device, self.dtype, beyond_gate, noise, on_line=on_line, line=line
+            self.track,
+            self._generator,
+            self.device,
+            self.dtype,
+            beyond_gate,
+            noise,
+            on_line=on_line,
+            line=line,
+            line_spread=line_spread,
         )
 
     def _make_crash_memory(self, share: float) -> CrashMemory | None:

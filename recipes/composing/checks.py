@@ -27,6 +27,7 @@ RACE_ONLY = {
     "env.control_rate": 50.0,
     "env.start_beyond_gate": 0.0,
     "env.start_on_line": 0.0,
+    "env.line_spread": 1.0,
     "env.start_before_crash": 0.0,
     "env.miss_radius": 0.0,
     "evaluation.start_noise": 0.0,

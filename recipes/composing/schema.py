@@ -28,6 +28,7 @@ class EnvConfig:
     episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
     # share of training episodes that begin behind a gate, to practise turns
     start_beyond_gate: float = setting(0.0, SHARE)
+    line_spread: float = setting(1.0, COUNT)  # of the noise around that line, as a multiple of its own
     start_before_crash: float = setting(0.0, SHARE)  # share that begin 0.4-2 s before the crash of an earlier one
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
