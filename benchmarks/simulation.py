@@ -3,7 +3,7 @@
     python benchmarks/simulation.py --json results/simulation.json         # this machine's CPU
     python benchmarks/simulation.py --device cuda --json results/simulation_cuda.json
     python benchmarks/simulation.py --peers --json results/simulation_peers.json
-    python benchmarks/simulation.py --readme results/simulation*.json       # no measuring: README's table
+    python benchmarks/simulation.py --page results/simulation*.json         # no measuring: the table of docs/benchmarks.md
 
 Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
 (physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
@@ -58,7 +58,7 @@ MILLISECONDS = tuple(f"{part}_ms" for part in (*PARTS, "torchrl"))
 COLUMNS = ("images", "num_envs", *MODES, "lost", "least", "actor_lost", *MILLISECONDS, "memory_gib")
 ROLLOUT = 16  # control steps in a batch
 TURNS = 5
-README = Path(__file__).parent.parent / "README.md"
+PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
 NAMES = {
     "none": "none", "egl": "EGL (Mesa, in software)", "osmesa": "OSMesa", "warp": "ray caster, no OpenGL library",
@@ -67,7 +67,7 @@ NAMES = {
 
 
 def main() -> None:
-    """Measure every combination asked for, or write README's table."""
+    """Measure every combination asked for, or write the table of the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--track", default="kidney")
@@ -79,11 +79,13 @@ def main() -> None:
     parser.add_argument("--actor", help="size of the DreamerV3 policy; default: cpu_small, on cuda size12m")
     parser.add_argument("--seconds", type=float, default=1.5, help="least time of a measurement")
     parser.add_argument("--peers", action="store_true", help="measure the peers that are installed instead")
-    parser.add_argument("--readme", nargs="*", metavar="JSON", help="write README's table from these results")
+    parser.add_argument(
+        "--page", nargs="*", metavar="JSON", help="write the table of docs/benchmarks.md from these results"
+    )
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    if arguments.readme is not None:
-        write_readme(arguments.readme)
+    if arguments.page is not None:
+        write_page(arguments.page)
         return
     records = []
     for job, *details in peer_jobs(arguments) if arguments.peers else jobs(arguments):
@@ -365,11 +367,11 @@ def crazyflow(name: str, track: str, preset: str, seconds: float, num_envs: int 
     return peer_record(name, num_envs, speed(steps, ROLLOUT * num_envs, seconds))
 
 
-# --- README ---
+# --- docs/benchmarks.md ---
 
 
-def write_readme(paths: list[str]) -> None:
-    """Replace README's table by the best N of each kind of images, from stored results."""
+def write_page(paths: list[str]) -> None:
+    """Replace the page's table by the best N of each kind of images, from stored results."""
     records = [record for path in paths for record in json.loads(Path(path).read_text())]
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for record in records:
@@ -389,9 +391,9 @@ def write_readme(paths: list[str]) -> None:
         speeds = f"**{record['collector']:,.0f}** | {record['worlds']:,.0f} | {record['actor']:,.0f}"
         name = NAMES.get(images, images) + (", CUDA" if images == "none" and device == "cuda" else "")
         lines.append(f"| {name} | {record['num_envs']} | {speeds} | {parts} |")
-    before, _, rest = README.read_text().partition(BEGIN)
+    before, _, rest = PAGE.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
-    README.write_text("\n".join((before + BEGIN, *lines, END + after)))
+    PAGE.write_text("\n".join((before + BEGIN, *lines, END + after)))
 
 
 if __name__ == "__main__":

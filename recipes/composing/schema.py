@@ -28,10 +28,10 @@ class EnvConfig:
     episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
     # share of training episodes that begin behind a gate, to practise turns
     start_beyond_gate: float = setting(0.0, SHARE)
-    line_spread: float = setting(1.0, COUNT)  # of the noise around that line, as a multiple of its own
-    start_before_crash: float = setting(0.0, SHARE)  # share that begin 0.4-2 s before the crash of an earlier one
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
+    line_spread: float = setting(1.0, COUNT)  # of the noise around that line, as a multiple of its own
+    start_before_crash: float = setting(0.0, SHARE)  # share that begin 0.4-2 s before the crash of an earlier one
     # m; training episodes end where a gate is missed by less than this; 0: they go on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's

@@ -1,0 +1,59 @@
+"""Pages: made ones are up to date, and links between them lead somewhere."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").glob("*.md")]
+
+
+def anchors(page: Path) -> set[str]:
+    """Of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
+    kept = (
+        "".join(letter for letter in heading.lower() if letter.isalnum() or letter in " -_") for heading in headings
+    )
+    return {heading.replace(" ", "-") for heading in kept}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("http"):
+            continue
+        file, _, anchor = target.partition("#")
+        found = (page.parent / file).resolve() if file else page
+        assert found.exists(), target
+        assert not anchor or found.suffix != ".md" or anchor in anchors(found), target
+
+
+def test_the_page_of_options_is_up_to_date():
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        options = importlib.import_module("options")
+    finally:
+        sys.path.pop(0)
+    assert options.PAGE.read_text(encoding="utf-8") == options.make_page(), "run python docs/options.py"
+
+
+def test_comments_and_attributes_are_read():
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        options = importlib.import_module("options")
+    finally:
+        sys.path.pop(0)
+    source = '    a: int = 1  # of a\n    # of b,\n    # and more\n    b: str = "x"\n    c: float = 2.0\n'
+    assert options.of_comments(source) == {"a": "of a", "b": "of b, and more"}
+    docstring = "Says.\n\nAttributes:\n    a: Of a,\n        and more.\n    b: Of b.\n\nReference: none."
+    assert options.of_attributes(docstring) == {"a": "Of a, and more.", "b": "Of b."}
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 180
