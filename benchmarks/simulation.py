@@ -3,7 +3,7 @@
     python benchmarks/simulation.py --json results/simulation.json         # this machine's CPU
     python benchmarks/simulation.py --device cuda --json results/simulation_cuda.json
     python benchmarks/simulation.py --peers --json results/simulation_peers.json
-    python benchmarks/simulation.py --page results/simulation*.json         # no measuring: the table of docs/benchmarks.md
+    python benchmarks/simulation.py --page results/simulation*.json     # no measuring: writes docs/benchmarks.md
 
 Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
 (physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:

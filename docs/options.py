@@ -38,9 +38,9 @@ OTHERS = (
 HEAD = """# Options
 
 Made by `python docs/options.py` from [recipes/composing/schema.py](../recipes/composing/schema.py): change that, not
-this page. Options are [hydra](https://hydra.cc) overrides, `env.num_envs=64` or, for a whole group, `model=size12m`; the
-groups are the folders of [recipes/config](../recipes/config). What is "chosen" is settled by the recipe when it starts,
-by device, size or budget, and printed. A wrong name, type or value is refused with the field named.
+this page. Options are [hydra](https://hydra.cc) overrides, `env.num_envs=64` or, for a whole group, `model=size12m`;
+the groups are the folders of [recipes/config](../recipes/config). What is "chosen" is settled by the recipe when it
+starts, by device, size or budget, and printed. A wrong name, type or value is refused with the field named.
 """
 
 
