@@ -360,7 +360,7 @@ class DroneRace(base.Task):
     def get_reward(self, physics: Physics) -> float:
         """Eq. 1 with today's b₂."""
         assert self.outcome is not None, "there is no reward before the first step"
-        return (self.outcome.reward_base - self.body_rate_weight * self.outcome.body_rate_norm).item()
+        return self.outcome.reward(self.body_rate_weight).item()
 
     def get_termination(self, physics: Physics) -> float | None:
         """Discount of the episode's end: 0 after a crash, 1 out of time or finished; None while it goes on."""

@@ -20,7 +20,7 @@ both. Shapes: N environments.
 """
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -36,7 +36,7 @@ from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions
 
 OBSERVATIONS = ("pixels", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
@@ -63,7 +63,8 @@ class GymWorlds:
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
-        worlds: further arguments of `RaceWorlds`.
+        preset: physics preset or parameters.
+        worlds: further arguments of `RaceWorlds`, see `WorldOptions`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -78,20 +79,22 @@ class GymWorlds:
         privileged: bool,
         body_rate_weight: float | None,
         render_mode: str | None,
-        worlds: dict[str, Any],
+        preset: str | QuadrotorParameters,
+        worlds: WorldOptions,
     ) -> None:
         if observation not in OBSERVATIONS:
             raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
-        if torch.device(worlds.get("device", "cpu")).type != "cpu":
+        device = worlds.get("device", "cpu")
+        if torch.device(device).type != "cpu":
             raise ValueError(
-                f"device={worlds['device']!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
+                f"device={device!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
             )
         self.observation = observation
         self.privileged = privileged
         self.renderer_name = worlds.get("renderer", "auto")
-        self.worlds = RaceWorlds(track, num_envs, from_pixels=observation in ("pixels", "both"), **worlds)
+        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=observation in ("pixels", "both"), **worlds)
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
@@ -124,7 +127,7 @@ class GymWorlds:
     def step(self, actions: Any) -> tuple[RaceStep, np.ndarray]:
         """Fly one control step; return what it did and the rewards (N,)."""
         outcome = self.worlds.step(torch.as_tensor(np.asarray(actions, np.float64)))
-        return outcome, (outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm).numpy()
+        return outcome, outcome.reward(self.body_rate_weight).numpy()
 
     def observe(self, mask: np.ndarray | None = None) -> Observation:
         """The observations of all environments, or of the M masked ones (N,) bool in order."""
@@ -219,10 +222,9 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: bool = False,
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
-        **worlds: Any,
+        **worlds: Unpack[WorldOptions],
     ) -> None:
-        worlds["preset"] = preset
-        self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.render_mode = render_mode
         self.action_space = self.race.action_space()
@@ -315,12 +317,11 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
         max_episode_steps: int | None = None,
-        **worlds: Any,
+        **worlds: Unpack[WorldOptions],
     ) -> None:
-        worlds["preset"] = preset
         if max_episode_steps is not None:
-            worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps", max_episode_steps))
-        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, worlds)
+            worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps") or max_episode_steps)
+        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.num_envs = num_envs
         self.render_mode = render_mode

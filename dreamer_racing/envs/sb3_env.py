@@ -5,7 +5,7 @@ package's own dependencies: `pip install -e '.[sb3]'`. Shapes: N environments.
 """
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.envs.worlds import WorldOptions
 
 _ONE_OBJECT = (
     "the drones of DroneRaceVecEnv share one object, so that there is none to each. Arguments go to its constructor; "
@@ -59,10 +60,9 @@ class DroneRaceVecEnv(VecEnv):
         privileged: bool = False,
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
-        **worlds: Any,
+        **worlds: Unpack[WorldOptions],
     ) -> None:
-        worlds["preset"] = preset
-        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, worlds)
+        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         self.render_mode = render_mode
         self._actions = np.zeros((num_envs, *self.race.action_space().shape), np.float32)
         super().__init__(num_envs, self.race.observation_space(), self.race.action_space())

@@ -4,7 +4,7 @@ Keys, shapes and units: `docs/architecture.md`. Shapes: N environments.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +16,7 @@ from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator import check_device
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds
 
 
 class DroneRacingEnv(EnvBase):
@@ -30,9 +30,7 @@ class DroneRacingEnv(EnvBase):
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and of the randomisation of physics and looks.
-        worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `looks`, `num_threads`, `backend`, `start_beyond_gate`, `start_noise`, `start_on_line`,
-            `start_before_crash`, `miss_radius`, `control_rate`.
+        worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.
@@ -52,7 +50,7 @@ class DroneRacingEnv(EnvBase):
         privileged: bool = True,
         preset: str | QuadrotorParameters = "easy",
         seed: int | None = None,
-        **worlds: Any,
+        **worlds: Unpack[RaceOptions],
     ) -> None:
         check_device(device)  # before TorchRL, which would fail with torch's own words
         super().__init__(device=device, batch_size=[num_envs])
@@ -122,7 +120,7 @@ class DroneRacingEnv(EnvBase):
             "reward_base": self._column(outcome.reward_base),
             "body_rate_norm": self._column(outcome.body_rate_norm),
             "race": self._group({name: self._column(getattr(outcome, name)) for name in names}),
-            "reward": self._column(outcome.reward_base - self.body_rate_weight * outcome.body_rate_norm),
+            "reward": self._column(outcome.reward(self.body_rate_weight)),
             "done": self._column(outcome.terminated | outcome.truncated),
             "terminated": self._column(outcome.terminated),
             "truncated": self._column(outcome.truncated),

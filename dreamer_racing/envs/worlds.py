@@ -5,7 +5,7 @@ The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: 
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -26,6 +26,33 @@ from dreamer_racing.envs.tracks import Track, load_track
 ACTION_SIZE = 4
 START_LINE = LineLimits(speed=0.7)
 """Of the line on which training episodes begin: tame enough to fly on from with noise [choice]."""
+
+
+class RaceOptions(TypedDict, total=False):
+    """Arguments of `RaceWorlds`, which says what they mean, that every environment made of it takes and hands on."""
+
+    evaluation: bool
+    episode_steps: int | None
+    weights: RewardWeights | None
+    renderer: str
+    camera: Camera | None
+    looks: str | LooksRandomisation | None
+    num_threads: int | None
+    backend: str
+    start_beyond_gate: float
+    start_on_line: float
+    line_spread: float
+    start_before_crash: float
+    start_noise: float
+    miss_radius: float
+    control_rate: float | None
+
+
+class WorldOptions(RaceOptions, total=False):
+    """Those, where an environment has no `device` and `seed` of its own."""
+
+    device: torch.device | str
+    seed: int | None
 
 
 class RaceWorlds:

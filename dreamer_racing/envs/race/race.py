@@ -48,6 +48,10 @@ class RaceStep:
     target_gate: torch.Tensor
     """int64: the gate to pass next, after this step."""
 
+    def reward(self, body_rate_weight: float) -> torch.Tensor:
+        """Return the reward (N,) with a weight b₂ of the body rates. Reference: paper, Eq. 1."""
+        return self.reward_base - body_rate_weight * self.body_rate_norm
+
 
 class Race:
     """Keeps the episode of each of N drones.
