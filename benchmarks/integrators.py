@@ -12,8 +12,8 @@ The scripted pilot's actions of 2 s at racing speed on every track are replayed 
 Variants: `plain` is an explicit step: the loop takes the rates at its beginning, the thrust is that of the motors'
 speed at its end, in the direction of its middle. `+position` and `+pose` bring MuJoCo's x' = x + dt v' to the
 trapezoidal rule after each step (position only; attitude too). `midpoint` is what the package does: `Quadrotor.wrench`
-is of the middle of the step, and unless the integrator is RK4, `Flight` corrects torque and pose. Columns in mm are the
-greatest position error over all tracks.
+is of the middle of the step, and unless the integrator is RK4, `RigidStep` corrects torque and pose. Columns in mm are
+the greatest position error over all tracks.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
-from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import turn
 from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.simulator.scene import build_drone
@@ -69,7 +69,7 @@ class Drones:
         batch = Batch(build_drone(self.parameters).compile(), num, min(2, num))
         self.qpos, self.qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         corrected = None if midpoint else False
-        self._flight = Flight(self.quadrotor, self.qpos, self.qvel, force, batch.step, corrected)
+        self._flight = RigidStep(self.quadrotor, self.qpos, self.qvel, force, batch.step, corrected)
         self._variant = variant
 
     def wrench(self, index: int) -> Tensor:

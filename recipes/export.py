@@ -39,7 +39,7 @@ from dreamer_racing.export.actor_step import (
 )
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, measure_latency, read_contract
-from dreamer_racing.export.parity import Flight, ParityError, TorchActor, episode_steps, record_flight
+from dreamer_racing.export.parity import ParityError, RecordedFlight, TorchActor, episode_steps, record_flight
 from dreamer_racing.export.shipped_agent import (
     ACTOR,
     AGENT,
@@ -102,7 +102,9 @@ def export(config: ExportConfig) -> None:
     print(f"written to {output.parent}: {', '.join(names)} ({size / 1e6:.2f} MB)")
 
 
-def prepare(config: ExportConfig, trained: DreamerConfig, checkpoint: Path) -> tuple[ActorStep, dict[str, Any], Flight]:
+def prepare(
+    config: ExportConfig, trained: DreamerConfig, checkpoint: Path
+) -> tuple[ActorStep, dict[str, Any], RecordedFlight]:
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
         num_envs=1,
@@ -236,7 +238,7 @@ def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> 
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def measure(step: ActorStep, flight: Flight, output: Path) -> None:
+def measure(step: ActorStep, flight: RecordedFlight, output: Path) -> None:
     """Print how long one step takes, with one thread."""
     contract = read_contract(output.parent / CONTRACT)
     for name, actor in (("onnxruntime", OnnxActor(output)), ("torch", TorchActor(contract, step))):

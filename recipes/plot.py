@@ -24,7 +24,7 @@ from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
 from dreamer_racing.figures.film import dream_video, write_gif, write_video
-from dreamer_racing.figures.flights import PROFILE_AXES, Flight, plot_dreams, plot_flights
+from dreamer_racing.figures.flights import PROFILE_AXES, NamedFlight, plot_dreams, plot_flights
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.runs import (
     RunData,
@@ -195,7 +195,7 @@ def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], pro
     return Drawn(["trajectories.png"], missing)
 
 
-def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[Flight]:
+def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[NamedFlight]:
     """Read the last or the best flight of the first seed of each curve; of those that cannot be read, the next one.
 
     Args:
@@ -219,11 +219,11 @@ def stored_flights(run: RunData, which: str) -> list[Path]:
     return [files[env_steps] for env_steps in order]
 
 
-def named_flight(file: str | Path) -> Flight:
+def named_flight(file: str | Path) -> NamedFlight:
     """Read a flight with its track; the run's and the evaluation's names are its title."""
     trajectory, track = read_trajectory(file)
     run = RunDirectory.of(Path(file).absolute()).path.name
-    return Flight(f"{run}, {stage_name(file)}", load_track(track), trajectory)
+    return NamedFlight(f"{run}, {stage_name(file)}", load_track(track), trajectory)
 
 
 def stage_name(file: str | Path) -> str:

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from dreamer_racing.evaluation.evaluate import Trajectory
     from dreamer_racing.learners.dreamer import DreamerLearner
 
-CONTEXT, PREDICTED = 3, 10  # stored frames: those that the model has seen, then those that it predicts on its own
+SEEN_FRAMES, PREDICTED_FRAMES = (
+    3,
+    10,
+)  # stored frames: those that the model has seen, then those that it predicts on its own
 STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
 
 
@@ -85,9 +88,11 @@ def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int =
         The dream; None if there is no image decoder or the flight is too short.
     """
     pixels = trajectory.pixels
-    if learner.agent.world_model.decoder is None or pixels is None or len(pixels) <= CONTEXT * STRIDE:
+    if learner.agent.world_model.decoder is None or pixels is None or len(pixels) <= SEEN_FRAMES * STRIDE:
         return None
-    length = STRIDE * min(CONTEXT + PREDICTED - 1, (len(pixels) - 1) // STRIDE) + 1  # ends with a stored frame
+    length = (
+        STRIDE * min(SEEN_FRAMES + PREDICTED_FRAMES - 1, (len(pixels) - 1) // STRIDE) + 1
+    )  # ends with a stored frame
     starts = sorted({int(start) for start in np.linspace(0, len(pixels) - length, windows + 1)[:-1]})
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
     parts = [slice(start, start + length) for start in starts]
@@ -99,13 +104,13 @@ def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int =
         batch_size=real.shape[:2],
     )
     reconstructed = learner.open_loop(batch, length).cpu()
-    seen = STRIDE * (CONTEXT - 1) + 1
+    seen = STRIDE * (SEEN_FRAMES - 1) + 1
     imagined = learner.open_loop(batch, seen).cpu()
     imagined[:, :seen] = reconstructed[:, :seen]  # rather than another sample of the same latents
     return Dream(
         real=real[:, ::STRIDE].numpy(),
         reconstructed=reconstructed[:, ::STRIDE].numpy(),
         imagined=imagined[:, ::STRIDE].numpy(),
-        context=CONTEXT,
+        context=SEEN_FRAMES,
         frame_dt=STRIDE * trajectory.control_dt,
     )

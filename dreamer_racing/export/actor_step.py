@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
-from dreamer_racing.export.parity import ACTION_TOLERANCE, Flight, TorchActor, check_parity, check_steps
+from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights
 from dreamer_racing.modules import join_features
 from dreamer_racing.modules.agent import Agent
@@ -216,7 +216,7 @@ def check_output(output: str | Path) -> Path:
 def export_actor(
     step: ActorStep,
     contract: Mapping[str, Any],
-    flight: Flight,
+    flight: RecordedFlight,
     output: str | Path,
     seed: int = 0,
     shared_weights: bool = False,
@@ -270,7 +270,7 @@ def export_actor(
     return deviation
 
 
-def _verification(flight: Flight, deviation: dict[str, float]) -> dict[str, Any]:
+def _verification(flight: RecordedFlight, deviation: dict[str, float]) -> dict[str, Any]:
     """Return what the contract says about a comparison that was passed."""
     return {
         "steps": len(flight.observations),

@@ -33,7 +33,7 @@ class ParityError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Flight:
+class RecordedFlight:
     """A recorded flight of T steps.
 
     Attributes:
@@ -53,7 +53,7 @@ class Flight:
 
 
 @torch.no_grad()
-def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> Flight:
+def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlight:
     """Fly the deterministic policy in an environment of one drone and keep what it sees.
 
     Args:
@@ -76,7 +76,7 @@ def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> Flight:
         for name in names:
             rows[name].append(flown[name][0].numpy().copy())
     observations, is_init, actions = (np.stack(rows[name]) for name in names)
-    return Flight(observations, is_init[:, 0], actions)
+    return RecordedFlight(observations, is_init[:, 0], actions)
 
 
 def episode_steps(steps: int) -> int:
@@ -119,7 +119,7 @@ class TorchActor(RecurrentActor):
         return [output.numpy() for output in self._step(*(torch.tensor(feed[name]) for name in self._shapes))]
 
 
-def check_parity(actors: Mapping[str, RecurrentActor], flight: Flight, seed: int = 0) -> dict[str, float]:
+def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, seed: int = 0) -> dict[str, float]:
     """Fly actors through a recorded flight, each carrying its own state, and compare them with the first.
 
     Args:
@@ -147,7 +147,7 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: Flight, seed: int
         raise ParityError(f"{error} {hint}") from None
 
 
-def _replay(actor: RecurrentActor, flight: Flight, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def _replay(actor: RecurrentActor, flight: RecordedFlight, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the actions (T, A) and the class of every latent (T, L)."""
     actions, classes = [], []
     for index, observation in enumerate(flight.observations):

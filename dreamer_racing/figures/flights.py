@@ -42,7 +42,7 @@ TITLE_ROOM = 0.35  # inches above the panels
 PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
 
 
-class Flight(NamedTuple):
+class NamedFlight(NamedTuple):
     """A recorded episode and what it is to be called."""
 
     title: str
@@ -51,7 +51,7 @@ class Flight(NamedTuple):
 
 
 def plot_flights(
-    flights: Sequence[Flight],
+    flights: Sequence[NamedFlight],
     path: str | Path,
     over: str = "distance",
     columns: int = 3,
@@ -110,7 +110,7 @@ def _proportion(track: Track) -> float:
     return depth / width
 
 
-def _outcome(flight: Flight) -> str:
+def _outcome(flight: NamedFlight) -> str:
     seconds = len(flight.trajectory.action) * flight.trajectory.control_dt
     gates = int((np.diff(flight.trajectory.target_gate) != 0).sum())
     outcome = (flight.trajectory.outcome or "recording stopped").replace("_", " ")

@@ -23,7 +23,7 @@ from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer
 from dreamer_racing.training.directory import RunDirectory
 
-CONTEXT, DREAM = 10, 40  # control steps the model sees, then predicts on its own, in the video
+SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps the model sees, then predicts on its own, in the video
 
 
 class EvaluationReport:
@@ -200,10 +200,10 @@ def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_ste
     is_init = torch.zeros(len(pixels), 1, dtype=torch.bool)
     is_init[0] = True
     shown = []
-    for start in range(0, len(pixels), CONTEXT + DREAM):
-        part = slice(start, start + CONTEXT + DREAM)
+    for start in range(0, len(pixels), SEEN_STEPS + DREAMT_STEPS):
+        part = slice(start, start + SEEN_STEPS + DREAMT_STEPS)
         window = {"pixels": pixels[part], "previous_action": action[part], "is_init": is_init[part]}
         batch = TensorDict({key: value.unsqueeze(0) for key, value in window.items()}, [1, len(pixels[part])])
-        dream = learner.open_loop(batch, min(CONTEXT, batch.shape[1]))[0].cpu()
-        shown.append(torch.as_tensor(side_by_side(pixels[part], dream, CONTEXT)))
+        dream = learner.open_loop(batch, min(SEEN_STEPS, batch.shape[1]))[0].cpu()
+        shown.append(torch.as_tensor(side_by_side(pixels[part], dream, SEEN_STEPS)))
     return torch.cat(shown)

@@ -33,8 +33,8 @@ from dreamer_racing.export.actor_step import (
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.parity import (
     MIN_STEPS,
-    Flight,
     ParityError,
+    RecordedFlight,
     TorchActor,
     check_parity,
     episode_steps,
@@ -72,7 +72,7 @@ def contract_of(step: ActorStep) -> dict:
     return make_contract(step, PRESETS["easy"], Camera(), checkpoint="checkpoint-1", track="circle", preset="easy")
 
 
-def make_flight(agent: Agent, steps: int = MIN_STEPS) -> Flight:
+def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
     """Observations that nobody flew, with a reset in every 40 steps and two next to each other."""
     random = np.random.default_rng(0)
     interface = agent.interface
@@ -83,7 +83,7 @@ def make_flight(agent: Agent, steps: int = MIN_STEPS) -> Flight:
     )
     is_init = np.arange(steps) % 40 == 0
     is_init[121] = True
-    return Flight(observations, is_init, np.zeros((steps, interface.action_dim), np.float32))
+    return RecordedFlight(observations, is_init, np.zeros((steps, interface.action_dim), np.float32))
 
 
 @pytest.fixture(scope="module")

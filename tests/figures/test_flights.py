@@ -12,12 +12,12 @@ import torch
 from PIL import Image
 
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.dreams import CONTEXT, PREDICTED, STRIDE, Dream, record_dream
+from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, STRIDE, Dream, record_dream
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.evaluation.trajectory import read_trajectory, write_trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
-from dreamer_racing.figures.flights import Flight, plot_dreams, plot_flights, profile_axis
+from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights, profile_axis
 
 
 def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool = False) -> Trajectory:
@@ -90,14 +90,16 @@ DREAMER = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(deco
 def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
     flight = random_flight(steps=100, pixels=True)
     dream = record_dream(DREAMER, flight, windows=2)
-    assert dream is not None and dream.real.shape == (2, CONTEXT + PREDICTED, 64, 64, 3)
+    assert dream is not None and dream.real.shape == (2, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3)
     assert dream.frame_dt == pytest.approx(0.02 * STRIDE)
-    starts = (0, (101 - (STRIDE * (CONTEXT + PREDICTED - 1) + 1)) // 2)
+    starts = (0, (101 - (STRIDE * (SEEN_FRAMES + PREDICTED_FRAMES - 1) + 1)) // 2)
     for real, start in zip(dream.real, starts, strict=True):
-        np.testing.assert_array_equal(real, flight.pixels[start::STRIDE][: CONTEXT + PREDICTED])
+        np.testing.assert_array_equal(real, flight.pixels[start::STRIDE][: SEEN_FRAMES + PREDICTED_FRAMES])
     np.testing.assert_array_equal(dream.reconstructed, dream.real // 2 + 1)
-    np.testing.assert_array_equal(dream.imagined[:, :CONTEXT], dream.reconstructed[:, :CONTEXT])
-    assert (dream.imagined[:, CONTEXT:] == STRIDE * (CONTEXT - 1) + 1).all()  # the last seen record is a stored one
+    np.testing.assert_array_equal(dream.imagined[:, :SEEN_FRAMES], dream.reconstructed[:, :SEEN_FRAMES])
+    assert (
+        dream.imagined[:, SEEN_FRAMES:] == STRIDE * (SEEN_FRAMES - 1) + 1
+    ).all()  # the last seen record is a stored one
     dream.save(tmp_path / "a_dream.npz")
     again = Dream.load(tmp_path / "a_dream.npz")
     for name in ("real", "reconstructed", "imagined"):
@@ -106,9 +108,9 @@ def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
 
 
 def test_short_flights_and_agents_without_decoder_leave_no_dream():
-    assert record_dream(DREAMER, random_flight(steps=CONTEXT * STRIDE - 1, pixels=True)) is None
-    shortest = record_dream(DREAMER, random_flight(steps=CONTEXT * STRIDE, pixels=True))
-    assert shortest is not None and shortest.real.shape[1] == CONTEXT + 1
+    assert record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE - 1, pixels=True)) is None
+    shortest = record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE, pixels=True))
+    assert shortest is not None and shortest.real.shape[1] == SEEN_FRAMES + 1
     blind = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(decoder=None)))
     assert record_dream(blind, random_flight(pixels=True)) is None
     assert record_dream(DREAMER, random_flight()) is None
@@ -159,7 +161,7 @@ def test_dreams_of_three_stages(tmp_path, figures):
 
 
 def test_flights_side_by_side(tmp_path, figures):
-    flights = [Flight(name, load_track(name), random_flight()) for name in ("figure8", "figure8_decoys")]
+    flights = [NamedFlight(name, load_track(name), random_flight()) for name in ("figure8", "figure8_decoys")]
     plot_flights(flights, tmp_path / "flights.png", over="time")
     maps, profiles = figures[0].axes[0:4:2], figures[0].axes[1:4:2]
     assert [axes.get_title(loc="left").split("\n")[0] for axes in maps] == ["figure8", "figure8_decoys"]
@@ -178,11 +180,11 @@ def test_axis_of_the_speed_profile():
     np.testing.assert_allclose(profile_axis(flight, "distance"), [0, 5, 17])
     np.testing.assert_allclose(profile_axis(flight, "time"), [0, 0.02, 0.04])
     with pytest.raises(ValueError, match="over=height: there are distance, time"):
-        plot_flights([Flight("a", load_track("circle"), flight)], Path("a.png"), over="height")
+        plot_flights([NamedFlight("a", load_track("circle"), flight)], Path("a.png"), over="height")
 
 
 def test_what_was_left_out_is_written_above(tmp_path, figures):
-    flight = Flight("lost", load_track("split_s"), random_flight())
+    flight = NamedFlight("lost", load_track("split_s"), random_flight())
     plot_flights([flight], tmp_path / "flights.png")
     plot_flights([flight], tmp_path / "warned.png", problems=["a_run without its last flight"])
     plot_dreams([("early", flat_dream())], tmp_path / "dreams.png", problems=[f"problem {i}" for i in range(10)])

@@ -16,7 +16,7 @@ from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rotation import rotate, turn
 
 
-class Flight:
+class RigidStep:
     """Quadrotors on MuJoCo's rigid bodies.
 
     The force is held in the direction it has in the step's middle. Beyond that, MuJoCo's Euler step is of first order:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dreamer_racing.envs.drone.quadrotor import GRAVITY, PRESETS, Quadrotor, QuadrotorParameters, load_preset
-from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.simulator import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import build_drone
 from dreamer_racing.envs.tracks import load_track
@@ -190,7 +190,7 @@ class Body:
         self.data.qvel[:] = (5.0, 0.0, 2.0, 3.0, -2.0, 1.0)
         arrays = (self.data.qpos, self.data.qvel, self.data.qfrc_applied)
         views = [torch.from_numpy(array).unsqueeze(0) for array in arrays]
-        self.flight = Flight(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(self.model, self.data))
+        self.flight = RigidStep(Quadrotor(parameters, 1), *views, lambda: mujoco.mj_step(self.model, self.data))
 
     def fly(self, wrenches: torch.Tensor, substeps: int) -> torch.Tensor:
         """Hold each wrench (6,) for so many steps; return the positions (T, 3)."""

@@ -1,4 +1,4 @@
-"""The kernels compute what `Quadrotor` and `Flight` state in torch, for drones in every condition."""
+"""The kernels compute what `Quadrotor` and `RigidStep` state in torch, for drones in every condition."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor, QuadrotorParameters
-from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 
 N = 256
@@ -47,7 +47,7 @@ def test_kernels_do_what_torch_does(parameters: QuadrotorParameters) -> None:
     vars(reference).update(other)
     ours, theirs = Bodies(), Bodies()
     fused = FusedFlight(quadrotor, ours.qpos, ours.qvel, ours.force, ours.integrate)
-    flight = Flight(reference, theirs.qpos, theirs.qvel, theirs.force, theirs.integrate)
+    flight = RigidStep(reference, theirs.qpos, theirs.qvel, theirs.force, theirs.integrate)
     generator = torch.Generator().manual_seed(2)
     for _ in range(4):
         action = 2.4 * torch.rand(N, 4, generator=generator, dtype=torch.float64) - 1.2

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
-from dreamer_racing.envs.drone.rigid_step import Flight
+from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator import MujocoSimulator, rendering
 from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
@@ -109,7 +109,7 @@ def test_kernels_fly_what_torch_and_mujocos_own_step_fly(preset: str) -> None:
     quadrotor = Quadrotor(parameters, 1, generator=torch.Generator().manual_seed(0))
     quadrotor.reset(everyone(1))
     views = [torch.from_numpy(array).unsqueeze(0) for array in (data.qpos, data.qvel, data.qfrc_applied)]
-    flight = Flight(quadrotor, *views, lambda: mujoco.mj_step(model, data))
+    flight = RigidStep(quadrotor, *views, lambda: mujoco.mj_step(model, data))
     for action in actions(10, 1):
         path = made.step(action)
         quadrotor.command(action)
