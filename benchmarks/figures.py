@@ -22,7 +22,7 @@ from measuring import print_table, write_json
 
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.evaluation.dreams import CONTEXT, PREDICTED, Dream
+from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, Dream
 from dreamer_racing.evaluation.evaluate import Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_trajectory
 
@@ -106,8 +106,8 @@ def write_run(
         stem = run / "evaluations" / f"{int(share * env_steps):09d}"
         write_trajectory(f"{stem}_trajectory.csv", flight(track), track)
         if algorithm == "dreamer_v3":
-            images = generator.integers(0, 256, (3, 1, CONTEXT + PREDICTED, 64, 64, 3), dtype=np.uint8)
-            Dream(images[0], images[1], images[2], CONTEXT, 0.08).save(f"{stem}_dream.npz")
+            images = generator.integers(0, 256, (3, 1, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3), dtype=np.uint8)
+            Dream(images[0], images[1], images[2], SEEN_FRAMES, 0.08).save(f"{stem}_dream.npz")
 
 
 @cache

@@ -20,10 +20,7 @@ if TYPE_CHECKING:
     from dreamer_racing.evaluation.evaluate import Trajectory
     from dreamer_racing.learners.dreamer import DreamerLearner
 
-SEEN_FRAMES, PREDICTED_FRAMES = (
-    3,
-    10,
-)  # stored frames: those that the model has seen, then those that it predicts on its own
+SEEN_FRAMES, PREDICTED_FRAMES = 3, 10  # that are stored: seen by the model, then predicted on its own
 STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
 
 
@@ -90,9 +87,8 @@ def record_dream(learner: DreamerLearner, trajectory: Trajectory, windows: int =
     pixels = trajectory.pixels
     if learner.agent.world_model.decoder is None or pixels is None or len(pixels) <= SEEN_FRAMES * STRIDE:
         return None
-    length = (
-        STRIDE * min(SEEN_FRAMES + PREDICTED_FRAMES - 1, (len(pixels) - 1) // STRIDE) + 1
-    )  # ends with a stored frame
+    frames = min(SEEN_FRAMES + PREDICTED_FRAMES - 1, (len(pixels) - 1) // STRIDE)
+    length = STRIDE * frames + 1  # ends with a stored frame
     starts = sorted({int(start) for start in np.linspace(0, len(pixels) - length, windows + 1)[:-1]})
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
     parts = [slice(start, start + length) for start in starts]

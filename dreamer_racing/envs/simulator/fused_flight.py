@@ -1,7 +1,8 @@
 """`RigidStep` as two kernels a physics step: what controller, motors and corrections do between two steps of MuJoCo.
 
 `drone.quadrotor.Quadrotor` and `drone.rigid_step.RigidStep` state the same equations in torch, an operation at a time,
-and are what these kernels are tested against. Here they take a tenth of the time on a CPU, and a CUDA graph has a third of the nodes.
+and are what these kernels are tested against. Here they take a tenth of the time on a CPU, and a CUDA graph has a third
+of the nodes.
 
 Shapes: N drones, P physics steps per control step. SI units, attitude wxyz, body frame FLU.
 """
