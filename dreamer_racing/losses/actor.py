@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.contract import require_keys, scheduled
-from dreamer_racing.losses.imagination import imagine, lambda_return
+from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
 from dreamer_racing.modules.actor import Actor
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
@@ -60,6 +60,7 @@ class ActorLoss(LossModule):
         entropy_scale: Weight of the entropy.
         return_decay: Decay of the moving percentiles.
         continuation: Whether predicted ends of episodes cut returns; if not, imagination goes on for ever.
+        noise_correlation: ρ of the imagined actions' noise, see ``imagine``.
 
     Reads ``belief``, ``state`` and ``terminated`` of the starts, batch ``[N]`` (or any, which is flattened). Writes the
     scalars ``loss_actor``, ``entropy``, ``return_mean``, ``return_scale``, ``imagined_reward``, ``continuation`` (mean
@@ -94,6 +95,7 @@ class ActorLoss(LossModule):
         entropy_scale: float = 3e-4,
         return_decay: float = 0.99,
         continuation: bool = True,
+        noise_correlation: float = 0.0,
     ) -> None:
         super().__init__()
         self.world_model = world_model
@@ -104,6 +106,7 @@ class ActorLoss(LossModule):
         self.lambda_ = lambda_
         self.entropy_scale = scheduled(entropy_scale)
         self.continuation = continuation
+        self.noise_correlation = noise_correlation
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
@@ -119,6 +122,7 @@ class ActorLoss(LossModule):
             entropy_scale=config.entropy_scale,
             return_decay=config.return_decay,
             continuation=config.continuation,
+            noise_correlation=config.noise_correlation,
             **own,
         )
 
@@ -146,6 +150,11 @@ class ActorLoss(LossModule):
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Imagine from starts ``(N, ...)``; return the loss and everything else that ``forward`` writes."""
         raise NotImplementedError(f"{type(self).__name__} must say what it maximises.")
+
+    def _imagine(self, belief: Tensor, state: Tensor) -> Imagination:
+        """Let the actor act in the world model from starts ``(N, ...)``."""
+        rssm = self.world_model.rssm
+        return imagine(rssm, self.actor, belief, state, self.horizon, self.noise_correlation)
 
     def _judge(self, features: Tensor, terminated: Tensor) -> Judgement:
         """Compute returns and weights of a rollout, with the gradient of its features.
@@ -200,7 +209,7 @@ class ReinforceLoss(ActorLoss):
 
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.no_grad():
-            features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+            features, action = self._imagine(belief, state)
             judged = self._judge(features, terminated)
         policy = self.actor(features[:-1])
         entropy = policy.entropy()
@@ -222,7 +231,7 @@ class DynamicsActorLoss(ActorLoss):
 
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         with frozen(self.world_model, self.critic):
-            features, _ = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+            features, _ = self._imagine(belief, state)
             judged = self._judge(features, terminated)
         # The policy once more on fixed features: the entropy shall not pull the dynamics towards indecision.
         entropy = self.actor(features[:-1].detach()).entropy()

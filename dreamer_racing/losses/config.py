@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, Range, setting
 
 
 @dataclass
@@ -51,6 +51,8 @@ class LossConfig:
         return_decay: Decay of the return percentiles.
         min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
             first way of doing something has made it sure of itself.
+        noise_correlation: ρ of the noise of imagined actions from one step to the next: more strays further for the same
+            deviation. The reference has 0.
         dynamics_scale: Weight of the dynamics loss.
         representation_scale: Weight of the representation loss.
         free_nats: KL below which there is no gradient, nats.
@@ -74,6 +76,7 @@ class LossConfig:
     entropy_scale: float = setting(3e-4, NOT_NEGATIVE)
     return_decay: float = setting(0.99, SHARE)
     min_std: float = setting(0.1, POSITIVE_SHARE)
+    noise_correlation: float = setting(0.0, Range(0, 0.99))
     dynamics_scale: float = setting(1.0, NOT_NEGATIVE)
     representation_scale: float = setting(0.1, NOT_NEGATIVE)
     free_nats: float = setting(1.0, NOT_NEGATIVE)

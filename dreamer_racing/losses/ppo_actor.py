@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from dreamer_racing.losses.actor import ActorLoss
 from dreamer_racing.losses.config import ImaginedPPOConfig, LossConfig
-from dreamer_racing.losses.imagination import imagine
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.agent import Agent
 
@@ -108,7 +107,7 @@ class PPOActorLoss(ActorLoss):
     @torch.no_grad()
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         self.prepare(len(belief))
-        features, action = imagine(self.world_model.rssm, self.actor, belief, state, self.horizon)
+        features, action = self._imagine(belief, state)
         judged = self._judge(features, terminated)
         policy = self.actor(features[:-1])
         if self.training:
