@@ -51,8 +51,8 @@ class LossConfig:
         return_decay: Decay of the return percentiles.
         min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
             first way of doing something has made it sure of itself.
-        noise_correlation: ρ of the noise of imagined actions from one step to the next: more strays further for the same
-            deviation. The reference has 0.
+        noise_correlation: ρ of the noise of imagined actions from one step to the next: more strays further for the
+            same deviation. The reference has 0.
         dynamics_scale: Weight of the dynamics loss.
         representation_scale: Weight of the representation loss.
         free_nats: KL below which there is no gradient, nats.
