@@ -26,6 +26,7 @@ sys.path.append(str(ROOT / "recipes"))
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
+from dreamer_racing.training.schedule import Clock  # noqa: E402
 
 COMMON, RECIPES = schema.RunConfig, (schema.DreamerConfig, schema.PPORunConfig, schema.SACRunConfig)
 OTHERS = (
@@ -83,7 +84,13 @@ def rows(config: type, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
             continue
         if dataclasses.is_dataclass(kind):
             if kind is schema.Ramp and field.name in said:
-                yield f"{name}.to, .begin, .end, .until, .by", "`null`, `0`, `1`, `null`, `run`", "", said[field.name]
+                clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in Clock)
+                yield (
+                    f"{name}.to, .begin, .end, .until, .by",
+                    "`null`, `0`, `1`, `null`, `run`",
+                    clocks,
+                    said[field.name],
+                )
             elif kind is not schema.Ramp:
                 yield from rows(typing.cast(type, kind), f"{name}.")
             continue

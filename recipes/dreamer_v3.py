@@ -72,7 +72,7 @@ class DreamerRun(ReplayRun):
     def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
         """Take note of the gates passed too."""
         episodes = super().take_in(rollout)
-        if len(episodes):
+        if len(episodes) and "gates_passed" in episodes:
             self.metrics.push({"episode/pass_share": self.passes.update(episodes)})
         return episodes
 

@@ -162,7 +162,7 @@ def describe(
 ) -> dict[str, Any]:
     """Return what agent.json says: where the agent comes from, and how well it flies."""
     source = contract["source"]
-    history = history_of(checkpoint)
+    history = history_of(checkpoint, source["env_steps"])
     commit = config.commit or (history[-1]["commit"] if history else None)
     if commit is None:
         print("commit of the training: not noted, for neither the run nor commit= says it")
@@ -182,13 +182,14 @@ def describe(
     }
 
 
-def history_of(checkpoint: Path) -> list[dict[str, Any]]:
-    """Return the starts that a run has noted, their overrides without what is of one machine."""
+def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
+    """Return a run's starts before a checkpoint of so many env_steps, overrides without what is of one machine."""
     run_dir = config_folder(checkpoint)
     starts = RunDirectory(run_dir).read_starts() or RunDirectory(run_dir.parent).read_starts()  # best/ lies in the run
     return [
         start | {"overrides": [text for text in start["overrides"] if override_key(text) not in OF_A_MACHINE]}
         for start in starts
+        if start["env_steps"] < env_steps
     ]
 
 

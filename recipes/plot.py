@@ -66,7 +66,7 @@ def draw(config: PlotConfig) -> None:
     Raises:
         ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
-    check_settings(config)
+    check_plot(config)
     output = ensure_writable(config.output)
     places = config.runs if isinstance(config.runs, list) else [config.runs]
     if [Path(str(place)).suffix for place in places] == [".csv"]:
@@ -83,7 +83,7 @@ def draw(config: PlotConfig) -> None:
         raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
 
 
-def check_settings(config: PlotConfig) -> None:
+def check_plot(config: PlotConfig) -> None:
     """Refuse what no figure can be drawn with.
 
     Raises:

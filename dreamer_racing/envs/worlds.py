@@ -41,7 +41,6 @@ class RaceOptions(TypedDict, total=False):
     backend: str
     start_beyond_gate: float
     start_on_line: float
-    line_spread: float
     start_before_crash: float
     start_noise: float
     miss_radius: float
@@ -76,7 +75,6 @@ class RaceWorlds:
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
-        line_spread: of the noise around that line, as a multiple of its own; see `StartSampler`.
         start_before_crash: share of training episodes that begin where an earlier one was 0.4-2 s before its crash; see
             `CrashMemory`.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
@@ -115,7 +113,6 @@ class RaceWorlds:
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
         start_on_line: float = 0.0,
-        line_spread: float = 1.0,
         start_before_crash: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
@@ -148,7 +145,7 @@ class RaceWorlds:
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
         self._vector = RaceVector(self.track, self.device, self.dtype)
-        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line, line_spread)
+        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line)
         self._crashes = self._make_crash_memory(start_before_crash)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
@@ -168,7 +165,7 @@ class RaceWorlds:
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
 
-    def _make_starts(self, beyond_gate: float, noise: float, on_line: float, line_spread: float) -> StartSampler:
+    def _make_starts(self, beyond_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
         if not 0.0 <= on_line <= 1.0:
             raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
@@ -185,7 +182,6 @@ class RaceWorlds:
             noise,
             on_line=on_line,
             line=line,
-            line_spread=line_spread,
         )
 
     def _make_crash_memory(self, share: float) -> CrashMemory | None:
@@ -252,8 +248,7 @@ class RaceWorlds:
         path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
         if self._crashes is not None:
-            crashed, steps = outcome.terminated, self.race.step_count
-            self._crashes.note(self.simulator.state, self.race.target_gate, crashed, steps)
+            self._crashes.note(self.simulator.state, self.race.target_gate, outcome.terminated)
         return outcome
 
     def _capture(self, action: Tensor) -> GraphedFunction:

@@ -43,7 +43,11 @@ def act(policy: RacingPolicy, tensordict: TensorDictBase) -> TensorDictBase:
 
 
 class Course:
-    """Worlds on the CPU to evaluate a policy in, as often as wanted; each time it meets the same starts and drones.
+    """Worlds on the CPU to evaluate a policy in, as often as wanted.
+
+    Each time it meets the same starts, drones and looks in the first episode of every world; in later ones, where
+    episodes are more than worlds, they depend on how the episodes before went. What a policy samples comes from torch's
+    generator.
 
     Args:
         policy: what is flown, on whichever device it is.

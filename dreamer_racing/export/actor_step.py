@@ -2,7 +2,7 @@
 
 `ActorStep` takes all recurrent state as inputs and gives it back as outputs: ``(observation, h, z, previous_action,
 is_init[, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
-``torch.export`` program, and publishes both, with the contract of `export_contract`, only if they pass `export_parity`.
+``torch.export`` program, and publishes both, with the contract of `contract`, only if they pass `parity`.
 
 Shape legend: D belief, S state = L·K, L latents, K classes, A action, V numbers.
 """
@@ -225,7 +225,7 @@ def export_actor(
 
     Args:
         step: The step.
-        contract: From `export_contract.make_contract`.
+        contract: From `contract.make_contract`.
         flight: To compare them over, at least ``MIN_STEPS`` steps.
         output: Path of the ``.onnx`` file; the ``.pt2`` has the same stem. Those of an earlier export are replaced.
         seed: Of the noise that samples latents in the comparison.

@@ -1,4 +1,4 @@
-"""Model-free baselines: PPO and SAC with the paper's networks on TorchRL's losses."""
+"""One update each: DreamerV3, and the model-free baselines PPO and SAC on TorchRL's losses."""
 
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize
 from dreamer_racing.learners.ppo import PPOConfig, PPOLearner

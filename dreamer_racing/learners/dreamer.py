@@ -24,7 +24,7 @@ from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, check_settings, setting
 
 
 @dataclass
@@ -124,6 +124,10 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+ACTOR_NUMBERS = ("horizon", "discount", "continuation")
+"""What is read off an actor's loss, as `ActorLoss` has it."""
+
+
 class DreamerLearner:
     """One update of world model, actor and critic by their losses and an optimiser; all of them are given.
 
@@ -154,6 +158,8 @@ class DreamerLearner:
         optimizer: torch.optim.Optimizer,
         config: LearnerConfig | None = None,
     ) -> None:
+        if lacking := [name for name in ACTOR_NUMBERS if not hasattr(losses["actor"], name)]:
+            raise ValueError(f"{type(losses['actor']).__name__} lacks {', '.join(lacking)}, which an actor's loss has.")
         self.config = config or LearnerConfig()
         self.agent = agent
         self.losses = nn.ModuleDict(losses)
@@ -243,6 +249,8 @@ class DreamerLearner:
         min_std: float | None = None,
     ) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named stays.
+
+        These are settings, not state: call it again after `load_state_dict`.
 
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
@@ -466,6 +474,9 @@ def make_dreamer(
 ) -> DreamerLearner:
     """Compose a learner by the names of its parts: networks, losses, optimiser.
 
+    Raises:
+        ValueError: If a number is out of its range, or there is no loss of a name.
+
     Args:
         size: Of the networks, or its name.
         interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
@@ -477,6 +488,8 @@ def make_dreamer(
             global generator of the device, which a checkpoint of yours should save.
     """
     losses, config = losses or LossConfig(), config or LearnerConfig()
+    check_settings(losses)
+    check_settings(config)
     decodes = find_loss(WORLD_MODEL_LOSSES, losses.world_model).decodes
     with seeded(seed):
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std).to(device)

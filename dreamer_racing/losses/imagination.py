@@ -40,10 +40,12 @@ def imagine(
         belief: Starts, ``(N, D)``.
         state: Starts, ``(N, S)``.
         horizon: H, number of actions.
-        noise_correlation: ρ of the actions' noise from one step to the next. Each action is still a sample of the
-            policy; with ρ a rollout strays sqrt((1 + ρ) / (1 − ρ)) times as far for the same deviation, as a drone
-            does that must hold another course to get there. Reference: Eberhard et al. 2023, "Pink noise is all you
-            need"; Hollenstein et al. 2024, "Colored noise in PPO".
+        noise_correlation: ρ of the actions' noise from one step to the next. With ρ a rollout strays
+            sqrt((1 + ρ) / (1 − ρ)) times as far for the same deviation, as a drone does that holds another course. By
+            itself each action is a sample of the policy; given the state that earlier noise led to it is not, so
+            gradients that take it for one are biased, and the returns are of what strays, not of what is flown.
+            Reference: Eberhard et al. 2023, "Pink noise is all you need"; Hollenstein et al. 2024, "Colored noise in
+            PPO", who find the bias worth it.
 
     Returns:
         The rollout.

@@ -125,9 +125,10 @@ class RunDirectory:
     def read_starts(self) -> list[dict[str, Any]]:
         """Return every start that was noted; none of runs of older versions."""
         try:
-            return [json.loads(line) for line in self.starts.read_text(encoding="utf-8").splitlines()]
+            lines = self.starts.read_text(encoding="utf-8").splitlines(keepends=True)
         except FileNotFoundError:
             return []
+        return [json.loads(line) for line in lines if line.endswith("\n")]  # a kill may cut the last one short
 
 
 def latest_checkpoint(path: str | Path) -> Path:

@@ -22,12 +22,12 @@ from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.run import ReplayRatio
+from dreamer_racing.training.schedule import Clock
 
 RACE_ONLY = {
     "env.control_rate": 50.0,
     "env.start_beyond_gate": 0.0,
     "env.start_on_line": 0.0,
-    "env.line_spread": 1.0,
     "env.start_before_crash": 0.0,
     "env.miss_radius": 0.0,
     "evaluation.start_noise": 0.0,
@@ -211,6 +211,10 @@ def check_schedule(config: DreamerConfig) -> None:
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
+        if ramp.to is not None and ramp.by is Clock.passes and not is_race(config):
+            raise ValueError(
+                f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
+            )
         if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     if config.schedule.wait_for_model is not None:

@@ -58,7 +58,7 @@ def launch(
         torch.save(error.batch.to("cpu").to_dict(), run.directory.nonfinite_batch)
         raise SystemExit(
             f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
-            f"kept in {run.directory / 'nonfinite_batch.pt'}; {run.last_good}. Continue from there with a lower "
+            f"kept in {run.directory.nonfinite_batch}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
     except RuntimeError as error:

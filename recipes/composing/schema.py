@@ -30,8 +30,7 @@ class EnvConfig:
     start_beyond_gate: float = setting(0.0, SHARE)
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
-    line_spread: float = setting(1.0, COUNT)  # of the noise around that line, as a multiple of its own
-    start_before_crash: float = setting(0.0, SHARE)  # share that begin 0.4-2 s before the crash of an earlier one
+    start_before_crash: float = setting(0.0, Range(0, 0.9))  # share that begin before the crash of an earlier one
     # m; training episodes end where a gate is missed by less than this; 0: they go on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
@@ -127,7 +126,7 @@ class CheckpointConfig:
 
 @dataclass
 class ScheduleConfig:
-    """Settings that move over a run, each from its own value `to` another between two shares of total_env_steps."""
+    """Settings that move over a run, each from its own value `to` another, by its length or by the gates passed."""
 
     learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
     discount: Ramp = field(default_factory=Ramp)  # loss.discount

@@ -1,4 +1,4 @@
-"""The guard against losses that are not finite, alone; with a learner it is in ``test_learner.py``."""
+"""The guard against losses that are not finite, alone; with a learner it is in ``test_dreamer.py``."""
 
 from __future__ import annotations
 

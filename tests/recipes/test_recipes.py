@@ -21,6 +21,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.lesions import LESIONS
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.pass_share import PassShare
 from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
 SMALL = [
@@ -520,7 +521,7 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     env = arena.make_env(config)
     assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
     assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
-    learner = arena.make_learner(config, Interface.of(env), "cpu")
+    learner = recipe_module("composing.learners").make_learner(config, Interface.of(env), "cpu")
     env.close()
     report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
     assert report._base.worlds.parameters.control_dt == 0.04
@@ -562,3 +563,21 @@ def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
     evaluated = recipe_module("composing.arena").make_suite(config, 1, 4)
     assert evaluated.observation_spec["pixels"].shape == (1, 96, 96, 3)
     evaluated.close()
+
+
+def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
+    overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
+    overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    recipe_module("composing.checks").check_dreamer(config)
+    learners, passes = recipe_module("composing.learners"), PassShare()
+    assert learners.scheduled(config, learners.clock_times(config, 100_000, passes))["min_std"] == pytest.approx(0.1)
+    passes.add(gates=150.0, crashes=100.0, episodes=200)  # 0.6
+    assert learners.scheduled(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(0.075)
+
+
+def test_nothing_goes_by_gates_where_there_are_none():
+    overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
+        recipe_module("composing.checks").check_dreamer(config)

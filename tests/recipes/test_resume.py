@@ -99,7 +99,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     assert learner_updates(whole) - learner_updates(before) >= 200
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {
-        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "random_state"
+        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes", "random_state"
     }  # fmt: skip
     assert_same(whole, parted, "checkpoint")
 

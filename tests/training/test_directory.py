@@ -22,6 +22,9 @@ def test_every_start_is_kept(tmp_path: Path) -> None:
     first, second = run.read_starts()
     assert (first["env_steps"], first["overrides"], first["commit"]) == (0, ["track=circle"], "abc")
     assert (second["env_steps"], second["overrides"][-1], second["commit"]) == (4000, "loss.discount=0.98", None)
+    with run.starts.open("a") as file:
+        file.write('{"env_steps": 80')  # killed there
+    assert len(run.read_starts()) == 2
 
 
 def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ class CrashMemory:
 
     Args:
         num_envs: N.
-        share: of episodes that begin again, once there is a crash to begin from.
+        share: of episodes that begin again, once every drone has left a state; less before.
         control_dt: duration of a control step, s.
         device: where everything lives.
         dtype: floating-point type of the poses.
@@ -42,8 +42,10 @@ class CrashMemory:
     def __init__(
         self, num_envs: int, share: float, control_dt: float, device: torch.device | str, dtype: torch.dtype
     ) -> None:
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"start_before_crash={share}: a share of episodes lies between 0 and 1.")
+        if not 0.0 <= share < 1.0:
+            raise ValueError(
+                f"start_before_crash={share}: a share of episodes lies between 0 and 1, below it; others leave crashes."
+            )
         self.share = share
         self._lags = tuple(max(1, round(seconds / control_dt)) for seconds in self.BEFORE)  # control steps
         depth = self._lags[1] + 1
@@ -56,23 +58,22 @@ class CrashMemory:
         self.filled = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.again = torch.zeros(num_envs, dtype=torch.bool, device=device)  # whether this episode began from memory
         self.crashed = torch.zeros(num_envs, dtype=torch.bool, device=device)  # in the latest step
-        self.steps = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of the episode
+        self.steps = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of the episode that were noted here
 
-    def note(self, state: DroneState, target_gate: Tensor, crashed: Tensor, steps: Tensor) -> None:
+    def note(self, state: DroneState, target_gate: Tensor, crashed: Tensor) -> None:
         """Remember every drone after a control step.
 
         Args:
             state: of the N drones.
             target_gate: to be passed next, (N,) int64.
             crashed: in this step, (N,) bool.
-            steps: of the episode so far, (N,) int64.
         """
         row = torch.cat((state.position, state.attitude, state.linear_velocity), -1)
         self.now.add_(1).remainder_(len(self.recent))
         self.recent.index_copy_(0, self.now, row.unsqueeze(0))
         self.recent_target.index_copy_(0, self.now, target_gate.unsqueeze(0))
         self.crashed.copy_(crashed)
-        self.steps.copy_(steps)
+        self.steps.add_(1)
 
     def begin(self, mask: Tensor, start: StartPose, generator: torch.Generator) -> StartPose:
         """Keep what the drones that begin anew have left, and put some of them where one has crashed.
@@ -97,6 +98,7 @@ class CrashMemory:
         again = (draw[:, 2] < self.share) & self.filled[chosen]
         self.again.copy_(torch.where(mask, again, self.again))
         self.crashed.masked_fill_(mask, value=False)
+        self.steps.masked_fill_(mask, 0)
         position, attitude, velocity = self.state[chosen].split((3, 4, 3), -1)
         wide = again.unsqueeze(-1)
         return dataclasses.replace(

@@ -47,8 +47,7 @@ class StartSampler:
     line's speed, with the attitude that flies it and the nose to where the line leads, and noise: six tenths of the
     above in position, along the world's axes, and as much in attitude. Every part of a lap is practised from the first
     episode on, also turns whose gate is out of view. Reference: Peng et al. 2018, "DeepMimic", Section 6.2 (reference
-    state initialisation). A policy that flies otherwise than the line meets other states; ``line_spread`` widens the
-    noise so many times, and adds ±1 m/s of velocity for each time above one.
+    state initialisation).
 
     Args:
         track: the track.
@@ -58,12 +57,11 @@ class StartSampler:
         beyond_gate: share of training episodes that begin beyond a gate, of those that do not begin on the line.
         on_line: share of training episodes that begin on ``line``; all others are as if there was none.
         line: the racing line; needed if ``on_line`` is above zero.
-        line_spread: of the noise around it, at least 1.
         start_noise: of evaluation starts, as a multiple of the noise of training.
 
     Raises:
         ValueError: ``beyond_gate`` or ``on_line`` is not a share, there is no line, or ``start_noise`` is negative or
-            could carry a drone across the plane of its first gate, or ``line_spread`` is below 1.
+            could carry a drone across the plane of its first gate.
 
     Example:
         >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
@@ -79,7 +77,6 @@ class StartSampler:
     BEYOND_SPEED = (1.5, 5.0)  # m/s along its direction
     PACE = (0.2, 1.0)  # fraction of the line's speed
     LINE_NOISE = 0.6  # times the position noise: less, to stay inside the gates that the line goes through
-    LINE_GUST = 1.0  # m/s, noise of the velocity for each time that the spread is above one
     LOOK_AHEAD = 0.5  # s: the nose points to where the line is this much later
     PAST_GATE = 1.0  # m around a gate's centre in which the side of its plane says whether it has been passed
 
@@ -93,14 +90,10 @@ class StartSampler:
         start_noise: float = 0.0,
         on_line: float = 0.0,
         line: RacingLine | None = None,
-        line_spread: float = 1.0,
     ):
-        if not line_spread >= 1.0:
-            raise ValueError(f"line_spread={line_spread}: the noise around the line is widened, so at least 1.")
         _check_share("beyond_gate", beyond_gate)
         _check_start_noise(start_noise, track)
         self._beyond_gate = beyond_gate
-        self._line_spread = line_spread
         self._line = line.to(device, dtype) if line is not None else None
         self.on_line = on_line
         self._start_noise = start_noise
@@ -187,17 +180,13 @@ class StartSampler:
         noise = 2 * draw[:, 3:] - 1  # (N, 6)
         time, pace = draw[:, 1] * line.lap_time, _spread(draw[:, 2:3], self.PACE)
         reference = line.at(time)
-        spread = self._line_spread
-        position = reference.position + spread * self.LINE_NOISE * self._position_noise * noise[:, :3]
+        position = reference.position + self.LINE_NOISE * self._position_noise * noise[:, :3]
         position = torch.minimum(torch.maximum(position, self._low), self._high)
         velocity = pace * reference.velocity
         # At a fraction of the speed the same curve asks for the square of that fraction of the acceleration.
         force = line.dynamics.force(velocity, pace.square() * reference.acceleration)
         ahead = line.at(time + self.LOOK_AHEAD).position - reference.position
-        attitude = turn(_pointing(force, ahead), spread * self._attitude_noise * noise[:, 3:])
-        if spread > 1.0:
-            gust = torch.rand(num, 3, generator=self._generator, device=self._device, dtype=self._dtype)
-            velocity = velocity + (spread - 1.0) * self.LINE_GUST * (2 * gust - 1)
+        attitude = turn(_pointing(force, ahead), self._attitude_noise * noise[:, 3:])
         on_line = (draw[:, 0] < self._on_line).unsqueeze(-1)
         return StartPose(
             position=torch.where(on_line, position, pose.position),
