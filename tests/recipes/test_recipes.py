@@ -524,9 +524,9 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     learner = recipe_module("composing.learners").make_learner(config, Interface.of(env), "cpu")
     env.close()
     report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
-    assert report._base.worlds.parameters.control_dt == 0.04
-    assert report._base.worlds.race._sweep._miss_radius == 0
-    assert report._base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
+    assert report._course.base.worlds.parameters.control_dt == 0.04
+    assert report._course.base.worlds.race._sweep._miss_radius == 0
+    assert report._course.base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
     assert len({episode.reward_sum for episode in report.evaluate(deterministic=True).episodes}) == 3
     report.close()
 
