@@ -6,9 +6,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ReinforceLoss
-from dreamer_racing.modules import SIZES, Interface
+from dreamer_racing.learners.learner import seeded
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, LossConfig, ReinforceLoss, make_losses
+from dreamer_racing.modules import SIZES, Agent, Interface, get_size
 from tests.dreamers import learner_of
 
 CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
@@ -430,3 +432,19 @@ def test_the_smallest_deviation_is_scheduled_saved_and_flown():
     other = learner_of(seed=1, **CONFIG | {"min_std": 0.4})
     other.load_state_dict(older)
     assert other.agent.actor.min_std.item() == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("actor", ["reinforce", "ppo"])
+def test_composing_by_names_draws_the_weights_that_composing_by_hand_does(actor):
+    """In the order networks, world-model loss, actor's, critic's: seeds mean the same in recipes and in the library."""
+    config = LossConfig(world_model="informed", actor=actor)
+    interface = Interface(privileged_dim=7)
+    named = make_dreamer("debug", interface, config, seed=3)
+    with seeded(3):
+        agent = Agent(get_size("debug"), interface, decode=True)
+        losses = make_losses(agent, config)
+    for name, value in named.agent.state_dict().items():
+        assert torch.equal(value, agent.state_dict()[name]), name
+    drawn = losses["world_model"].privileged_decoder.state_dict()
+    for name, value in named.losses["world_model"].privileged_decoder.state_dict().items():
+        assert torch.equal(value, drawn[name]), name

@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
-from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
 
 pytest.importorskip("onnxscript")
@@ -179,3 +179,18 @@ def test_the_agents_that_ship_are_whole_and_small() -> None:
         assert {path.name for path in folder.iterdir()} == set(FILES)
         assert OmegaConf.load(folder / "config.yaml").run_dir is None
     assert sum(path.stat().st_size for folder in folders for path in folder.iterdir()) <= 10e6
+
+
+def test_an_agent_ships_with_the_starts_before_its_checkpoint(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    run.path.mkdir()
+    run.note_start(0, ["track=circle", "run_dir=/somewhere"], "abc")
+    run.note_start(4000, ["track=circle", "loss.discount=0.98"], "def")
+    history_of = recipe_module("export").history_of
+    early, late = (run.checkpoints / f"checkpoint-{env_steps:012d}" for env_steps in (4000, 8000))
+    assert [start["commit"] for start in history_of(early, 4000)] == ["abc"]
+    assert [start["overrides"] for start in history_of(late, 8000)] == [
+        ["track=circle"], ["track=circle", "loss.discount=0.98"]
+    ]  # fmt: skip
+    assert len(history_of(run.best.checkpoints / "checkpoint-000000008000", 8000)) == 2
+    assert history_of(tmp_path / "other" / "checkpoints" / "checkpoint-000000000100", 100) == []
