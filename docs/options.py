@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "options.md"
 sys.path.append(str(ROOT / "recipes"))
 
+# Below code, because it is found only with the recipes' folder on the path.
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
@@ -59,16 +60,15 @@ def main() -> None:
 
 def make_page() -> str:
     """Return the whole page."""
-    shared = {name for name, *_ in rows(COMMON)}
-    parts = [HEAD, section("All training recipes", COMMON, list(rows(COMMON)))]
+    shared = list(rows(COMMON))
+    parts = [HEAD, section("All training recipes", shared)]
     for recipe in (*RECIPES, *OTHERS):
-        known = shared if issubclass(recipe, COMMON) else set()
-        own = [row for row in rows(recipe) if row[0] not in known or row[1:] not in [r[1:] for r in rows(COMMON)]]
-        parts.append(section(first_sentence(recipe), recipe, own))
+        known = shared if issubclass(recipe, COMMON) else []
+        parts.append(section(first_sentence(recipe), [row for row in rows(recipe) if row not in known]))
     return "\n".join(parts)
 
 
-def section(title: str, config: type, found: list[tuple[str, str, str, str]]) -> str:
+def section(title: str, found: list[tuple[str, str, str, str]]) -> str:
     """Return a heading and a table."""
     lines = [f"## {title}", "", "| option | default | may be | |", "|---|---|---|---|"]
     lines += [f"| `{name}=` | {default} | {allowed} | {meaning} |" for name, default, allowed, meaning in found]

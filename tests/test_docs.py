@@ -6,11 +6,22 @@ import importlib
 import re
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").glob("*.md")]
+
+
+@pytest.fixture(scope="module")
+def options() -> ModuleType:
+    """The generator of the page of options, a script beside it."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        return importlib.import_module("options")
+    finally:
+        sys.path.pop(0)
 
 
 def anchors(page: Path) -> set[str]:
@@ -34,21 +45,11 @@ def test_links_lead_somewhere(page):
         assert not anchor or found.suffix != ".md" or anchor in anchors(found), target
 
 
-def test_the_page_of_options_is_up_to_date():
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        options = importlib.import_module("options")
-    finally:
-        sys.path.pop(0)
+def test_the_page_of_options_is_up_to_date(options):
     assert options.PAGE.read_text(encoding="utf-8") == options.make_page(), "run python docs/options.py"
 
 
-def test_comments_and_attributes_are_read():
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        options = importlib.import_module("options")
-    finally:
-        sys.path.pop(0)
+def test_comments_and_attributes_are_read(options):
     source = '    a: int = 1  # of a\n    # of b,\n    # and more\n    b: str = "x"\n    c: float = 2.0\n'
     assert options.of_comments(source) == {"a": "of a", "b": "of b, and more"}
     docstring = "Says.\n\nAttributes:\n    a: Of a,\n        and more.\n    b: Of b.\n\nReference: none."

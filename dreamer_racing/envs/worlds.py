@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
-from dreamer_racing.envs.race.crash_memory import CrashMemory
+from dreamer_racing.envs.race.crash_memory import CrashMemory, check_share
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
@@ -186,8 +186,10 @@ class RaceWorlds:
 
     def _make_crash_memory(self, share: float) -> CrashMemory | None:
         """Make what lets training episodes begin before crashes, if any are to."""
-        memory = CrashMemory(self.num_envs, share, self.parameters.control_dt, self.device, self.dtype)
-        return memory if share and not self.evaluation else None
+        check_share(share)
+        if not share or self.evaluation:
+            return None
+        return CrashMemory(self.num_envs, share, self.parameters.control_dt, self.device, self.dtype)
 
     @property
     def start_on_line(self) -> float:

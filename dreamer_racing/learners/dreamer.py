@@ -474,9 +474,6 @@ def make_dreamer(
 ) -> DreamerLearner:
     """Compose a learner by the names of its parts: networks, losses, optimiser.
 
-    Raises:
-        ValueError: If a number is out of its range, or there is no loss of a name.
-
     Args:
         size: Of the networks, or its name.
         interface: What the agent sees and does; ``Interface.of(env)`` reads it off an environment.
@@ -486,6 +483,9 @@ def make_dreamer(
         device: Where the networks live and updates run.
         seed: Of the initial weights; None takes them from the global generator. Later sampling always uses the
             global generator of the device, which a checkpoint of yours should save.
+
+    Raises:
+        ValueError: If a number is out of its range, or there is no loss of a name.
     """
     losses, config = losses or LossConfig(), config or LearnerConfig()
     check_settings(losses)

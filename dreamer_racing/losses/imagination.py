@@ -55,7 +55,7 @@ def imagine(
     for _ in range(horizon):
         policy = actor(features[-1])
         noise = next_noise(noise, policy.mean, noise_correlation)
-        action = torch.addcmul(policy.mean, policy.std, noise)
+        action = policy.sample(noise)
         belief, state = rssm.imagine_step(belief, state, action)
         actions.append(action)
         features.append(join_features(belief, state))

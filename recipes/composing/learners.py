@@ -6,10 +6,10 @@ import torch
 
 from composing.schema import DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.learners.dreamer import DreamerLearner, make_optimizer
-from dreamer_racing.learners.learner import Learner, seeded
-from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss, make_losses
-from dreamer_racing.modules import Agent, Interface, get_size
+from dreamer_racing.learners.dreamer import make_dreamer
+from dreamer_racing.learners.learner import Learner
+from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import Clock
 
@@ -31,26 +31,30 @@ def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, flo
     return {name: ramp.at(value, times[ramp.by]) for name, (ramp, value) in now.items()}
 
 
-def make_agent(config: DreamerConfig, interface: Interface, device: torch.device | str | None = None) -> Agent:
-    """Make the networks, with initial weights from torch's generator.
+def size_of(config: DreamerConfig) -> ModelSize:
+    """The networks' size, and what their states are."""
+    return replace(get_size(config.model.size), sampled=config.model.sampled)
 
-    Args:
-        config: resolved.
-        interface: what they see and do.
-        device: where; None for the configuration's.
-    """
-    size = replace(get_size(config.model.size), sampled=config.model.sampled)
+
+def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
+    """Make the networks of a resolved configuration, with initial weights from torch's generator."""
     decodes = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).decodes
-    return Agent(size, interface, decodes, config.loss.min_std).to(device or config.device)
+    return Agent(size_of(config), interface, decodes, config.loss.min_std).to(config.device)
 
 
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
     """Make the learner of a recipe's configuration."""
     if isinstance(config, DreamerConfig):
-        with seeded(config.seed):
-            agent = make_agent(config, interface, device)
-            losses = make_losses(agent, config.loss, config.model.imagination_horizon)
-        return DreamerLearner(agent, losses, make_optimizer(agent, losses, config.model), config.model)
+        model = config.model
+        return make_dreamer(
+            size_of(config),
+            interface,
+            config.loss,
+            model,
+            horizon=model.imagination_horizon,
+            device=device,
+            seed=config.seed,
+        )
     assert isinstance(config, (PPORunConfig, SACRunConfig))
     size = NetworkSize(config.network.layers, config.network.units)
     if isinstance(config, SACRunConfig):

@@ -15,6 +15,12 @@ from dreamer_racing.envs.race.starts import StartPose
 from dreamer_racing.envs.simulator.base import DroneState
 
 
+def check_share(share: float) -> None:
+    """Refuse what is no share of episodes, and all of them, for only others leave crashes."""
+    if not 0.0 <= share < 1.0:
+        raise ValueError(f"start_before_crash={share}: a share of episodes, at least 0 and below 1.")
+
+
 class CrashMemory:
     """Remembers where each drone was before it crashed, and lets a share of new episodes begin there.
 
@@ -42,10 +48,7 @@ class CrashMemory:
     def __init__(
         self, num_envs: int, share: float, control_dt: float, device: torch.device | str, dtype: torch.dtype
     ) -> None:
-        if not 0.0 <= share < 1.0:
-            raise ValueError(
-                f"start_before_crash={share}: a share of episodes lies between 0 and 1, below it; others leave crashes."
-            )
+        check_share(share)
         self.share = share
         self._lags = tuple(max(1, round(seconds / control_dt)) for seconds in self.BEFORE)  # control steps
         depth = self._lags[1] + 1
@@ -82,6 +85,9 @@ class CrashMemory:
             mask: which drones begin, (N,) bool.
             start: where they begin otherwise.
             generator: source of randomness, on the device.
+
+        Returns:
+            Where they begin, (N, ...); read only where masked.
         """
         num, device, (least, most) = len(mask), mask.device, self._lags
         draw = torch.rand(num, 3, generator=generator, device=device, dtype=self.state.dtype)
@@ -100,12 +106,12 @@ class CrashMemory:
         self.crashed.masked_fill_(mask, value=False)
         self.steps.masked_fill_(mask, 0)
         position, attitude, velocity = self.state[chosen].split((3, 4, 3), -1)
-        wide = again.unsqueeze(-1)
+        column = again.unsqueeze(-1)  # (N, 1)
         return dataclasses.replace(
             start,
-            position=torch.where(wide, position, start.position),
-            attitude=torch.where(wide, attitude, start.attitude),
-            linear_velocity=torch.where(wide, velocity, start.linear_velocity),
+            position=torch.where(column, position, start.position),
+            attitude=torch.where(column, attitude, start.attitude),
+            linear_velocity=torch.where(column, velocity, start.linear_velocity),
             target_gate=torch.where(again, self.target[chosen], start.target_gate),
         )
 
