@@ -73,7 +73,8 @@ class DreamerRun(ReplayRun):
         """Take note of the gates passed too."""
         episodes = super().take_in(rollout)
         if len(episodes) and "gates_passed" in episodes:
-            self.metrics.push({"episode/pass_share": self.passes.update(episodes)})
+            share = self.passes.update(episodes)
+            self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})
         return episodes
 
     def measure(self) -> None:
@@ -116,7 +117,7 @@ class DreamerRun(ReplayRun):
         self.learner.adjust(**scheduled(self.config, times))
         ramp = self.config.schedule.start_on_line
         if ramp.to is not None:
-            share = ramp.at(self.config.env.start_on_line, times[ramp.by])
+            share = ramp.at(self.config.env.start_on_line, times)
             cast(DroneRacingEnv, self.env).worlds.start_on_line = share
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
@@ -209,7 +210,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         "replay": make_sequence_replay(config, env, curriculum, latents),
         "ratio": replay_ratio(config),
         "lag": ModelLag(config.schedule.wait_for_model),
-        "passes": PassShare(),
+        "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
     }
     return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)
 

@@ -79,6 +79,7 @@ class DroneRacingEnv(EnvBase):
             lap_time=number(1),
             crash=number(1, dtype=torch.int64),
             finished=flag(),
+            target_gate=number(1, dtype=torch.int64),
             shape=n,
             device=self.device,
         )
@@ -115,7 +116,7 @@ class DroneRacingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         outcome = self.worlds.step(tensordict["action"])
-        names = ("gates_passed", "gate_offset", "lap_time", "crash", "finished")
+        names = ("gates_passed", "gate_offset", "lap_time", "crash", "finished", "target_gate")
         data = {
             "reward_base": self._column(outcome.reward_base),
             "body_rate_norm": self._column(outcome.body_rate_norm),

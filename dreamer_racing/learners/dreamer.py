@@ -247,6 +247,7 @@ class DreamerLearner:
         discount: float | None = None,
         entropy_scale: float | None = None,
         min_std: float | None = None,
+        noise_correlation: float | None = None,
     ) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named stays.
 
@@ -257,6 +258,7 @@ class DreamerLearner:
             discount: γ.
             entropy_scale: Weight of the actor's entropy.
             min_std: Smallest standard deviation of actions.
+            noise_correlation: ρ of the noise of imagined actions.
         """
         if rates is not None:
             for group, rate in zip(self._groups, self._rates, strict=True):
@@ -265,6 +267,8 @@ class DreamerLearner:
             self._set_in_losses("discount", discount)
         if entropy_scale is not None:
             self._set_in_losses("entropy_scale", entropy_scale)
+        if noise_correlation is not None:
+            self._set_in_losses("noise_correlation", noise_correlation)
         if min_std is not None:
             self.agent.actor.min_std.fill_(min_std)
             self.flying_agent.actor.min_std.fill_(min_std)

@@ -106,7 +106,7 @@ class ActorLoss(LossModule):
         self.lambda_ = lambda_
         self.entropy_scale = scheduled(entropy_scale)
         self.continuation = continuation
-        self.noise_correlation = noise_correlation
+        self.noise_correlation = scheduled(noise_correlation)
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod

@@ -28,7 +28,7 @@ class Imagination(NamedTuple):
 
 
 def imagine(
-    rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int, noise_correlation: float = 0.0
+    rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int, noise_correlation: float | Tensor = 0.0
 ) -> Imagination:
     """Let the policy act in the world model.
 
@@ -62,16 +62,16 @@ def imagine(
     return Imagination(torch.stack(features), torch.stack(actions))
 
 
-def next_noise(noise: Tensor | None, like: Tensor, correlation: float) -> Tensor:
+def next_noise(noise: Tensor | None, like: Tensor, correlation: float | Tensor) -> Tensor:
     """Return standard normal noise of the shape of ``like``, correlated with that of the step before, if there is one.
 
     Args:
         noise: Of the step before; None at the first.
         like: For shape, type and device.
-        correlation: ρ, from 0 to below 1.
+        correlation: ρ, from 0 to below 1, a number or a scalar.
     """
     fresh = torch.randn_like(like)
-    if noise is None or not correlation:
+    if noise is None:
         return fresh
     return correlation * noise + (1.0 - correlation**2) ** 0.5 * fresh
 

@@ -28,7 +28,7 @@ class EpisodeTracker:
         >>> #     metrics.push(tracker.summary(episodes))
     """
 
-    _FACTS = ("gates_passed", "crash", "finished")
+    _FACTS = ("gates_passed", "crash", "finished", "target_gate")
 
     def __init__(self, num_envs: int, crash_causes: type[IntEnum] | None = None) -> None:
         self.crash_causes = crash_causes
@@ -45,7 +45,8 @@ class EpisodeTracker:
         Returns:
             Finished episodes, batch ``[E]``, on the CPU, in the order in which they ended: ``env`` int64, ``return``
             float32 (undiscounted), ``length`` int64 (control steps), and as they were at the episode's last step
-            ``truncated``, ``gates_passed``, ``crash`` and ``finished``, as far as the rollout has them, all ``(E,)``.
+            ``truncated``, ``gates_passed``, ``crash``, ``finished`` and ``target_gate``, as far as the rollout
+            has them, all ``(E,)``.
         """
         reward = rollout["next", "reward"].squeeze(-1).cpu().double()  # (N, T)
         done = rollout["next", "done"].squeeze(-1).cpu()

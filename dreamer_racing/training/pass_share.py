@@ -4,64 +4,84 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 
-MEMORY = 300
-"""Episodes over which the share is a running mean [choice]: it is then known to about 0.02."""
+MEMORY = 200
+"""Attempts at a gate over which its share is a running mean [choice]: it is then known to about 0.03."""
 
 
 class PassShare:
-    """The share of target gates that training episodes pass: passes / (passes + crashes).
+    """The share of flights that pass the hardest gate of a track, of those that come from the gate before it.
 
-    An episode that runs out of time has failed at no gate. Two gates and a crash are 0.67, five 0.83, twenty 0.95.
+    It is the hardest gate that tells when a whole lap is known: a mean over gates is high where most are passed and one
+    never is. What an episode does with its first gate is not counted, since training may begin one right before it.
+    An episode that runs out of time has failed at no gate.
+
+    Args:
+        num_gates: Of the track, G; 0: there is no race, and the share stays 0.
 
     Attributes:
-        best: The highest that the share has been, 0 before the first hundred episodes: it never goes back, so that
-            what is scheduled by it does not swing with it.
+        best: The highest that the share has been since each gate was tried half of `MEMORY` times, 0 before: it never
+            goes back, so that what is scheduled by it does not swing with it.
 
     Example:
-        >>> passes = PassShare()
-        >>> for _ in range(200):
-        ...     passes.add(gates=400.0, crashes=100.0, episodes=100)
-        >>> round(passes.best, 2)
-        0.8
+        >>> from tensordict import TensorDict
+        >>> passes = PassShare(num_gates=4)
+        >>> episodes = TensorDict(
+        ...     {"gates_passed": torch.tensor([4]), "target_gate": torch.tensor([0]), "crash": torch.tensor([1])}, [1]
+        ... )
+        >>> for _ in range(120):  # gate 0, then 1, 2, 3, and a crash at 0
+        ...     share = passes.update(episodes)
+        >>> passes.shares.tolist(), passes.best
+        ([0.0, 1.0, 1.0, 1.0], 0.0)
     """
 
-    def __init__(self) -> None:
+    def __init__(self, num_gates: int) -> None:
         self.best = 0.0
-        self._gates = self._crashes = self._episodes = 0.0  # forgotten at the rate of one in MEMORY episodes
+        self._passes = torch.zeros(num_gates, dtype=torch.float64)  # (G,), forgotten at the rate of one in MEMORY
+        self._attempts = torch.zeros(num_gates, dtype=torch.float64)  # (G,)
 
     def update(self, episodes: TensorDictBase) -> float:
         """Take note of finished episodes, batch ``[E]`` of ``EpisodeTracker.update``; return the share."""
-        if len(episodes) and "gates_passed" in episodes:
-            self.add(
-                gates=float(episodes["gates_passed"].sum()),
-                crashes=float((episodes["crash"] != 0).sum()),
-                episodes=len(episodes),
-            )
+        num_gates = len(self._passes)
+        if not num_gates or not len(episodes):
+            return self.share
+        passed, target = episodes["gates_passed"].unsqueeze(-1), episodes["target_gate"].unsqueeze(-1)  # (E, 1)
+        gates = torch.arange(num_gates)
+        # How many passes ago gate g was passed last, 1 being the pass before the target; then every G passes before it.
+        # The first pass of an episode, `passed` ago, is left out.
+        ago = (target - gates - 1) % num_gates + 1  # (E, G)
+        passes = ((passed - 1 - ago) // num_gates + 1).clamp(min=0).sum(0)  # (G,)
+        failed = (episodes["crash"].unsqueeze(-1) != 0) & (passed > 0) & (target == gates)
+        attempts = passes + failed.sum(0)
+        kept = (1.0 - 1.0 / MEMORY) ** attempts
+        self._passes = kept * self._passes + passes
+        self._attempts = kept * self._attempts + attempts
+        if self._attempts.min() >= MEMORY / 2:
+            self.best = max(self.best, self.share)
         return self.share
 
-    def add(self, gates: float, crashes: float, episodes: int) -> None:
-        """Take note of some episodes."""
-        kept = (1.0 - 1.0 / MEMORY) ** episodes
-        self._gates = kept * self._gates + gates
-        self._crashes = kept * self._crashes + crashes
-        self._episodes = kept * self._episodes + episodes
-        if self._episodes >= MEMORY / 3:
-            self.best = max(self.best, self.share)
+    @property
+    def shares(self) -> torch.Tensor:
+        """Of each gate as it is now, (G,); 0 before the first attempt."""
+        return self._passes / self._attempts.clamp(min=1.0)
 
     @property
     def share(self) -> float:
-        """As it is now; 0 before the first episode."""
-        attempts = self._gates + self._crashes
-        return self._gates / attempts if attempts else 0.0
+        """Of the hardest gate as it is now."""
+        return float(self.shares.min()) if len(self._passes) else 0.0
+
+    @property
+    def hardest_gate(self) -> int:
+        """Which gate that is, in the order of the track."""
+        return int(self.shares.argmin())
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {"best": self.best, "gates": self._gates, "crashes": self._crashes, "episodes": self._episodes}
+        return {"best": self.best, "passes": self._passes.clone(), "attempts": self._attempts.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.best = state_dict["best"]
-        self._gates, self._crashes = state_dict["gates"], state_dict["crashes"]
-        self._episodes = state_dict["episodes"]
+        self._passes, self._attempts = state_dict["passes"].clone(), state_dict["attempts"].clone()

@@ -203,15 +203,16 @@ def check_schedule(config: DreamerConfig) -> None:
     Raises:
         ValueError: the message names the ramp.
     """
+    of_losses = ("discount", "entropy_scale", "min_std", "noise_correlation")
     targets = {
         "learning_rates": POSITIVE,
-        **{name: allowed_values(config.loss, name) for name in ("discount", "entropy_scale", "min_std")},
+        **{name: allowed_values(config.loss, name) for name in of_losses},
         "start_on_line": allowed_values(config.env, "start_on_line"),
     }
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and ramp.by is Clock.passes and not is_race(config):
+        if ramp.to is not None and Clock.passes in ramp.clocks and not is_race(config):
             raise ValueError(
                 f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
             )

@@ -27,8 +27,9 @@ def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, flo
         "discount": (schedule.discount, loss.discount),
         "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
         "min_std": (schedule.min_std, loss.min_std),
+        "noise_correlation": (schedule.noise_correlation, loss.noise_correlation),
     }
-    return {name: ramp.at(value, times[ramp.by]) for name, (ramp, value) in now.items()}
+    return {name: ramp.at(value, times) for name, (ramp, value) in now.items()}
 
 
 def size_of(config: DreamerConfig) -> ModelSize:

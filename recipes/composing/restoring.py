@@ -198,7 +198,7 @@ def restore_learner(
     env.close()
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
-    passes = PassShare()
+    passes = PassShare(0)  # takes the gates of what is restored
     parts = {"learner": learner, "counters": counters, "passes": passes}
     load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
     if isinstance(learner, DreamerLearner):

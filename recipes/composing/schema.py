@@ -132,6 +132,7 @@ class ScheduleConfig:
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
+    noise_correlation: Ramp = field(default_factory=Ramp)  # loss.noise_correlation
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None

@@ -570,9 +570,9 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     recipe_module("composing.checks").check_dreamer(config)
-    learners, passes = recipe_module("composing.learners"), PassShare()
+    learners, passes = recipe_module("composing.learners"), PassShare(1)
     assert learners.scheduled(config, learners.clock_times(config, 100_000, passes))["min_std"] == pytest.approx(0.1)
-    passes.add(gates=150.0, crashes=100.0, episodes=200)  # 0.6
+    passes.best = 0.6
     assert learners.scheduled(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(0.075)
 
 

@@ -1,4 +1,4 @@
-"""The share of gates passed, by hand."""
+"""The share of flights that pass the hardest gate, by hand."""
 
 from __future__ import annotations
 
@@ -9,34 +9,55 @@ from tensordict import TensorDict
 from dreamer_racing.training.pass_share import MEMORY, PassShare
 
 
-def episodes(gates: list[int], crashes: list[int]) -> TensorDict:
-    return TensorDict({"gates_passed": torch.tensor(gates), "crash": torch.tensor(crashes)}, [len(gates)])
+def episodes(gates: list[int], targets: list[int], crashes: list[int]) -> TensorDict:
+    columns = {"gates_passed": gates, "target_gate": targets, "crash": crashes}
+    return TensorDict({name: torch.tensor(column, dtype=torch.int64) for name, column in columns.items()}, [len(gates)])
 
 
-def test_an_episode_fails_at_most_at_one_gate():
-    passes = PassShare()
+def test_an_episode_counts_the_gates_after_its_first():
+    passes = PassShare(3)
     assert passes.share == 0.0
-    assert passes.update(episodes([2, 0, 3], [1, 3, 0])) == pytest.approx(5 / 7)  # the last ran out of time
-    assert passes.update(episodes([], [])) == pytest.approx(5 / 7)
-    assert passes.update(TensorDict({}, [3])) == pytest.approx(5 / 7)  # episodes of no race
+    passes.update(episodes([3], [0], [1]))  # from gate 0 on: 0 does not count, 1 and 2 are passed, crash before 0
+    assert passes.shares.tolist() == [0.0, 1.0, 1.0]
+    assert passes.share == 0.0 and passes.hardest_gate == 0
+    passes.update(episodes([], [], []))
+    passes.update(episodes([0, 1], [0, 1], [1, 0]))  # a crash before the first gate, and time that ran out after it
+    assert passes.shares.tolist() == [0.0, 1.0, 1.0]
 
 
-def test_the_best_counts_after_a_hundred_episodes_and_never_goes_back():
-    passes = PassShare()
-    passes.add(gates=99.0, crashes=0.0, episodes=99)
-    assert passes.best == 0.0
-    passes.add(gates=30.0, crashes=0.0, episodes=30)
+def test_laps_count_each_pass():
+    passes = PassShare(3)
+    passes.update(
+        episodes([7, 1, 1], [2, 1, 1], [0, 2, 3])
+    )  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
+    assert passes.shares.tolist() == pytest.approx([1.0, 2 / 4, 1.0], abs=0.01)
+    assert passes.share == pytest.approx(0.5, abs=0.01) and passes.hardest_gate == 1
+
+
+def test_where_there_are_no_gates_the_share_stays_0():
+    passes = PassShare(0)
+    assert passes.update(TensorDict({}, [3])) == 0.0 and passes.best == 0.0
+
+
+def test_the_best_counts_once_each_gate_was_tried_and_never_goes_back():
+    passes = PassShare(2)
+    passes.update(episodes([150, 2], [0, 0], [0, 0]))
+    assert passes.best == 0.0  # 75 attempts at each
+    for _ in range(4):
+        passes.update(episodes([150], [0], [0]))
     assert passes.best == 1.0
-    passes.add(gates=0.0, crashes=1000.0, episodes=1000)
+    passes.update(episodes([1] * 1000, [0] * 1000, [1] * 1000))
     assert passes.share < 0.1 and passes.best == 1.0
 
 
-def test_old_episodes_are_forgotten():
-    passes = PassShare()
-    passes.add(gates=1000.0, crashes=0.0, episodes=1000)
-    for _ in range(20):
-        passes.add(gates=0.5 * MEMORY / 20, crashes=0.5 * MEMORY / 20, episodes=MEMORY // 20)
-    assert 0.5 < passes.share < 0.95
-    resumed = PassShare()
+def test_old_attempts_are_forgotten_and_a_resumed_run_remembers_what_is_left():
+    passes = PassShare(2)
+    for _ in range(MEMORY):
+        passes.update(episodes([11], [0], [0]))
+    before = passes.share
+    for _ in range(MEMORY):
+        passes.update(episodes([1], [0], [1]))
+    assert before == 1.0 and 0.2 < passes.share < 0.6
+    resumed = PassShare(0)
     resumed.load_state_dict(passes.state_dict())
-    assert (resumed.share, resumed.best) == (passes.share, passes.best)
+    assert (resumed.share, resumed.best, resumed.hardest_gate) == (passes.share, passes.best, 0)
