@@ -26,7 +26,8 @@ from measuring import print_table, write_json
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
+from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import turn
 from dreamer_racing.envs.race.pilot import ScriptedPilot

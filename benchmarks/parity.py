@@ -19,9 +19,10 @@ from measuring import print_table, write_json
 from PIL import Image
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import load_preset, without_randomisation
+from dreamer_racing.envs.drone.parameters import load_preset, without_randomisation
 from dreamer_racing.envs.race.pilot import ScriptedPilot
-from dreamer_racing.envs.simulator import MujocoSimulator, WarpSimulator
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 

@@ -44,7 +44,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv

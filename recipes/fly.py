@@ -25,7 +25,7 @@ from hydra.core.config_store import ConfigStore
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv

@@ -38,7 +38,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.dm_control_env import _choose_gl_backend
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
 _choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
 

@@ -29,12 +29,13 @@ import torch
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import Quadrotor, QuadrotorParameters, at_control_rate, load_preset
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, at_control_rate, load_preset
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.rendering import GL_LIBRARIES, RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE

@@ -29,7 +29,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE

@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions

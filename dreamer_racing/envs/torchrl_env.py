@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
-from dreamer_racing.envs.simulator import check_device
+from dreamer_racing.envs.simulator.backends import check_device
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds
 

@@ -58,7 +58,7 @@ def launch_viewer(env: Any, policy: Callable[[Any], np.ndarray] | None = None) -
 
 def hover(time_step: Any) -> np.ndarray:
     """The action (4,) that holds altitude when level, whatever the observation."""
-    from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+    from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 
     return np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
 

@@ -10,14 +10,20 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters, at_control_rate, load_preset, without_randomisation
+from dreamer_racing.envs.drone.parameters import (
+    QuadrotorParameters,
+    at_control_rate,
+    load_preset,
+    without_randomisation,
+)
 from dreamer_racing.envs.race.crash_memory import CrashMemory, check_share
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator import Simulator, check_device, make_simulator
+from dreamer_racing.envs.simulator.backends import check_device, make_simulator
+from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction

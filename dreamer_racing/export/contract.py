@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.export.actor_step import OUTPUTS, ActorStep

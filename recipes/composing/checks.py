@@ -11,7 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from composing.schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig, is_race
-from dreamer_racing.envs.drone.quadrotor import at_control_rate, load_preset
+from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track

@@ -31,7 +31,7 @@ def plain_errors() -> Iterator[None]:
 
 
 def _renderer_error() -> type[Exception]:
-    from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+    from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
     return RendererUnavailableError
 

@@ -7,7 +7,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from dreamer_racing.envs.drone.quadrotor import MIN_CONTROL_RATE
+from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.dreamer import LearnerConfig
 from dreamer_racing.losses import LossConfig

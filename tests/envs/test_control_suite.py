@@ -12,7 +12,7 @@ from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing.envs.control_suite as dmc_module
 from dreamer_racing.envs.control_suite import TASKS, ControlSuiteEnv
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules.interface import Interface
 from tests.dreamers import learner_of
 

@@ -17,11 +17,11 @@ from torchrl.envs.utils import check_env_specs
 from dreamer_racing.envs import dm_control_env as task_module
 from dreamer_racing.envs import viewer
 from dreamer_racing.envs.dm_control_env import NoseCamera, load
-from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.rewards import RewardWeights
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import dreamer_racing
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import DroneRaceGymEnv, DroneRaceVectorEnv
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv

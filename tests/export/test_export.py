@@ -17,7 +17,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import actor_step as export

@@ -16,7 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.lesions import LESIONS
 from dreamer_racing.modules import Interface

@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse, turn
 from dreamer_racing.envs.race.race import EVALUATION_TIME, RaceStep
 from dreamer_racing.envs.race.racing_line import Dynamics, LineLimits, Reference, plan_racing_line

@@ -15,7 +15,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.tracks import Track
 
 DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous

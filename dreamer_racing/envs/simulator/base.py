@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import Quadrotor, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.looks import Looks, LooksSampler
 

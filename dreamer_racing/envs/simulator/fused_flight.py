@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import ROTOR_SPINS, Quadrotor
+from dreamer_racing.envs.drone.parameters import ROTOR_SPINS
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 

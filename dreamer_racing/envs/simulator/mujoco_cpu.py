@@ -5,7 +5,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.simulator.base import Simulator, no_images
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer

@@ -8,7 +8,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.simulator.base import Simulator, no_images
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.ray_caster import RayCaster

@@ -16,36 +16,25 @@ Workers, in the order in which `renderer="auto"` tries them:
 Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
 
-import atexit
-import ctypes
-import importlib
 import logging
-import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Protocol
 
 import mujoco
-import numpy as np
 import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.looks import Looks
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError, open_scene, require_library
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
-from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
+from dreamer_racing.envs.simulator.scene import Camera
 
 logger = logging.getLogger(__name__)
 
-MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
-GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
 RENDERERS = ("egl", "osmesa", "warp")
 HYBRID = "warp_cuda"
-
-
-class RendererUnavailableError(RuntimeError):
-    """No image can be drawn this way on this machine; the message says why and what would help."""
 
 
 class NoseMount:
@@ -145,68 +134,32 @@ class Renderer:
 
 
 class OpenGLWorker:
-    """MuJoCo's OpenGL renderer with a context of its own.
+    """MuJoCo's OpenGL renderer.
 
     Args:
         backend: `egl` or `osmesa`.
         model: the compiled scene.
         camera: the nose camera.
+
+    Raises:
+        RendererUnavailableError: OpenGL did not start.
     """
 
     def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
-        gl = importlib.import_module(f"mujoco.{backend}")
-        self._gl: Any = gl.GLContext(camera.width, camera.height)
-        atexit.register(self._gl.free)  # runs before MuJoCo's own hook terminates the display
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._viewport = mujoco.MjrRect(0, 0, camera.width, camera.height)
-        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = 0
-        option.geomgroup[HALL_GROUP] = 1
-        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        view = mujoco.MjvCamera()
-        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        view.fixedcamid = model.camera(CAMERA_NAME).id
-        mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
-        self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
+        self._scene = open_scene(backend, model, camera)
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
         """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
-        buffer, upright = self._buffer, self._buffer[::-1]  # OpenGL's first row is the lowest
         positions, ups, forwards = position.numpy(), axes[:, 1].numpy(), (-axes[:, 2]).numpy()
         images = out.numpy()
         for index in range(len(images)):
             if looks is not None:
-                self._dress(looks.colors[index].numpy(), looks.field_of_view[index].item())
-            for eye in self._eyes:
-                eye.pos = positions[index]
-                eye.up = ups[index]
-                eye.forward = forwards[index]
-            mujoco.mjr_render(self._viewport, self._scene, self._context)
-            mujoco.mjr_readPixels(buffer, None, self._viewport, self._context)
-            images[index] = upright
-
-    def _dress(self, colors: np.ndarray, field_of_view: float) -> None:
-        """Give the scene's materials their colours (K, 3), and the camera its vertical field of view, degrees."""
-        for geom in self._scene.geoms[: self._scene.ngeom]:
-            geom.rgba[:3] = colors[geom.matid]
-        for eye in self._eyes:
-            eye.frustum_top = eye.frustum_near * math.tan(math.radians(field_of_view) / 2)
-            eye.frustum_bottom = -eye.frustum_top
+                self._scene.dress(looks.colors[index].numpy(), looks.field_of_view[index].item())
+            self._scene.draw(positions[index], ups[index], forwards[index], images[index])
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._context.free()
-        self._gl.free()
-        atexit.unregister(self._gl.free)
+        self._scene.close()
 
 
 def make_renderer(
@@ -253,27 +206,5 @@ def _worker_factory(
         if device == "cuda" and not torch.cuda.is_available():
             raise RendererUnavailableError(f"{name} needs a CUDA device, and torch {torch.__version__} finds none.")
         return lambda: RayCaster(model, camera, frames, device, varied_looks)
-    _require_library(name)
-    # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-
-    def make() -> Worker:
-        try:
-            return OpenGLWorker(name, model, camera)
-        except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
-            raise RendererUnavailableError(f"{name} did not start ({type(error).__name__}: {error}).") from error
-
-    return make
-
-
-def _require_library(name: str) -> None:
-    for library in GL_LIBRARIES[name]:
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
-        return
-    raise RendererUnavailableError(
-        f"{name} needs {GL_LIBRARIES[name][0]}, which is not installed "
-        f"(Debian: apt-get install {'libegl1 libgl1-mesa-dri' if name == 'egl' else 'libosmesa6'})."
-    )
+    require_library(name)
+    return lambda: OpenGLWorker(name, model, camera)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from dreamer_racing.envs.drone.quadrotor import GRAVITY, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.tracks import Gate, Track
 
 HALL_GROUP = 0  # geom group of hall and gates

@@ -9,9 +9,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 Vector = tuple[float, float, float]
 
@@ -114,23 +115,30 @@ class Track:
         """Number of race gates, which is the number of passes in a lap."""
         return len(self.gates)
 
-    def gate_positions(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    def gate_positions(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
         """Return the centres of the race gates, (G, 3), m."""
-        return torch.tensor([gate.position for gate in self.gates], device=device, dtype=dtype)
+        return _tensor([gate.position for gate in self.gates], device, dtype)
 
-    def gate_yaws(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    def gate_yaws(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
         """Return the directions of flight through the race gates, (G,), rad."""
-        return torch.tensor([math.radians(gate.yaw_degrees) for gate in self.gates], device=device, dtype=dtype)
+        return _tensor([math.radians(gate.yaw_degrees) for gate in self.gates], device, dtype)
 
-    def gate_normals(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    def gate_normals(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
         """Return the unit directions of flight through the race gates, (G, 3)."""
-        return torch.tensor([gate.forward for gate in self.gates], device=device, dtype=dtype)
+        return _tensor([gate.forward for gate in self.gates], device, dtype)
 
-    def gate_rotations(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    def gate_rotations(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
         """Return the rotations gate → world, (G, 3, 3): their columns are forward, left and up."""
         up = (0.0, 0.0, 1.0)
         columns = [(gate.forward, gate.left, up) for gate in self.gates]
-        return torch.tensor(columns, device=device, dtype=dtype).mT.contiguous()
+        return _tensor(columns, device, dtype).mT.contiguous()
+
+
+def _tensor(values: Any, device: torch.device | str, dtype: torch.dtype | None) -> torch.Tensor:
+    """Return numbers as a tensor, float32 if not said otherwise; who only reads a track does not load torch."""
+    import torch
+
+    return torch.tensor(values, device=device, dtype=dtype or torch.float32)
 
 
 def make_track(

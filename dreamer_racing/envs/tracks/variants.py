@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from dreamer_racing.envs.tracks.loading import load_track
 from dreamer_racing.envs.tracks.track import Gate, Track, TrackError
 from dreamer_racing.envs.tracks.validation import validate_track
+
+if TYPE_CHECKING:
+    import torch
 
 DECOYS = {"paper": {"figure8": "figure8_decoys"}}
 """Sets of decoys: for each the tracks that have it, and the built-in track that shows where its decoys stand."""
@@ -86,6 +88,8 @@ def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -
         >>> displaced.start_position == load_track("circle").start_position
         True
     """
+    import torch  # who does not displace gates does not load it
+
     generator = torch.Generator().manual_seed(seed)
     for _ in range(ATTEMPTS):
         displaced = dataclasses.replace(
@@ -106,6 +110,8 @@ def displace_gates(track: Track, shift: float, turn_degrees: float, seed: int) -
 
 def _displace(gate: Gate, shift: float, turn_degrees: float, generator: torch.Generator) -> Gate:
     """Draw the displacement of one gate."""
+    import torch
+
     direction = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     radius, turn = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
     x, y, z = (

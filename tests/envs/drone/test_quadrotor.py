@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dreamer_racing.envs.drone.quadrotor import GRAVITY, PRESETS, Quadrotor, QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
-from dreamer_racing.envs.simulator import MujocoSimulator
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import build_drone
 from dreamer_racing.envs.tracks import load_track
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import PRESETS, QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 

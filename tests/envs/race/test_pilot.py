@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot, fly_laps
 from dreamer_racing.envs.race.racing_line import LineLimits, RacingLine, plan_racing_line

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from dreamer_racing.envs.drone.quadrotor import GRAVITY, load_preset, without_randomisation
+from dreamer_racing.envs.drone.parameters import GRAVITY, load_preset, without_randomisation
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import ScriptedPilot

@@ -8,11 +8,12 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.envs.drone.quadrotor import PRESETS
+from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator import MujocoSimulator, WarpSimulator, mujoco_warp
-from dreamer_racing.envs.simulator.mujoco_warp import memory_of_worlds
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator import mujoco_warp
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator, memory_of_worlds
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds

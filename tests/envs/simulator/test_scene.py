@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS, QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import PRESETS, QuadrotorParameters
 from dreamer_racing.envs.simulator.scene import CAMERA_NAME, DRONE_GROUP, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, Track, load_track
 

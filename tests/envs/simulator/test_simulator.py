@@ -14,11 +14,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.quadrotor import PRESETS, Quadrotor
+from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
-from dreamer_racing.envs.simulator import MujocoSimulator, rendering
-from dreamer_racing.envs.simulator.rendering import RendererUnavailableError
+from dreamer_racing.envs.simulator import opengl, rendering
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import load_track
 
@@ -28,7 +30,7 @@ KIDNEY = load_track("kidney")
 
 def renderer_or_skip(name: str) -> str:
     """The name, if the OpenGL library behind it loads here."""
-    libraries = rendering.GL_LIBRARIES.get(name, ())
+    libraries = opengl.GL_LIBRARIES.get(name, ())
     for library in libraries:
         try:
             ctypes.CDLL(library)
@@ -211,7 +213,7 @@ def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
         "import sys, torch\n"
         "from dreamer_racing.envs.simulator.scene import Camera, build_scene\n"
         "from dreamer_racing.envs.simulator.rendering import make_renderer\n"
-        "from dreamer_racing.envs.drone.quadrotor import PRESETS\n"
+        "from dreamer_racing.envs.drone.parameters import PRESETS\n"
         "from dreamer_racing.envs.tracks import load_track\n"
         "for size in (32, 64, 96):\n"
         "    camera = Camera(size, size)\n"
@@ -290,7 +292,7 @@ def test_nothing_hangs_in_mid_air() -> None:
     """OpenGL draws the hall and nothing else: no sites, frames or cameras."""
     renderer_or_skip("egl")
     model = build_scene(KIDNEY, EASY).compile()
-    worker = rendering.OpenGLWorker("egl", model, Camera())
+    worker = opengl.OpenGLScene("egl", model, Camera())
     kinds = {worker._scene.geoms[index].objtype for index in range(worker._scene.ngeom)}
     worker.close()
     assert kinds == {int(mujoco.mjtObj.mjOBJ_GEOM)}
@@ -328,7 +330,7 @@ def without(*libraries: str):
 
 
 def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(rendering.ctypes, "CDLL", without("libEGL", "libOSMesa"))
+    monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL", "libOSMesa"))
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         made = simulator(2, "auto")
     assert made.renderer is not None
@@ -340,7 +342,7 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
 
 
 def test_renderer_that_was_asked_for_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering.ctypes, "CDLL", without("libEGL"))
+    monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL"))
     with pytest.raises(RendererUnavailableError, match="egl needs libEGL.so.1"):
         simulator(1, "egl")
 
@@ -350,7 +352,7 @@ def test_opengl_that_does_not_start_is_a_reason_too(monkeypatch: pytest.MonkeyPa
         raise RuntimeError("no device")
 
     renderer_or_skip("egl")
-    monkeypatch.setattr(rendering, "OpenGLWorker", broken)
+    monkeypatch.setattr(opengl, "OpenGLScene", broken)
     with pytest.raises(RendererUnavailableError, match=r"egl did not start \(RuntimeError: no device\)"):
         simulator(1, "egl")
 

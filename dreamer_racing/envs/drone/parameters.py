@@ -1,0 +1,131 @@
+"""Physical and control parameters of the quadrotor, as plain numbers: no torch in here.
+
+Sources of numbers: [paper] Romero et al., "Dream to Fly"; [rpg] public code of the same laboratory; [choice] this
+project's, because nobody published it.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+GRAVITY = 9.81  # m/s²
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Half-widths of the uniform, per-episode randomisation of each drone, relative unless a unit is given [rpg]."""
+
+    mass: float = 0.05
+    inertia: float = 0.10  # each axis on its own
+    drag: float = 0.10
+    thrust: float = 0.10  # all four rotors together: battery voltage
+    torque: float = 0.01
+    delay_max: float = 0.040  # s; the command delay is uniform in [0, delay_max]
+
+
+@dataclass(frozen=True)
+class QuadrotorParameters:
+    """Physical and control parameters of the drone, in SI units.
+
+    Example:
+        >>> QuadrotorParameters().hover_action
+        -0.26407
+    """
+
+    mass: float = 0.6  # kg [paper]
+    inertia: tuple[float, float, float] = (0.002410, 0.001800, 0.003759)  # kg m², principal axes = body axes [paper]
+    arm_length: float = 0.14  # m, centre to rotor [paper]; X layout [choice]
+    torque_constant: float = 0.022  # m: N m of yaw torque per N of rotor thrust [paper]
+    rotor_thrust_max: float = 4.0  # N, thrust-to-weight ratio 2.72 [paper]
+    motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/(m/s), linear rotor drag in the body frame
+    body_rate_max: tuple[float, float, float] = (10.0, 10.0, 4.0)  # rad/s at action ±1 [rpg]
+    collective_thrust_scale: float = 13.33  # m/s²: c = scale · (1 + a) [rpg]
+    rate_gain: float = 15.0  # 1/s, proportional body-rate loop [choice]
+    command_delay: float = 0.0  # s
+    physics_dt: float = 0.002  # s [rpg]
+    control_dt: float = 0.02  # s, 50 Hz [rpg]
+    integrator: str = "Euler"  # MuJoCo's name of it
+    randomisation: Randomisation | None = None
+
+    def __post_init__(self) -> None:
+        steps = self.control_dt / self.physics_dt
+        if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+            raise ValueError(
+                f"QuadrotorParameters: control_dt={self.control_dt} s must be a whole multiple of "
+                f"physics_dt={self.physics_dt} s (e.g. 0.02 and 0.002)."
+            )
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.control_dt / self.physics_dt)
+
+    @property
+    def hover_action(self) -> float:
+        """Collective-thrust action that holds altitude when level."""
+        return round(GRAVITY / self.collective_thrust_scale - 1.0, 5)
+
+    @property
+    def rotor_positions(self) -> tuple[tuple[float, float], ...]:
+        """(x, y) of the rotors in m: rear right, front right, rear left, front left (Betaflight's order)."""
+        d = self.arm_length / math.sqrt(2.0)
+        return ((-d, -d), (d, -d), (-d, d), (d, d))
+
+
+ROTOR_SPINS = (1.0, -1.0, -1.0, 1.0)  # sign of the yaw torque on the body of each rotor (Betaflight's "props in")
+
+PRESETS: dict[str, QuadrotorParameters] = {
+    "easy": QuadrotorParameters(),
+    "faithful": QuadrotorParameters(
+        drag=(0.26, 0.28, 0.42),  # [rpg]
+        command_delay=0.020,  # [rpg]
+        physics_dt=0.001,  # [rpg]
+        integrator="RK4",  # [rpg]
+        randomisation=Randomisation(),
+    ),
+}
+
+
+def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
+    """Return the parameters of a named preset (`easy`, `faithful`), or the given parameters themselves.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if isinstance(preset, QuadrotorParameters):
+        return preset
+    if preset not in PRESETS:
+        raise ValueError(f"Unknown physics preset {preset!r}: the presets are {', '.join(sorted(PRESETS))}.")
+    return PRESETS[preset]
+
+
+MIN_CONTROL_RATE = 10.0
+"""Hz: the lowest rate of actions; at 18 m/s a drone flies 1.8 m in a step then [choice]."""
+
+
+def at_control_rate(parameters: QuadrotorParameters, rate: float) -> QuadrotorParameters:
+    """The same drone with so many actions a second.
+
+    Args:
+        parameters: of the drone.
+        rate: Hz, at least ``MIN_CONTROL_RATE``; a control step must be a whole number of physics steps.
+
+    Raises:
+        ValueError: it is not, or the rate is lower.
+    """
+    if not rate >= MIN_CONTROL_RATE:
+        raise ValueError(
+            f"control_rate={rate} Hz: at least {MIN_CONTROL_RATE:g}, because a control step can pass one gate only."
+        )
+    steps = round(1.0 / (rate * parameters.physics_dt))
+    if steps < 1 or abs(rate * steps * parameters.physics_dt - 1.0) > 1e-6:
+        raise ValueError(
+            f"control_rate={rate} Hz: a control step must be a whole number of physics steps of "
+            f"{parameters.physics_dt * 1e3:g} ms, for example 50 or 25 Hz."
+        )
+    return replace(parameters, control_dt=steps * parameters.physics_dt)
+
+
+def without_randomisation(parameters: QuadrotorParameters) -> QuadrotorParameters:
+    """The same drone with nominal parameters in every episode (drag and delay stay)."""
+    return replace(parameters, randomisation=None)

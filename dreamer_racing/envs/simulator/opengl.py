@@ -1,0 +1,120 @@
+"""MuJoCo's OpenGL renderer as this project uses it: one scene that stands still, seen by a camera that is put anywhere.
+
+No torch in here: whoever flies an exported actor draws with this too (`dreamer_racing.hil`).
+"""
+
+import atexit
+import ctypes
+import importlib
+import math
+import os
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
+
+MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
+GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
+
+
+class RendererUnavailableError(RuntimeError):
+    """No image can be drawn this way on this machine; the message says why and what would help."""
+
+
+class OpenGLScene:
+    """A compiled scene in an OpenGL context of its own; to be used in the thread that made it.
+
+    Args:
+        backend: `egl` or `osmesa`.
+        model: the compiled scene.
+        camera: the nose camera.
+    """
+
+    def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
+        gl = importlib.import_module(f"mujoco.{backend}")
+        self._gl: Any = gl.GLContext(camera.width, camera.height)
+        atexit.register(self._gl.free)  # runs before MuJoCo's own hook terminates the display
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._viewport = mujoco.MjrRect(0, 0, camera.width, camera.height)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 0
+        option.geomgroup[HALL_GROUP] = 1
+        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        view = mujoco.MjvCamera()
+        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = model.camera(CAMERA_NAME).id
+        mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
+        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
+        self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
+        self._upright = self._buffer[::-1]  # OpenGL's first row is the lowest
+
+    def draw(self, position: np.ndarray, up: np.ndarray, forward: np.ndarray, out: np.ndarray) -> None:
+        """Draw what a camera sees.
+
+        Args:
+            position: of the camera, (3,) m.
+            up: the camera's up direction in the world, (3,).
+            forward: the direction in which it looks, (3,).
+            out: takes the image, uint8 RGB (height, width, 3), first row at the top.
+        """
+        for eye in self._eyes:
+            eye.pos, eye.up, eye.forward = position, up, forward
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(self._buffer, None, self._viewport, self._context)
+        out[:] = self._upright
+
+    def dress(self, colors: np.ndarray, field_of_view: float) -> None:
+        """Give the scene's materials their colours (K, 3), and the camera its vertical field of view, degrees."""
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            geom.rgba[:3] = colors[geom.matid]
+        for eye in self._eyes:
+            eye.frustum_top = eye.frustum_near * math.tan(math.radians(field_of_view) / 2)
+            eye.frustum_bottom = -eye.frustum_top
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._context.free()
+        self._gl.free()
+        atexit.unregister(self._gl.free)
+
+
+def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
+    """Make a scene.
+
+    Raises:
+        RendererUnavailableError: OpenGL did not start; the message says why.
+    """
+    # llvmpipe, Mesa's software rasteriser, must not start threads of its own beside ours
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    try:
+        return OpenGLScene(backend, model, camera)
+    except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
+        raise RendererUnavailableError(f"{backend} did not start ({type(error).__name__}: {error}).") from error
+
+
+def require_library(backend: str) -> None:
+    """Refuse a back end whose library is not installed.
+
+    Raises:
+        RendererUnavailableError: the message says how to install it.
+    """
+    for library in GL_LIBRARIES[backend]:
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return
+    raise RendererUnavailableError(
+        f"{backend} needs {GL_LIBRARIES[backend][0]}, which is not installed "
+        f"(Debian: apt-get install {'libegl1 libgl1-mesa-dri' if backend == 'egl' else 'libosmesa6'})."
+    )
