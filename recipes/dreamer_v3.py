@@ -24,7 +24,8 @@ from composing.building import (
     seed_generators,
 )
 from composing.checks import check_dreamer, replay_ratio
-from composing.command_line import CONFIG_DIR, choose_device, computes_bfloat16
+from composing.command_line import CONFIG_DIR
+from composing.devices import choose_device, computes_bfloat16
 from composing.launching import launch
 from composing.learners import clock_times, make_agent, scheduled
 from composing.schema import Collection, DreamerConfig, register

@@ -37,6 +37,10 @@ from dreamer_racing.training.directory import (
 logger = logging.getLogger(__name__)
 
 
+class RunCheckpointError(CheckpointError, ValueError):
+    """A checkpoint that cannot be written, or not be read for what it is wanted; the message says what to do."""
+
+
 class RandomState(GlobalRNGState):
     """State of the Python, NumPy and torch generators; that of devices absent here is skipped with a warning."""
 
@@ -128,7 +132,7 @@ class RunCheckpoints:
             The checkpoint's folder.
 
         Raises:
-            CheckpointError: if it cannot be written; the previous checkpoints are untouched.
+            RunCheckpointError: if it cannot be written; the previous checkpoints are untouched.
         """
         final = self.directory / f"{PREFIX}-{env_steps:012d}"
         if final == self._last_saved:
@@ -141,7 +145,7 @@ class RunCheckpoints:
             _publish(partial, final)
         except Exception as error:
             shutil.rmtree(partial, ignore_errors=True)
-            raise CheckpointError(
+            raise RunCheckpointError(
                 f"The checkpoint {final} could not be written ({error}). Earlier checkpoints are untouched; check the "
                 "free space and the permissions of that folder, then resume."
             ) from error
@@ -168,7 +172,7 @@ class RunCheckpoints:
 
         Raises:
             FileNotFoundError: if there is no complete checkpoint.
-            CheckpointError: if a part is missing or does not fit.
+            RunCheckpointError: if a part is missing or does not fit.
         """
         source = latest_checkpoint(self.directory if path is None else path)
         self._last_saved = None
@@ -234,7 +238,7 @@ def load_components(
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
-        CheckpointError: if a part is missing or does not fit.
+        RunCheckpointError: if a part is missing or does not fit.
     """
     source = latest_checkpoint(path)
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
@@ -257,7 +261,7 @@ def load_state(
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
-        CheckpointError: if it has no such part.
+        RunCheckpointError: if it has no such part.
     """
     state = _PlainState()
     metadata = load_components(path, {part: state}, map_location)
@@ -292,7 +296,7 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
     try:
         return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
-        raise CheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
+        raise RunCheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
 
 
 def _check_loadable(path: Path) -> None:

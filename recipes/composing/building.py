@@ -16,7 +16,8 @@ from torchrl.envs import Compose, InitTracker
 
 from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name
 from composing.checks import refuse_to_replace
-from composing.command_line import CONFIG_DIR, choose_device, new_run_dir
+from composing.command_line import CONFIG_DIR, new_run_dir
+from composing.devices import choose_device
 from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME

@@ -1,4 +1,4 @@
-"""What every recipe does around its own work: plain errors for bad input, logging, device choice, run directories."""
+"""What every recipe does around its own work: plain errors for bad input, logging, run directories; no torch."""
 
 import logging
 import sys
@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
-import torch
 from omegaconf.errors import MissingMandatoryValue
-from torchrl.checkpoint import CheckpointError
+
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
 CONFIG_DIR = Path(__file__).parents[1] / "config"
 
@@ -25,18 +25,9 @@ def plain_errors() -> Iterator[None]:
     except MissingMandatoryValue as error:
         print(f"error: {error.full_key}= is missing, and there is no default.", file=sys.stderr)
         raise SystemExit(2) from error
-    except (ValueError, OSError, CheckpointError, RendererError) as error:
+    except (ValueError, OSError, RendererUnavailableError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
-
-
-def _renderer_error() -> type[Exception]:
-    from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
-
-    return RendererUnavailableError
-
-
-RendererError = _renderer_error()
 
 
 def start_logging() -> None:
@@ -44,34 +35,6 @@ def start_logging() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-
-
-def choose_device(device: str) -> torch.device:
-    """Resolve `auto`, and refuse a device that is not there.
-
-    Raises:
-        ValueError: not a device of this machine.
-    """
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        chosen = torch.device(device)
-        torch.empty(1, device=chosen)
-    except (RuntimeError, AssertionError) as error:
-        available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-        raise ValueError(
-            f"device={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "
-            "device=auto takes the best."
-        ) from error
-    return chosen
-
-
-def computes_bfloat16(device: torch.device) -> bool:
-    """Whether a device multiplies in bfloat16 natively, rather than slowly by way of float32."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    capabilities = torch.cpu.get_capabilities()
-    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
 def new_run_dir(recipe: str, track: str) -> Path:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 
 from composing.arena import Environment, make_env
-from composing.command_line import choose_device
+from composing.devices import choose_device
 from composing.learners import clock_times, make_learner, scheduled
 from composing.saved import trained_config
 from composing.schema import (
