@@ -1,0 +1,301 @@
+"""What a Betaflight flight controller must be set to for an actor, and whether it is.
+
+    python -m dreamer_racing.hil.betaflight print --contract agents/kidney/contract.json --link crsf
+    python -m dreamer_racing.hil.betaflight check --contract agents/kidney/contract.json --link crsf --dump dump.txt
+
+The first prints lines for the flight controller's CLI. The second reads what ``dump all`` or ``diff all`` gave there,
+and exits with status 1 if a setting differs or is missing, 2 if there is nothing to compare.
+
+Reference: https://betaflight.com/docs/wiki/guides/current/Betaflight-2025.12-CLI-commands and the same page of 4.5:
+names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like.
+"""
+
+from __future__ import annotations
+
+import argparse
+import enum
+import logging
+import math
+import re
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.hil.sticks import RateMap, ThrustMap
+
+logger = logging.getLogger(__name__)
+
+AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
+LINKS = ("crsf", "sbus", "msp")
+
+_STEP = math.radians(10.0)  # rad/s: the unit of rc_rate and srate under ACTUAL rates
+_LARGEST = 199  # of these: setpoints end at 1998 deg/s
+_DEFAULTS_SINCE = (4, 5)  # release from which on the defaults below are known to hold
+_NO_DUMP = (
+    "This is no dump of a Betaflight flight controller: {}. Open the CLI of the configurator, type `dump all`, save "
+    "what it says to a file, and give that."
+)
+
+
+class Wanted(NamedTuple):
+    """A setting that matters.
+
+    Args:
+        name: Of the setting, or of whatever else the dump is read for.
+        value: It must have.
+        reason: Why.
+        default: The firmware's own, where it does not depend on board or release; ``diff`` leaves it out.
+        section: ``profile`` or ``rateprofile`` where each profile has its own.
+        line: For the CLI; made from name and value if empty.
+        former: Its name in older releases.
+    """
+
+    name: str
+    value: str
+    reason: str
+    default: str | None = None
+    section: str = ""
+    line: str = ""
+    former: str = ""
+
+    @property
+    def command(self) -> str:
+        """What to type into the CLI."""
+        if self.name.startswith("feature "):
+            return self.name.replace(" ", " " if self.value == "ON" else " -")
+        return self.line or f"set {self.name} = {self.value}"
+
+
+class Status(enum.Enum):
+    """How a flight controller's setting compares."""
+
+    OK = "ok"
+    DIFFERS = "differs"
+    MISSING = "missing"
+
+
+class Finding(NamedTuple):
+    """A setting compared: what is wanted, how it is, and its value (None: not known)."""
+
+    wanted: Wanted
+    status: Status
+    found: str | None
+
+    def __str__(self) -> str:
+        note = ""
+        if self.status is Status.DIFFERS:
+            note = f"found {self.found}: {self.wanted.reason}"
+        elif self.status is Status.MISSING:
+            note = "not in the text: take `dump all`, which says everything"
+        return f"{self.status.value:8} {self.wanted.command:32} {note}".rstrip()
+
+
+def rate_map(contract: dict[str, Any]) -> RateMap:
+    """Return the rates at full stick that a flight controller set by this module has.
+
+    They are the contract's largest, rounded up to the next 10 deg/s, which is what Betaflight can be set to.
+
+    Raises:
+        ValueError: The contract has no body rates, or larger ones than Betaflight can follow.
+    """
+    return RateMap(**{axis: steps * _STEP for axis, steps in _rate_steps(contract).items()})
+
+
+def wanted_settings(contract: dict[str, Any], link: str) -> list[Wanted]:
+    """Return every setting that matters for an actor, in the order in which to type them.
+
+    Args:
+        contract: As `read_contract` returns it.
+        link: One of `LINKS`.
+
+    Raises:
+        ValueError: There is no such link; or as `rate_map`.
+    """
+    return [*_receiver(link), *_MASTER, *_PROFILE, *_rates(contract)]
+
+
+def print_settings(contract: dict[str, Any], link: str) -> list[str]:
+    """Return lines for the CLI. They are plain ASCII: other characters, tabs and question marks mean things there."""
+    asked = ", ".join(f"{rate:.6g}" for rate in _asked_rates(contract).values())
+    rates = rate_map(contract)
+    full = [f"{axis}={getattr(rates, axis):.6g}" for axis in AXES]
+    lines = [
+        f"# Betaflight 4.5 and later, link {link}. Select the profile and rateprofile to fly with before.",
+        f"# The actor asks for up to {asked} rad/s about x, y, z. Full stick is set to the next 10 deg/s above:",
+        f"# the link's RateMap must be {', '.join(full)} rad/s, not the actor's.",
+    ]
+    for wanted in wanted_settings(contract, link):
+        former = f" Before 2025.12: set {wanted.former} = {wanted.value}" if wanted.former else ""
+        lines += [f"# {wanted.reason}.{former}", wanted.command]
+    return [*lines, "save"]
+
+
+def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
+    """Compare what the CLI said to ``dump all`` or ``diff all`` with what is wanted.
+
+    Raises:
+        ValueError: It said neither; or as `wanted_settings`.
+    """
+    wanted_all = wanted_settings(contract, link)
+    values, version = _read_dump(text, {name: each.section for each in wanted_all for name in (each.name, each.former)})
+    is_diff = re.search(r"^(defaults nosave|#\s*diff\b.*)\s*$", text, re.MULTILINE) is not None
+    silence_is_default = is_diff and version is not None and version >= _DEFAULTS_SINCE
+    findings = []
+    for wanted in wanted_all:
+        found = values.get(wanted.name, values.get(wanted.former, wanted.default if silence_is_default else None))
+        same = found is not None and found.upper() == wanted.value.upper()
+        status = Status.OK if same else Status.MISSING if found is None else Status.DIFFERS
+        findings.append(Finding(wanted, status, found))
+    return findings
+
+
+def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tuple[int, int] | None]:
+    """Return values by name, of the profiles selected at the end, and the firmware's release where it is said."""
+    version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)
+    settings = re.findall(r"^set \w+ = ", text, re.MULTILINE)
+    if version is None and not settings:
+        raise ValueError(_NO_DUMP.format("it has no lines of its CLI"))
+    if version is not None and version[1] != "Betaflight":
+        raise ValueError(_NO_DUMP.format(f"it is of {version[1]}"))
+    selected = {"": "", "profile": "0", "rateprofile": "0"}
+    values: dict[tuple[str, str], str] = {}
+    modes: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        match line.split("#")[0].split():
+            case ["profile" | "rateprofile" as section, number]:
+                selected[section] = number
+            case ["set", name, "=", *value]:
+                values[name, selected[sections.get(name, "")]] = " ".join(value)
+            case ["feature", name]:
+                values[f"feature {name.removeprefix('-')}", ""] = "OFF" if name.startswith("-") else "ON"
+            case ["map", order]:
+                values["map", ""] = order
+            case ["aux", slot, *mode]:
+                modes[slot] = mode
+    values |= {(name, ""): value for name, value in _read_modes(list(modes.values())).items()}
+    chosen = {name: value for (name, profile), value in values.items() if profile == selected[sections.get(name, "")]}
+    return chosen, None if version is None else (int(version[2]), int(version[3]))
+
+
+def _read_modes(modes: list[list[str]]) -> dict[str, str]:
+    """Return what arms, and whether the sticks mean angles when AUX1 is at 2000 µs and other switches are at 1000 µs.
+
+    Args:
+        modes: Number of the mode (0 ARM, 1 ANGLE, 2 HORIZON), index of the switch, from and to in µs, and more.
+    """
+    ranges = [tuple(map(int, mode[:4])) for mode in modes if len(mode) >= 4 and all(map(str.isdigit, mode[:4]))]
+    arms = [f"AUX{switch + 1} {low}-{high}" for mode, switch, low, high in ranges if mode == 0 and low < high]
+    levels = [low <= (1000 if switch else 2000) < high for mode, switch, low, high in ranges if mode in (1, 2)]
+    return {"ARM": ", ".join(arms) or "none", "levelling": "ON" if any(levels) else "OFF"}
+
+
+def _receiver(link: str) -> list[Wanted]:
+    """Return what makes the flight controller listen to a link."""
+    if link not in LINKS:
+        raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
+    serial = link != "msp"
+    alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
+    rx_serial = Wanted("feature RX_SERIAL", "ON" if serial else "OFF", "a receiver at a UART: see the Ports tab", "ON")
+    rx_msp = Wanted("feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF")
+    if not serial:
+        return [rx_serial, rx_msp]
+    # The one that is off comes first: the firmware keeps one receiver, and not always the last.
+    return [rx_msp, rx_serial, Wanted("serialrx_provider", link.upper(), "the protocol of the link")]
+
+
+def _rates(contract: dict[str, Any]) -> list[Wanted]:
+    """Return what makes the sticks ask for body rates linearly, and the throttle for thrust untouched."""
+    wanted = [("rates_type", "ACTUAL", "rates in units of 10 deg/s", "ACTUAL")]
+    for axis, steps in _rate_steps(contract).items():
+        full = f"full {axis} stick is {10 * steps} deg/s"
+        wanted += [
+            (f"{axis}_rc_rate", str(steps), f"{full}: the slope at the centre", "7"),
+            (f"{axis}_srate", str(steps), f"{full}: the same slope everywhere, so a straight line", "67"),
+            (f"{axis}_expo", "0", "no curve", "0"),
+            (f"{axis}_rate_limit", "1998", "the largest there is, so it cuts nothing off", "1998"),
+        ]
+    wanted += [
+        ("thr_mid", "50", "with thr_expo: a straight throttle", "50"),
+        ("thr_expo", "0", "no curve", "0"),
+        ("throttle_limit_type", "OFF", "full throttle must be full thrust", "OFF"),
+    ]
+    return [Wanted(*each, section="rateprofile") for each in wanted]
+
+
+def _rate_steps(contract: dict[str, Any]) -> dict[str, int]:
+    """Return the rates at full stick, in units of 10 deg/s, by axis."""
+    steps = {axis: math.ceil(rate / _STEP - 1e-6) for axis, rate in _asked_rates(contract).items()}
+    for axis, step in steps.items():
+        if not 1 <= step <= _LARGEST:
+            raise ValueError(
+                f"action.channels: {AXES[axis]} of {step * _STEP:.4g} rad/s needs {axis} rates of {10 * step} deg/s; "
+                f"Betaflight goes from 10 to {10 * _LARGEST}."
+            )
+    return steps
+
+
+def _asked_rates(contract: dict[str, Any]) -> dict[str, float]:
+    """Return the largest body rates that an actor asks for, rad/s, by axis."""
+    channels = {channel["name"]: channel for channel in contract["action"]["channels"]}
+    for name in AXES.values():
+        if name not in channels or channels[name]["unit"] != "rad/s":
+            raise ValueError(f"action.channels has no {name} in rad/s: this actor does not fly by body rates.")
+    return {axis: abs(channels[name]["offset"]) + abs(channels[name]["scale"]) for axis, name in AXES.items()}
+
+
+_MASTER = (
+    Wanted("map", "AETR1234", "roll, pitch, throttle, yaw: the order in which the link sends", "AETR1234",
+           line="map AETR1234"),
+    Wanted("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
+           line="aux 0 0 0 1700 2100 0 0"),
+    Wanted("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
+           line="# ANGLE and HORIZON off"),
+    Wanted("mid_rc", "1500", "the sticks' centre", "1500"),
+    Wanted("deadband", "0", "small rates count", "0"),
+    Wanted("yaw_deadband", "0", "small rates count", "0"),
+    Wanted("yaw_control_reversed", "OFF", "yaw has the sign that the link gives it", "OFF"),
+    Wanted("min_check", f"{ThrustMap.min_check:.0f}", "where the throttle begins, as in the link's ThrustMap", "1050"),
+    Wanted("motor_idle", f"{1e4 * ThrustMap.idle:.0f}", f"{ThrustMap.idle:.1%}, as in the link's ThrustMap", "550",
+           former="dshot_idle_value"),
+    Wanted("feature AIRMODE", "ON", "rates are followed at least throttle too", "ON"),
+    Wanted("failsafe_delay", "5", "motors stop 0.5 s after the last message: the last line of defence", "15"),
+    Wanted("failsafe_procedure", "DROP", "a drone in a room falls rather than flies on", "DROP"),
+)  # fmt: skip
+_PROFILE = (
+    Wanted("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile"),
+    Wanted("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
+    Wanted("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),
+    Wanted("vbat_sag_compensation", "0", "the link's ThrustMap counts the battery's voltage itself", "0", "profile"),
+    Wanted("motor_output_limit", "100", "full throttle must be full thrust", "100", "profile"),
+)
+
+
+def main() -> None:
+    """Print the settings, or check a dump."""
+    parser = argparse.ArgumentParser(prog="python -m dreamer_racing.hil.betaflight", description=main.__doc__)
+    parser.add_argument("do", choices=("print", "check"))
+    parser.add_argument("--contract", required=True, help="contract.json of the actor")
+    parser.add_argument("--link", choices=LINKS, default="crsf", help="what the flight controller receives")
+    parser.add_argument("--dump", help="for check: the text that `dump all` or `diff all` gave")
+    arguments = parser.parse_args()
+    if (arguments.do == "check") != (arguments.dump is not None):
+        parser.error("check needs --dump FILE, and print takes none.")
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    try:
+        contract = read_contract(arguments.contract)
+        if arguments.do == "print":
+            logger.info("\n".join(print_settings(contract, arguments.link)))
+            return
+        text = Path(arguments.dump).read_text(encoding="utf-8", errors="replace")
+        findings = check_dump(text, contract, arguments.link)
+    except (OSError, ValueError) as error:
+        parser.exit(2, f"{error}\n")
+    wrong = [finding for finding in findings if finding.status is not Status.OK]
+    logger.info("\n".join(map(str, findings)))
+    logger.info("%d of %d settings differ or are missing.", len(wrong), len(findings))
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""What the nose camera would see from a measured pose, in the scene of training."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene, require_library
+from dreamer_racing.envs.simulator.scene import Camera, build_scene
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.stamping import rotation_matrix
+from dreamer_racing.hil.vehicle import Pose
+
+
+class NoseCamera:
+    """Draws one image after the other, in the thread that made it.
+
+    Args:
+        track: What stands in the hall.
+        camera: The camera that the actor was trained with.
+        backend: ``egl``, ``osmesa``, or ``auto`` for the first that works.
+
+    Attributes:
+        backend: The one that draws.
+
+    Raises:
+        RendererUnavailableError: None works here; the message says why and what would help.
+    """
+
+    def __init__(self, track: Track, camera: Camera, backend: str = "auto") -> None:
+        model = build_scene(track, QuadrotorParameters(), camera).compile()
+        reasons = []
+        for candidate in GL_LIBRARIES if backend == "auto" else (backend,):
+            try:
+                require_library(candidate)
+                self._scene = open_scene(candidate, model, camera)
+            except RendererUnavailableError as error:
+                reasons.append(str(error))
+                continue
+            self.backend = candidate
+            break
+        else:
+            raise RendererUnavailableError(" ".join(reasons))
+        tilt = math.radians(camera.tilt)
+        self._mount = np.array(camera.position)
+        self._up = np.array((-math.sin(tilt), 0.0, math.cos(tilt)))
+        self._forward = np.array((math.cos(tilt), 0.0, math.sin(tilt)))
+        self._size = (camera.height, camera.width, 3)
+
+    def see(self, pose: Pose) -> np.ndarray:
+        """Return the image, uint8 RGB (height, width, 3), first row at the top."""
+        turned = rotation_matrix(pose.attitude)
+        image = np.empty(self._size, np.uint8)
+        self._scene.draw(pose.position + turned @ self._mount, turned @ self._up, turned @ self._forward, image)
+        return image
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._scene.close()
+
+
+def camera_of(contract: dict[str, Any]) -> Camera:
+    """Return the camera of a contract.
+
+    Raises:
+        ValueError: The actor sees numbers, not images.
+    """
+    described = contract.get("camera")
+    if described is None:
+        raise ValueError(
+            "This actor was trained on numbers, not on images (its contract has no camera): it cannot fly here."
+        )
+    return Camera(
+        width=described["width_px"],
+        height=described["height_px"],
+        field_of_view=described["vertical_field_of_view_deg"],
+        tilt=described["tilt_up_deg"],
+        position=tuple(described["position_body_m"]),
+    )

@@ -1,0 +1,197 @@
+"""What happens at each tick: poses in, one command out. No clock and no socket in here.
+
+`FlightChain.tick` is a function of what came in at this tick and of the ticks before, so that a recorded flight can be
+played through it again: the same file gives the same commands, bit for bit.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.camera import NoseCamera
+from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.operator import Operator
+from dreamer_racing.hil.pose import PosePacket, Received
+from dreamer_racing.hil.progress import GateProgress
+from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
+from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
+from dreamer_racing.hil.vehicle import Pose, Setpoint
+
+
+class ChainConfig(NamedTuple):
+    """What of a flight is more than its flyer and its track.
+
+    Args:
+        limits: Of safety.
+        stamping: When poses count as measured.
+        latency: s, from a pose's measurement to its arrival at the least.
+        laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
+        arm: Whether it may arm at all.
+    """
+
+    limits: SafetyLimits
+    stamping: Stamping = Stamping.receive
+    latency: float = 0.0
+    laps: int | None = None
+    arm: bool = False
+
+
+class Inputs(NamedTuple):
+    """What came in at a tick.
+
+    Args:
+        time: s, by the loop's clock.
+        received: Pose packets since the last tick, oldest first.
+        operator: What the operator wants.
+        overrun: Whether the tick before took longer than its period.
+    """
+
+    time: float
+    received: list[Received]
+    operator: Operator
+    overrun: bool
+
+
+class Outputs(NamedTuple):
+    """What came of a tick.
+
+    Args:
+        verdict: State, command and reasons.
+        setpoint: What the flyer wanted; None without a pose.
+        pose: For which it was chosen: the newest one, extrapolated to the tick.
+        image: What the flyer saw; None if it has no camera.
+        target_gate: Index of the gate that comes next.
+        passes: Gates passed in this flight.
+        render_s: s that drawing the image took.
+        act_s: s that the flyer took.
+    """
+
+    verdict: Verdict
+    setpoint: Setpoint | None
+    pose: Pose | None
+    image: np.ndarray | None
+    target_gate: int
+    passes: int
+    render_s: float
+    act_s: float
+
+
+class FlightChain:
+    """Pose → image → flyer → safety.
+
+    Args:
+        flyer: Who flies.
+        track: Where.
+        config: The rest.
+        camera: Draws what the flyer sees; None if it needs no image.
+
+    Attributes:
+        progress: Which gates were passed.
+        clock: Of the poses.
+        safety: Has the last word.
+    """
+
+    def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
+        self.progress = GateProgress(track)
+        self.clock = PoseClock(config.stamping, config.latency)
+        self.safety = Safety(config.limits)
+        self._flyer, self._camera, self._config = flyer, camera, config
+        self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
+        self._newest: Pose | None = None
+        self._flying = False  # whether the vehicle has been armed and has left the start
+
+    def tick(self, inputs: Inputs) -> Outputs:
+        """Take in what came, choose, and let safety judge."""
+        if not self._flying:  # as long as the vehicle stands still, each tick is the first of the flight
+            self._flyer.reset()
+            self.progress.reset()
+        for received in inputs.received:
+            pose = self.clock.read(received)
+            if pose is not None:
+                self.progress.update(pose)
+                self._newest = pose
+        pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
+        setpoint, image, render_s, act_s = self._choose(pose)
+        finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
+        verdict = self.safety.step(
+            Tick(
+                now=inputs.time,
+                pose=self._newest,
+                pose_age=np.inf if self._newest is None else inputs.time - self._newest.time,
+                setpoint=setpoint,
+                operator=inputs.operator,
+                arm_requested=self._config.arm,
+                loop_overrun=inputs.overrun,
+                finish=finish,
+            )
+        )
+        self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
+        progress = self.progress
+        return Outputs(verdict, setpoint, pose, image, progress.target, len(progress.passes), render_s, act_s)
+
+    def _moves(self) -> bool:
+        """Whether the newest pose is one of a vehicle that has left the start."""
+        return (
+            self._newest is not None and np.linalg.norm(self._newest.linear_velocity) > self._config.limits.start_speed
+        )
+
+    def _choose(self, pose: Pose | None) -> tuple[Setpoint | None, np.ndarray | None, float, float]:
+        """Return setpoint and image, and how long drawing and choosing took, s."""
+        if pose is None:
+            return None, None, 0.0, 0.0
+        start = time.perf_counter()
+        image = None if self._camera is None else self._camera.see(pose)
+        drawn = time.perf_counter()
+        setpoint = self._flyer.act(pose, image, self.progress.target)
+        return setpoint, image, drawn - start, time.perf_counter() - drawn
+
+    def close(self) -> None:
+        """Free the camera."""
+        if self._camera is not None:
+            self._camera.close()
+
+
+def describe_inputs(inputs: Inputs) -> dict[str, Any]:
+    """Return what came in as JSON values, from which `read_inputs` makes it again."""
+    return {
+        "time": inputs.time,
+        "received": [[received.time, *_numbers(received.packet)] for received in inputs.received],
+        "operator": list(inputs.operator),
+        "overrun": inputs.overrun,
+    }
+
+
+def read_inputs(message: dict[str, Any]) -> Inputs:
+    """Return what came in from what `describe_inputs` made of it."""
+    received = []
+    for arrived, sequence, stamp, *numbers in message["received"]:
+        values = np.array(numbers)
+        packet = PosePacket(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
+        received.append(Received(arrived, packet))
+    return Inputs(message["time"], received, Operator(*message["operator"]), message["overrun"])
+
+
+def describe_outputs(outputs: Outputs) -> dict[str, Any]:
+    """Return what came of a tick as JSON values, but for how long it took: the same again when it is played back."""
+    command = outputs.verdict.command
+    return {
+        "state": outputs.verdict.state.value,
+        "reasons": [reason.value for reason in outputs.verdict.reasons],
+        "setpoint": None if outputs.setpoint is None else _flat(outputs.setpoint),
+        "command": [command.armed, *_flat(command.setpoint)],
+        "pose": None if outputs.pose is None else [number for part in outputs.pose[1:] for number in part.tolist()],
+        "target_gate": outputs.target_gate,
+        "passes": outputs.passes,
+    }
+
+
+def _numbers(packet: PosePacket) -> list[float]:
+    return [packet.sequence, packet.stamp, *(number for vector in packet[2:] for number in vector.tolist())]
+
+
+def _flat(setpoint: Setpoint) -> list[float]:
+    return [float(setpoint.collective_thrust), *(float(rate) for rate in setpoint.body_rates)]

@@ -1,0 +1,141 @@
+"""Links to vehicles, by name.
+
+| name | goes over | says | needs |
+|---|---|---|---|
+| ``udp``, ``simulated`` | UDP | setpoints in SI units | port |
+| ``betaflight_sitl`` | UDP | channels | rates, thrust |
+| ``crsf`` | serial port | channels | device, rates, thrust |
+| ``sbus`` | serial port | channels | device, rates, thrust |
+| ``msp`` | serial port | channels | device, rates, thrust |
+| ``mavlink`` | UDP, or serial port | body rates, normalised thrust | port or device, thrust |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from dreamer_racing.hil.links.crsf import encode_crsf
+from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
+from dreamer_racing.hil.links.mavlink import MavlinkLink
+from dreamer_racing.hil.links.msp import encode_msp
+from dreamer_racing.hil.links.sbus import encode_sbus
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialTransport
+from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
+from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
+from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """Which link, and what it needs.
+
+    Attributes:
+        name: One of `LINKS`.
+        host: To send to over UDP.
+        port: UDP port; for ``betaflight_sitl`` 9004 unless given.
+        device: Path of a serial port.
+        baud: Bits a second of the serial port; the protocol's own unless given.
+        rates: What the flight controller makes of the sticks.
+        thrust: What motors and battery make of the throttle.
+        arm_channel: Index of the channel that arms, 4 for AUX1.
+
+    Raises:
+        ValueError: ``arm_channel`` is no switch.
+    """
+
+    name: str
+    host: str = "127.0.0.1"
+    port: int | None = None
+    device: str | None = None
+    baud: int | None = None
+    rates: RateMap | None = None
+    thrust: ThrustMap | None = None
+    arm_channel: int = FIRST_SWITCH
+
+    def __post_init__(self) -> None:
+        check_arm_channel(self.arm_channel)
+
+
+def make_link(config: LinkConfig) -> TransportLink:
+    """Make a link and open what it goes over.
+
+    Raises:
+        ValueError: There is no link of that name, or something that it needs is not given, or cannot be.
+        OSError: Device or host cannot be used.
+        ImportError: A package is missing; the message says how to install it.
+
+    Example:
+        >>> make_link(LinkConfig("udp", port=9100)).close()
+    """
+    if config.name not in LINKS:
+        raise ValueError(f"name={config.name}: the links are {', '.join(LINKS)}.")
+    return LINKS[config.name](config)
+
+
+def _udp(config: LinkConfig) -> TransportLink:
+    return UdpLink(config.host, _port(config))
+
+
+def _betaflight_sitl(config: LinkConfig) -> TransportLink:
+    rates, thrust = _maps(config)
+    return ChannelLink(_datagrams(config, RC_PORT), encode_sitl, rates, thrust, config.arm_channel)
+
+
+def _radio(encode: Callable[[Sequence[float]], bytes]) -> Callable[[LinkConfig], TransportLink]:
+    """Return what makes the link of a radio's receiver at a serial port."""
+
+    def make(config: LinkConfig) -> TransportLink:
+        rates, thrust = _maps(config)
+        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel)
+
+    return make
+
+
+def _mavlink(config: LinkConfig) -> TransportLink:
+    thrust = _given(config.thrust, "thrust", config)
+    return MavlinkLink(_wire(config) if config.device is not None else _datagrams(config), thrust)
+
+
+LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
+    "udp": _udp,
+    "simulated": _udp,
+    "betaflight_sitl": _betaflight_sitl,
+    "crsf": _radio(encode_crsf),
+    "sbus": _radio(encode_sbus),
+    "msp": _radio(encode_msp),
+    "mavlink": _mavlink,
+}
+"""What makes a link, by its name."""
+
+
+def _given(value: T | None, field: str, config: LinkConfig) -> T:
+    """Return a setting; refuse one that is missing."""
+    if value is None:
+        raise ValueError(f"{field} is not given: the link {config.name} needs it.")
+    return value
+
+
+def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:
+    return _given(config.rates, "rates", config), _given(config.thrust, "thrust", config)
+
+
+def _port(config: LinkConfig, default: int | None = None) -> int:
+    port = _given(default if config.port is None else config.port, "port", config)
+    if not 1 <= port <= 65535:
+        raise ValueError(f"port={port}: must be at least 1 and at most 65535.")
+    return port
+
+
+def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport:
+    return UdpTransport(config.host, _port(config, default_port))
+
+
+def _wire(config: LinkConfig) -> Transport:
+    settings = PROTOCOLS[config.name]
+    if config.baud is not None:
+        settings = settings._replace(baud=config.baud)
+    return SerialTransport(_given(config.device, "device", config), settings)

@@ -1,0 +1,96 @@
+"""MAVLink 2 (PX4, ArduPilot): SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
+
+The vehicle must be in the mode in which it obeys (PX4: offboard; ArduPilot: guided, no GPS); a person puts it there, by
+radio. Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does.
+
+Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
+
+Reference: mavlink.io/en/messages/common.html.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from dreamer_racing.hil.links.link import Transport, TransportLink
+from dreamer_racing.hil.sticks import ThrustMap
+from dreamer_racing.hil.vehicle import Command
+
+IGNORE_ATTITUDE = 128
+"""ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
+FORCE = 21196.0
+"""Second number of COMPONENT_ARM_DISARM: disarm wherever the vehicle is."""
+ARM_TRIES = 5
+"""Messages that arm, from when a command is armed first: one may be lost, but a vehicle that has disarmed itself later
+must not be armed again [choice]."""
+
+
+class MavlinkLink(TransportLink):
+    """Sends attitude targets, and arms and disarms.
+
+    Args:
+        transport: Takes the bytes.
+        thrust: What the motors make of their command; ``idle`` and ``min_check`` play no part.
+        system: Number of the vehicle.
+        component: Number of its autopilot.
+
+    Attributes:
+        thrust: May be replaced in flight, as the battery's voltage sinks.
+
+    Raises:
+        ImportError: pymavlink is not installed.
+    """
+
+    def __init__(self, transport: Transport, thrust: ThrustMap, system: int = 1, component: int = 1) -> None:
+        super().__init__(transport)
+        self.thrust = thrust
+        self._common = _import_messages()
+        self._target = system, component
+        self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._armed_for = 0  # commands in a row
+
+    def encode(self, command: Command) -> bytes:
+        """Return the messages of a command: what arms or disarms where that is due, and the target."""
+        self._armed_for = self._armed_for + 1 if command.armed else 0
+        switch = self._switch(command.armed) if self._armed_for <= ARM_TRIES else b""
+        return switch + self._attitude_target(command)
+
+    def _switch(self, armed: bool) -> bytes:
+        force = 0.0 if armed else FORCE
+        confirmation = max(self._armed_for - 1, 0)
+        arm = self._common.MAV_CMD_COMPONENT_ARM_DISARM
+        return self._pack(
+            self._common.MAVLink_command_long_message(
+                *self._target, arm, confirmation, float(armed), force, 0, 0, 0, 0, 0
+            )
+        )
+
+    def _attitude_target(self, command: Command) -> bytes:
+        thrust = self.thrust.to_motor(command.setpoint.collective_thrust)
+        forward, left, up = (float(rate) for rate in command.setpoint.body_rates)
+        rates_frd = forward, -left, -up
+        milliseconds = int(1000 * time.monotonic()) % 2**32
+        return self._pack(
+            self._common.MAVLink_set_attitude_target_message(
+                milliseconds, *self._target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rates_frd, thrust
+            )
+        )
+
+    def _pack(self, message: Any) -> bytes:
+        data = bytes(message.pack(self._sender))
+        self._sender.seq = (self._sender.seq + 1) % 256
+        return data
+
+
+def _import_messages() -> Any:
+    """Return the module of MAVLink 2's common messages.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    try:
+        from pymavlink.dialects.v20 import common
+    except ImportError as error:
+        raise ImportError("The link mavlink needs pymavlink: pip install 'dreamer_racing[hil]'.") from error
+    return common

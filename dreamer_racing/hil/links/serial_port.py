@@ -1,0 +1,104 @@
+"""Serial ports: the settings of each protocol, and a transport that never waits."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import Any, NamedTuple
+
+
+class SerialSettings(NamedTuple):
+    """How bytes go over a wire: 8 bits each.
+
+    Args:
+        baud: Bits a second.
+        parity: ``N`` for none, ``E`` for even.
+        stop_bits: 1 or 2.
+    """
+
+    baud: int
+    parity: str
+    stop_bits: int
+
+
+PROTOCOLS = {
+    "crsf": SerialSettings(420_000, "N", 1),
+    "sbus": SerialSettings(100_000, "E", 2),
+    "msp": SerialSettings(115_200, "N", 1),
+    "mavlink": SerialSettings(57_600, "N", 1),  # PX4's default on TELEM1
+}
+"""Settings by name of the protocol."""
+
+_REMEDIES = {
+    errno.ENOENT: "there is no such device. Is it plugged in? Look into /dev/serial/by-id",
+    errno.EACCES: "you may not use it: sudo usermod -aG dialout $USER, and log in again",
+    errno.EAGAIN: "another program uses it: a configurator, or a second pilot?",
+    errno.EBUSY: "another program uses it: a configurator, or a second pilot?",
+}
+
+
+class SerialTransport:
+    """Writes to a serial port.
+
+    Args:
+        device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
+        settings: Of the protocol.
+
+    Raises:
+        ImportError: pyserial is not installed.
+        OSError: The device is missing, of no use, or another's; the message says which.
+        ValueError: The device has no such baud rate.
+    """
+
+    def __init__(self, device: str, settings: SerialSettings) -> None:
+        self._device = device
+        self._port = _open(device, settings)
+
+    def write(self, data: bytes) -> bool:
+        """Write bytes; return whether the buffer took them all.
+
+        If not, whatever waits there is old: it is thrown away, so that the next command is heard at once.
+
+        Raises:
+            OSError: The device is gone.
+        """
+        descriptor = self._port.fileno()
+        try:
+            # Not pyserial's own write, which tries a full buffer again until there is room.
+            written = os.write(descriptor, data)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
+        if written < len(data):
+            self._port.reset_output_buffer()
+        return written == len(data)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+def _open(device: str, settings: SerialSettings) -> Any:
+    """Return an open port of pyserial; raises as `SerialTransport` does."""
+    try:
+        import serial
+    except ImportError as error:
+        raise ImportError("A serial link needs pyserial: pip install 'dreamer_racing[hil]'.") from error
+    if settings.baud <= 0:
+        raise ValueError(f"baud={settings.baud}: must be above 0.")
+    try:
+        return serial.Serial(
+            device,
+            settings.baud,
+            parity=settings.parity,
+            stopbits=settings.stop_bits,
+            timeout=0,
+            write_timeout=0,
+            exclusive=True,
+        )
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"baud={settings.baud}: {device} has no such rate: {error}") from error
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, str(error))
+        raise OSError(f"device={device}: {remedy}.") from error

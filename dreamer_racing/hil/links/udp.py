@@ -1,0 +1,127 @@
+"""Commands over UDP: the packet in SI units that a simulated vehicle takes, and the socket that never waits.
+
+The packet, little endian, 53 bytes: ``b"DRC1"``, sequence number u32, the sender's ``time.monotonic`` f64 (s), armed u8
+(0 or 1), collective thrust f64 (m/s²), body rates 3 f64 (rad/s), and CRC-32 u32 of all before it. Frames and units are
+those of `Setpoint`.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+import struct
+import time
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.hil.links.link import TransportLink
+from dreamer_racing.hil.vehicle import Command, Setpoint
+
+MAGIC = b"DRC1"
+_BODY = struct.Struct("<4sIdB4d")
+_CHECK = struct.Struct("<I")
+PACKET_SIZE = _BODY.size + _CHECK.size
+"""Bytes of a packet: 53."""
+_PASSING = {errno.EAGAIN, errno.ECONNREFUSED, errno.ENOBUFS, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH}
+
+
+class CommandPacket(NamedTuple):
+    """What a command packet says.
+
+    Args:
+        sequence: Counts packets, modulo 2³²; what is not newer than the last one is a copy of an old one.
+        stamp: s, the sender's own clock.
+        command: What to do.
+    """
+
+    sequence: int
+    stamp: float
+    command: Command
+
+
+def encode_command(packet: CommandPacket) -> bytes:
+    """Return the bytes of a packet."""
+    armed, (thrust, rates) = packet.command
+    numbers = (float(number) for number in (thrust, *rates))
+    body = _BODY.pack(MAGIC, packet.sequence % 2**32, packet.stamp, bool(armed), *numbers)
+    return body + _CHECK.pack(zlib.crc32(body))
+
+
+def decode_command(data: bytes) -> CommandPacket | None:
+    """Return what a packet says; None if it is none: of another size or kind, damaged, or with impossible numbers."""
+    if (
+        len(data) != PACKET_SIZE
+        or data[:4] != MAGIC
+        or _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size])
+    ):
+        return None
+    _, sequence, stamp, armed, thrust, *rates = _BODY.unpack_from(data)
+    if armed > 1 or thrust < 0 or not all(math.isfinite(number) for number in (stamp, thrust, *rates)):
+        return None
+    return CommandPacket(sequence, stamp, Command(bool(armed), Setpoint(thrust, np.array(rates))))
+
+
+class UdpTransport:
+    """Sends datagrams to one address.
+
+    Args:
+        host: Name or address.
+        port: To send to.
+
+    Raises:
+        OSError: There is no such host; the message names it.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.connect((host, port))
+        except (OSError, OverflowError) as error:
+            self._socket.close()
+            raise OSError(f"host={host}, port={port}: cannot be sent to: {error}") from error
+
+    def write(self, data: bytes) -> bool:
+        """Send a datagram; return whether it went out: not so if buffers are full or the last one found nobody."""
+        try:
+            self._socket.send(data)
+        except OSError as error:
+            if error.errno not in _PASSING:
+                raise
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class UdpLink(TransportLink):
+    """Sends command packets to a vehicle that takes setpoints as they are.
+
+    Args:
+        host: Name or address.
+        port: Where it listens.
+
+    Raises:
+        OSError: There is no such host.
+
+    Example:
+        >>> link = UdpLink("127.0.0.1", 9100)
+        >>> len(link.send(Command(True, Setpoint(9.81, np.zeros(3)))))
+        53
+        >>> link.close()
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(UdpTransport(host, port))
+        self._sequence = 0
+
+    def encode(self, command: Command) -> bytes:
+        """Return the next packet."""
+        packet = CommandPacket(self._sequence, time.monotonic(), command)
+        self._sequence += 1
+        return encode_command(packet)

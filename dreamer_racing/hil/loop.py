@@ -1,0 +1,235 @@
+"""The loop: at a fixed rate, take in what came, tick the chain, send the command, write it down."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+
+from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
+from dreamer_racing.hil.operator import OperatorSource
+from dreamer_racing.hil.pose import PoseSource
+from dreamer_racing.hil.recording import FlightRecorder
+from dreamer_racing.hil.vehicle import Link, at_rest
+
+logger = logging.getLogger(__name__)
+
+FAREWELL = 1.0
+"""s for which disarm frames are sent after the last tick, however it came to that."""
+
+FAREWELL_RATE = 50.0
+"""Hz of those frames [choice]."""
+
+
+class Clock(Protocol):
+    """Tells the time and waits; tests have one of their own."""
+
+    def now(self) -> float:
+        """Return s, of a clock that never jumps."""
+        ...
+
+    def sleep_until(self, deadline: float) -> None:
+        """Wait until then; return at once if it is past."""
+        ...
+
+
+class MonotonicClock:
+    """The machine's own."""
+
+    def now(self) -> float:
+        """Return ``time.monotonic``."""
+        return time.monotonic()
+
+    def sleep_until(self, deadline: float) -> None:
+        """Sleep until then."""
+        remaining = deadline - time.monotonic()
+        if remaining > 0.0:
+            time.sleep(remaining)
+
+
+@dataclass
+class LoopStatistics:
+    """What a flight's ticks took, all in s.
+
+    Attributes:
+        jitter: How late each tick began.
+        pose_age: Of the newest pose, when the command was sent.
+        latency: From the arrival of the pose that a command is made from to its being sent.
+        render: Of drawing.
+        act: Of the flyer.
+        busy: Of the whole tick.
+        overruns: Ticks that took longer than their period.
+    """
+
+    jitter: list[float] = field(default_factory=list)
+    pose_age: list[float] = field(default_factory=list)
+    latency: list[float] = field(default_factory=list)
+    render: list[float] = field(default_factory=list)
+    act: list[float] = field(default_factory=list)
+    busy: list[float] = field(default_factory=list)
+    overruns: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """Return p50, p99 and the largest of each in ms, and the counts."""
+        stages = ("jitter", "pose_age", "latency", "render", "act", "busy")
+        table = {name: percentiles(getattr(self, name)) for name in stages}
+        return {**table, "ticks": len(self.busy), "overruns": self.overruns}
+
+
+def percentiles(seconds: list[float]) -> dict[str, float] | None:
+    """Return p50, p99 and maximum in ms; None of nothing."""
+    if not seconds:
+        return None
+    p50, p99, largest = (1e3 * float(value) for value in np.percentile(seconds, (50, 99, 100)))
+    return {"p50_ms": p50, "p99_ms": p99, "max_ms": largest}
+
+
+class FlightLoop:
+    """Flies one flight.
+
+    Args:
+        chain: What happens at each tick.
+        poses: Where poses come from.
+        operator: Who answers for it.
+        link: To the vehicle.
+        rate: Hz.
+        recorder: Writes the flight; None: it is not written.
+        watch: Called after each tick with its outputs; for people to look at.
+        clock: Tells the time.
+
+    Attributes:
+        statistics: What ticks took.
+        last: The last tick's outputs.
+    """
+
+    def __init__(
+        self,
+        chain: FlightChain,
+        poses: PoseSource,
+        operator: OperatorSource,
+        link: Link,
+        rate: float,
+        recorder: FlightRecorder | None = None,
+        watch: Callable[[Outputs], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self.statistics = LoopStatistics()
+        self.last: Outputs | None = None
+        self._chain, self._poses, self._operator, self._link = chain, poses, operator, link
+        self._period = 1.0 / rate
+        self._recorder, self._watch = recorder, watch
+        self._clock = clock or MonotonicClock()
+        self._stop: str | None = None
+
+    def stop(self, reason: str) -> None:
+        """End the flight after the tick that is under way."""
+        self._stop = self._stop or reason
+
+    def run(self, duration: float | None = None) -> str:
+        """Fly until the flight is over, or for so many seconds; disarm in any case.
+
+        Returns:
+            Why it ended.
+        """
+        with self._answering_signals(), _without_garbage_collection():
+            try:
+                return self._run(duration)
+            finally:
+                self._say_farewell()
+
+    def _run(self, duration: float | None) -> str:
+        began = deadline = self._clock.now()
+        overrun, flew = False, False
+        while self._stop is None:
+            self._clock.sleep_until(deadline)
+            start = self._clock.now()
+            outputs = self._tick(start, deadline, overrun)
+            flew = flew or outputs.verdict.command.armed
+            deadline, overrun = self._next(deadline)
+            if flew and not outputs.verdict.command.armed:
+                words = "; ".join(outputs.verdict.words) or "disarmed"
+                return f"{outputs.verdict.state.value}: {words}"
+            if duration is not None and start - began >= duration:
+                return f"{duration:g} s are over" + ("" if flew else f"; not armed: {'; '.join(outputs.verdict.words)}")
+        return self._stop
+
+    def _tick(self, start: float, deadline: float, overrun: bool) -> Outputs:
+        """Do one tick: what came in → chain → link → file."""
+        inputs = Inputs(start, self._poses.poll(), self._operator.poll(), overrun)
+        outputs = self._chain.tick(inputs)
+        sent = self._link.send(outputs.verdict.command)
+        done = self._clock.now()
+        self._note(start - deadline, inputs, outputs, done)
+        if self._recorder is not None:
+            took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
+            message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
+            self._recorder.tick(start, message)
+        if self._watch is not None:
+            self._watch(outputs)
+        self.last = outputs
+        return outputs
+
+    def _next(self, deadline: float) -> tuple[float, bool]:
+        """Return the next deadline, on the same grid however late it is, and whether one was missed."""
+        now, following = self._clock.now(), deadline + self._period
+        if now < following:
+            return following, False
+        self.statistics.overruns += 1
+        return following + self._period * ((now - following) // self._period), True
+
+    def _note(self, jitter: float, inputs: Inputs, outputs: Outputs, done: float) -> None:
+        noted = self.statistics
+        noted.jitter.append(jitter)
+        noted.busy.append(done - inputs.time)
+        if outputs.pose is not None:
+            noted.render.append(outputs.render_s)
+            noted.act.append(outputs.act_s)
+        if inputs.received:
+            noted.latency.append(done - inputs.received[-1].time)
+            noted.pose_age.append(inputs.time - inputs.received[-1].time)
+
+    def _say_farewell(self) -> None:
+        """Send disarm frames for a while: the vehicle must hear one, and radios lose some."""
+        deadline = self._clock.now()
+        for _ in range(round(FAREWELL * FAREWELL_RATE)):
+            try:
+                self._link.send(at_rest())
+            except OSError as error:
+                logger.error("the link does not take the disarm frame: %s", error)
+            deadline += 1.0 / FAREWELL_RATE
+            self._clock.sleep_until(deadline)
+
+    @contextmanager
+    def _answering_signals(self) -> Iterator[None]:
+        """Let Ctrl-C and SIGTERM end the flight, and a second one not interrupt the farewell."""
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            self.stop(f"{signal.Signals(number).name}")
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Keep the collector from stopping the loop: what a flight allocates is freed by reference counts."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()

@@ -1,0 +1,169 @@
+"""The person who answers for the flight: who lets the vehicle fly, and may stop it at any time."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import time
+import zlib
+from collections.abc import Callable
+from typing import IO, Any, NamedTuple, Protocol
+
+from dreamer_racing.hil.pose import bind
+
+MAGIC = b"DRO1"
+_BODY = struct.Struct("<4sIBB")
+_CHECK = struct.Struct("<I")
+PACKET_SIZE = _BODY.size + _CHECK.size
+"""Bytes of a packet: 14, little endian: ``b"DRO1"``, sequence u32, enable u8, kill u8, CRC-32 u32 of all before it."""
+
+DEAD_MAN = 0.5
+"""s without a packet after which the enable counts as released [choice]; send ten a second or more."""
+
+
+class Operator(NamedTuple):
+    """What the operator wants.
+
+    Args:
+        enable: The vehicle may fly.
+        kill: Motors off, now and for good.
+    """
+
+    enable: bool
+    kill: bool
+
+
+class OperatorSource(Protocol):
+    """Where the operator's will comes from."""
+
+    def poll(self) -> Operator:
+        """Return what is wanted now, without waiting."""
+        ...
+
+    def close(self) -> None:
+        """Give back socket or terminal; may be called twice."""
+        ...
+
+
+def encode_operator(sequence: int, operator: Operator) -> bytes:
+    """Return the bytes of a packet."""
+    body = _BODY.pack(MAGIC, sequence % 2**32, operator.enable, operator.kill)
+    return body + _CHECK.pack(zlib.crc32(body))
+
+
+def decode_operator(data: bytes) -> tuple[int, Operator] | None:
+    """Return sequence number and will; None if it is no such packet, or a damaged one."""
+    if len(data) != PACKET_SIZE or data[:4] != MAGIC:
+        return None
+    _, sequence, enable, kill = _BODY.unpack_from(data)
+    if _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size]) or max(enable, kill) > 1:
+        return None
+    return sequence, Operator(bool(enable), bool(kill))
+
+
+class UdpOperator:
+    """A switch on the network. A kill is remembered; an enable lapses when packets stop.
+
+    Args:
+        port: To listen on.
+        host: Address to listen on.
+        clock: s; for tests.
+
+    Attributes:
+        rejected: Datagrams that were no such packets, or older than one before.
+    """
+
+    def __init__(self, port: int, host: str = "127.0.0.1", clock: Callable[[], float] = time.monotonic) -> None:
+        self.rejected = 0
+        self._socket = bind(host, port)
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self._clock = clock
+        self._will = Operator(False, False)
+        self._heard = -DEAD_MAN
+        self._sequence: int | None = None
+
+    def poll(self) -> Operator:
+        """Return what is wanted now, without waiting."""
+        while True:
+            try:
+                data = self._socket.recv(PACKET_SIZE + 1)
+            except (BlockingIOError, ConnectionRefusedError):
+                break
+            self._take(decode_operator(data))
+        alive = self._clock() - self._heard < DEAD_MAN
+        return Operator(self._will.enable and alive, self._will.kill)
+
+    def _take(self, packet: tuple[int, Operator] | None) -> None:
+        if packet is None:
+            self.rejected += 1
+            return
+        sequence, will = packet
+        # A kill is obeyed whatever its number; an enable that is not newer may be a replayed one.
+        replayed = self._sequence is not None and (sequence - self._sequence - 1) % 2**32 >= 2**31
+        if replayed:
+            self.rejected += 1
+        else:
+            self._sequence, self._heard = sequence, self._clock()
+        self._will = Operator(self._will.enable if replayed else will.enable, self._will.kill or will.kill)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class KeyboardOperator:
+    """The terminal: ``e`` gives or takes back the enable; any other key kills.
+
+    Raises:
+        OSError: There is no terminal.
+    """
+
+    def __init__(self, terminal: IO[str] | None = None) -> None:
+        import select
+        import termios
+        import tty
+
+        self._terminal = sys.stdin if terminal is None else terminal
+        if not self._terminal.isatty():
+            raise OSError("operator=keyboard needs a terminal to read keys from: use operator=udp.")
+        self._select, self._termios = select.select, termios
+        self._before: list[Any] | None = termios.tcgetattr(self._terminal)
+        tty.setcbreak(self._terminal)
+        self._will = Operator(False, False)
+
+    def poll(self) -> Operator:
+        """Return what is wanted now, without waiting."""
+        while self._select([self._terminal], [], [], 0.0)[0]:
+            key = self._terminal.read(1)
+            self._will = (
+                self._will._replace(enable=not self._will.enable) if key == "e" else Operator(self._will.enable, True)
+            )
+            if not key:
+                break
+        return self._will
+
+    def close(self) -> None:
+        """Give the terminal back as it was."""
+        if self._before is not None:
+            self._termios.tcsetattr(self._terminal, self._termios.TCSADRAIN, self._before)
+            self._before = None
+
+
+class TimedOperator:
+    """Enables by itself after a while: for a vehicle that is simulated, never for a real one.
+
+    Args:
+        delay: s before it enables.
+        clock: s; for tests.
+    """
+
+    def __init__(self, delay: float = 0.5, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._from = clock() + delay
+
+    def poll(self) -> Operator:
+        """Return what is wanted now."""
+        return Operator(self._clock() >= self._from, False)
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -1,0 +1,68 @@
+"""Which gate comes next, from positions alone."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.vehicle import Pose
+
+
+class GatePass(NamedTuple):
+    """A gate that was passed.
+
+    Args:
+        gate: Its index.
+        time: s, by the loop's clock, when the vehicle crossed its plane.
+        offset: m, from its centre.
+    """
+
+    gate: int
+    time: float
+    offset: float
+
+
+class GateProgress:
+    """Counts gates passed in order. A pass goes forwards through the plane, inside of the opening less its margin.
+
+    Args:
+        track: The gates.
+
+    Attributes:
+        target: Index of the gate that comes next.
+        passes: Those passed since `reset`, in order.
+    """
+
+    def __init__(self, track: Track) -> None:
+        self._centres = np.array([gate.position for gate in track.gates])  # (G, 3)
+        self._forward = np.array([gate.forward for gate in track.gates])  # (G, 3)
+        self._left = np.array([gate.left for gate in track.gates])  # (G, 3)
+        self._half_width = track.shape.pass_half_width
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at the first gate."""
+        self.target = 0
+        self.passes: list[GatePass] = []
+        self._last: Pose | None = None
+
+    def update(self, pose: Pose) -> GatePass | None:
+        """Take in the next measured pose; return the gate passed since the one before, if there is one."""
+        last, self._last = self._last, pose
+        if last is None:
+            return None
+        centre, forward, left = self._centres[self.target], self._forward[self.target], self._left[self.target]
+        before, after = float((last.position - centre) @ forward), float((pose.position - centre) @ forward)
+        if not before < 0.0 <= after:
+            return None
+        share = before / (before - after)
+        crossing = last.position + share * (pose.position - last.position) - centre
+        if max(abs(float(crossing @ left)), abs(float(crossing[2]))) > self._half_width:
+            return None
+        time = last.time + share * (pose.time - last.time)
+        passed = GatePass(self.target, time, float(np.linalg.norm(crossing)))
+        self.passes.append(passed)
+        self.target = (self.target + 1) % len(self._centres)
+        return passed

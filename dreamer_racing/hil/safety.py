@@ -1,0 +1,393 @@
+"""The last word before a vehicle: whether its motors may turn, and what it is told.
+
+| `State` | what is sent | ends with |
+|---|---|---|
+| DISARMED | at rest | the operator's enable, given anew, and nothing that speaks against it → FLYING |
+| FLYING | what the actor wants, within limits | pose or setpoint not fresh → HOLD; any other finding → CUT |
+| HOLD | level hover thrust, zero body rates | both fresh again → FLYING; lost, or any other finding → CUT |
+| CUT | at rest | as DISARMED: it is latched until a new flight is begun on purpose |
+
+`Tick.finish` disarms from FLYING and HOLD; the operator's kill leads to CUT from everywhere.
+There is no clock and no I/O in here: the same ticks give the same verdicts, so a recorded flight can be judged again.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.hil.operator import Operator
+from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, is_within, to_number, to_numbers
+from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, at_rest, hover
+
+
+class State(enum.Enum):
+    """What a vehicle may do."""
+
+    DISARMED = "disarmed"
+    FLYING = "flying"
+    HOLD = "hold"
+    CUT = "cut"
+
+
+class Reason(enum.Enum):
+    """Why a vehicle is in its state, or does not arm."""
+
+    KILL = "kill"
+    NO_ENABLE = "no enable"
+    NOT_RELEASED = "enable not released before"
+    NOT_REQUESTED = "arming not requested"
+    CONTRACT = "contract"
+    CLOCK = "clock"
+    OVERRUNS = "overruns"
+    NOT_FINITE = "pose not finite"
+    POSE_JUMP = "pose jump"
+    POSE_STALE = "pose stale"
+    POSE_LOST = "pose lost"
+    GEOFENCE = "geofence"
+    SPEED = "speed"
+    TILT = "tilt"
+    NO_SETPOINT = "no setpoint"
+    SETPOINT_LOST = "setpoint lost"
+    OUTSIDE_START_BOX = "outside start box"
+    TURNED_AT_START = "turned at start"
+    TILTED_AT_START = "tilted at start"
+    MOVING_AT_START = "moving at start"
+    ARMING = "arming"
+    FINISHED = "finished"
+
+
+Findings = dict[Reason, str]
+_HOLDING = {Reason.POSE_STALE, Reason.NO_SETPOINT}
+_OVER = "the flight is over"
+# Rates of zero, not such as would level it: a hold lasts 0.1 s, in which levelling would save some decimetres a second,
+# and the attitude to level from is the very thing that is no longer known: after 0.05 s at 10 rad/s it is off by 30°.
+_HOVER: Vector = (hover().collective_thrust, 0.0, 0.0, 0.0)
+
+
+class Tick(NamedTuple):
+    """What is known at a tick of the loop.
+
+    Args:
+        now: s, ``time.monotonic``.
+        pose: The newest that was measured; None if there is none.
+        pose_age: s since it was measured. The time since `Pose.time` counts where it is longer.
+        setpoint: What the actor wants; None if it wants nothing.
+        operator: What the operator wants; None counts as no enable.
+        arm_requested: Whether the program was started with leave to arm.
+        contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
+        loop_overrun: Whether the tick before took longer than its period.
+        finish: Whether the flight is over.
+    """
+
+    now: float
+    pose: Pose | None
+    pose_age: float
+    setpoint: Setpoint | None
+    operator: Operator | None
+    arm_requested: bool
+    contract_mismatch: str | None = None
+    loop_overrun: bool = False
+    finish: bool = False
+
+
+class Verdict(NamedTuple):
+    """What becomes of a tick.
+
+    Args:
+        state: From this tick on.
+        command: To be sent now.
+        reasons: Of the state: what cut, what it holds for, or what speaks against arming.
+        words: The same for a person, one for each reason.
+    """
+
+    state: State
+    command: Command
+    reasons: tuple[Reason, ...]
+    words: tuple[str, ...]
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Why it does not arm, in words; empty where it is armed."""
+        return () if self.command.armed else self.words
+
+
+class _Seen(NamedTuple):
+    """A pose in plain numbers: as `Pose`, with an attitude of unit length."""
+
+    time: float
+    position: Vector
+    attitude: Vector
+    speed: float
+
+    @property
+    def tilt_degrees(self) -> float:
+        """Angle between body z and world z."""
+        _, x, y, _ = self.attitude
+        return math.degrees(2.0 * math.asin(min(1.0, math.hypot(x, y))))
+
+    @property
+    def yaw_degrees(self) -> float:
+        """Direction of body x from world x, left."""
+        w, x, y, z = self.attitude
+        return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+class Safety:
+    """Decides at each tick of the loop whether motors may turn and what is sent; it never raises once it is made.
+
+    Args:
+        limits: Its thresholds.
+
+    Attributes:
+        limits: As given.
+        state: Now.
+
+    Raises:
+        ValueError: The limits are none; see `SafetyLimits.check`.
+
+    Example:
+        >>> limits = SafetyLimits(fence_low=(-9, -8, -1), fence_high=(9, 8, 5), start_position=(0, 0, 0))
+        >>> verdict = Safety(limits).step(Tick(0.0, None, 0.0, None, Operator(enable=False, kill=False), True))
+        >>> verdict.state, verdict.command.armed, verdict.refusals[0]
+        (<State.DISARMED: 'disarmed'>, False, 'the operator does not give the enable')
+    """
+
+    def __init__(self, limits: SafetyLimits) -> None:
+        limits.check()
+        self.limits = limits
+        self.state = State.DISARMED
+        self._now, self._elapsed = math.nan, 0.0
+        self._overruns: deque[float] = deque(maxlen=int(limits.overruns_max) + 1)
+        self._least: Vector = (float(limits.thrust_min), 0.0, 0.0, 0.0)  # thrust and body rates
+        self._sent: Vector = self._least
+        self._forget()
+
+    @property
+    def armed(self) -> bool:
+        """Whether motors may turn."""
+        return self.state in (State.FLYING, State.HOLD)
+
+    def step(self, tick: Tick) -> Verdict:
+        """Judge a tick."""
+        findings = self._check_clock(tick) | self._check_people(tick)
+        if Reason.CLOCK not in findings:
+            findings |= self._check_loop(tick) | self._take_pose(tick) | self._check_flight(tick)
+        if self.armed:
+            findings |= self._check_setpoint(tick)
+            self._fly_on(findings, tick.finish)
+        else:
+            findings |= self._check_start(tick)
+            self._stay_or_arm(findings)
+        if tick.operator is not None and tick.operator.enable:
+            self._ready = False
+        if self._arming:
+            findings[Reason.ARMING] = f"armed: the least thrust for {self.limits.arm_time:g} s"
+        return Verdict(self.state, self._command(tick), tuple(findings), tuple(findings.values()))
+
+    @property
+    def _arming(self) -> bool:
+        return self.armed and self._now - self._armed_at < self.limits.arm_time
+
+    def _fly_on(self, findings: Findings, finish: bool) -> None:
+        if findings.keys() - _HOLDING:
+            self.state = State.CUT
+        elif finish:
+            self.state = State.DISARMED
+            findings[Reason.FINISHED] = _OVER
+        else:
+            self.state = State.HOLD if findings else State.FLYING
+
+    def _stay_or_arm(self, findings: Findings) -> None:
+        if Reason.KILL in findings:
+            self.state = State.CUT
+        elif not findings:
+            self.state = State.FLYING
+            self._armed_at = self._wanted_at = self._now
+
+    def _command(self, tick: Tick) -> Command:
+        """Return what is sent: the wanted one within its limits, and not faster than they may change."""
+        if not self.armed:
+            self._sent = self._least
+            return at_rest()
+        wanted: Vector | None = _read_setpoint(tick.setpoint)
+        if self._arming:
+            wanted = self._least
+        elif self.state is State.HOLD or wanted is None:
+            wanted = _HOVER
+        limits = self.limits
+        low = self._least[0], *(-rate for rate in limits.rate_max)
+        high = limits.thrust_max, *limits.rate_max
+        steps = (slew * self._elapsed for slew in (limits.thrust_slew, *3 * (limits.rate_slew,)))
+        self._sent = tuple(
+            _clip(_clip(want, *bounds), sent - step, sent + step)
+            for want, sent, step, *bounds in zip(wanted, self._sent, steps, low, high, strict=True)
+        )
+        return Command(True, Setpoint(self._sent[0], np.array(self._sent[1:])))
+
+    def _forget(self) -> None:
+        """Drop whatever was measured by a clock that cannot be trusted, or that has only begun."""
+        self._seen: _Seen | None = None
+        self._measured_at = -math.inf
+        self._overruns.clear()
+        self._released_at: float | None = None
+        self._ready = False  # the enable was released for long enough, and has not been given since
+        self._upright_at = self._wanted_at = self._armed_at = self._now
+
+    def _check_clock(self, tick: Tick) -> Findings:
+        now = to_number(tick.now)
+        step = now - self._now  # not a number at the first tick
+        self._now = now
+        forwards = 0.0 <= step <= self.limits.tick_max
+        self._elapsed = step if forwards else 0.0
+        if not forwards:
+            self._forget()
+        if math.isfinite(now) and (forwards or math.isnan(step)):
+            return {}
+        return {Reason.CLOCK: f"the clock moved by {step:g} s from tick to tick (allowed: {self.limits.tick_max:g})"}
+
+    def _check_people(self, tick: Tick) -> Findings:
+        """Ask those who answer for the flight, and remember for how long the enable has been released."""
+        operator = tick.operator if tick.operator is not None else Operator(enable=False, kill=False)
+        findings: Findings = {}
+        if operator.kill:
+            findings[Reason.KILL] = "the operator killed the flight"
+        if not operator.enable:
+            findings[Reason.NO_ENABLE] = "the operator does not give the enable"
+        if operator.kill or operator.enable:
+            self._released_at = None
+        elif self._released_at is None:
+            self._released_at = self._now
+        if operator.kill:
+            self._ready = False
+        elif self._released_at is not None:
+            self._ready = self._now - self._released_at >= self.limits.release_time
+        if not tick.arm_requested:
+            findings[Reason.NOT_REQUESTED] = "arming was not requested: start with arm=true"
+        if tick.contract_mismatch is not None:
+            findings[Reason.CONTRACT] = f"the actor's contract does not fit: {tick.contract_mismatch}"
+        return findings
+
+    def _check_loop(self, tick: Tick) -> Findings:
+        limits, overruns = self.limits, self._overruns
+        if tick.loop_overrun:
+            overruns.append(self._now)
+        if len(overruns) == overruns.maxlen and self._now - overruns[0] <= limits.overrun_window:
+            return {
+                Reason.OVERRUNS: f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
+                f"(allowed: {limits.overruns_max})"
+            }
+        return {}
+
+    def _take_pose(self, tick: Tick) -> Findings:
+        """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""
+        if tick.pose is None:
+            return {}
+        seen = _read_pose(tick.pose)
+        if seen is None:
+            return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an attitude that is none"}
+        last, limits = self._seen, self.limits
+        if seen.time > self._now + limits.hold_after or (last is not None and seen.time <= last.time):
+            return {}
+        age = to_number(tick.pose_age)
+        self._seen = seen
+        self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
+        if last is not None:
+            moved = math.dist(seen.position, last.position)
+            allowed = limits.speed_max * (seen.time - last.time) + limits.jump_tolerance
+            if not moved <= allowed:
+                return {Reason.POSE_JUMP: f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"}
+        return {}
+
+    def _check_flight(self, tick: Tick) -> Findings:
+        limits, seen = self.limits, self._seen
+        age = self._now - self._measured_at
+        if tick.pose is not None and not math.isnan(to_number(tick.pose_age)):
+            age = max(age, to_number(tick.pose_age))
+        findings: Findings = {}
+        if age > limits.hold_after:
+            reason = Reason.POSE_LOST if age > limits.cut_after else Reason.POSE_STALE
+            known = f"the newest pose is {age:.3g} s old (allowed: {limits.hold_after:g})"
+            findings[reason] = known if seen is not None else "there is no pose"
+        if seen is None:
+            self._upright_at = self._now
+            return findings
+        if not is_within(seen.position, limits.fence_low, limits.fence_high):
+            findings[Reason.GEOFENCE] = f"at {_say(seen.position)} m it is outside of the fence"
+        if seen.speed > limits.speed_max:
+            findings[Reason.SPEED] = f"it moves at {seen.speed:.3g} m/s (allowed: {limits.speed_max:g})"
+        if seen.tilt_degrees <= limits.tilt_max_degrees:
+            self._upright_at = self._now
+        elif self._now - self._upright_at > limits.tilt_time:
+            findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
+        return findings
+
+    def _check_setpoint(self, tick: Tick) -> Findings:
+        if self._arming or _read_setpoint(tick.setpoint) is not None:
+            self._wanted_at = self._now
+            return {}
+        missing = self._now - self._wanted_at
+        reason = Reason.SETPOINT_LOST if missing > self.limits.cut_after else Reason.NO_SETPOINT
+        return {reason: f"the actor has given no usable setpoint for {missing:.3g} s"}
+
+    def _check_start(self, tick: Tick) -> Findings:
+        """Return what else speaks against arming: an enable that is not new, a finished flight, or a vehicle astray."""
+        limits, seen = self.limits, self._seen
+        findings: Findings = {}
+        if tick.finish:
+            findings[Reason.FINISHED] = _OVER
+        if not self._ready and tick.operator is not None and tick.operator.enable:
+            findings[Reason.NOT_RELEASED] = f"release the enable for {limits.release_time:g} s and give it again"
+        if seen is None:
+            return findings
+        away = max(abs(here - start) for here, start in zip(seen.position, limits.start_position, strict=True))
+        turned = abs((seen.yaw_degrees - limits.start_yaw_degrees + 180.0) % 360.0 - 180.0)
+        for reason, value, limit, text in (
+            (Reason.OUTSIDE_START_BOX, away, limits.start_box, "it is {:.3g} m from the start along an axis"),
+            (Reason.TURNED_AT_START, turned, limits.start_yaw_tolerance_degrees, "its yaw is {:.0f}° from the start's"),
+            (Reason.TILTED_AT_START, seen.tilt_degrees, limits.start_tilt_degrees, "it stands tilted by {:.0f}°"),
+            (Reason.MOVING_AT_START, seen.speed, limits.start_speed, "it moves at {:.3g} m/s"),
+        ):
+            if value > limit:
+                findings[reason] = f"{text.format(value)} (allowed: {limit:g})"
+        return findings
+
+
+def farewell() -> Command:
+    """Return what a program sends for a moment before it goes, whatever has happened: disarmed, no thrust."""
+    return at_rest()
+
+
+def _read_pose(pose: Pose) -> _Seen | None:
+    """Return a pose in plain numbers; None if one is not finite, or the attitude is none."""
+    time = to_number(pose.time)
+    position, velocity, rates = (
+        to_numbers(value, 3) for value in (pose.position, pose.linear_velocity, pose.body_rates)
+    )
+    attitude = to_numbers(pose.attitude, 4)
+    if position is None or velocity is None or rates is None or attitude is None or not math.isfinite(time):
+        return None
+    length = math.hypot(*attitude)
+    if not 0.9 < length < 1.1:
+        return None
+    return _Seen(time, position, tuple(value / length for value in attitude), math.hypot(*velocity))
+
+
+def _read_setpoint(setpoint: Setpoint | None) -> Vector | None:
+    """Return thrust and body rates in plain numbers; None if there are none, or one is not finite."""
+    if setpoint is None:
+        return None
+    thrust, rates = to_number(setpoint.collective_thrust), to_numbers(setpoint.body_rates, 3)
+    return (thrust, *rates) if rates is not None and math.isfinite(thrust) else None
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+def _say(point: Vector) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in point)})"

@@ -1,0 +1,120 @@
+"""Every threshold of `safety.Safety`: how far, how fast, how old, and for how long.
+
+Where nothing else is said, the numbers are this project's own choice, for a track of some metres in a room.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from dreamer_racing.hil.vehicle import GRAVITY
+from dreamer_racing.settings import Range, check_settings, setting
+
+Vector = tuple[float, ...]
+
+_SECONDS, _TOLERANCE, _DEGREES = Range(0, 1, open_below=True), Range(0, 10), Range(0, 180, open_below=True)
+_MOST = Range(0, 1e4, open_below=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyLimits:
+    """Every threshold of `Safety`. Where the room is has no default.
+
+    Attributes:
+        fence_low: (3,) m, world: lower corner of the box that the vehicle must not leave.
+        fence_high: (3,) m, world: its upper corner.
+        start_position: (3,) m, world: where the vehicle stands before a flight.
+        start_yaw_degrees: where its nose points then, from world x, left.
+        start_box: m, from the start along each axis, within which it may arm.
+        start_yaw_tolerance_degrees: from its yaw, within which it may arm.
+        start_tilt_degrees: from level, within which it may arm.
+        start_speed: m/s, above which it does not arm.
+        release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
+        arm_time: s after arming in which the least thrust is sent: Betaflight arms at low throttle only.
+        hold_after: s, age of a pose above which it holds.
+        cut_after: s, age of a pose, or time without a setpoint, above which it cuts.
+        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still.
+        overruns_max: overruns of the loop that may happen within `overrun_window`.
+        overrun_window: s.
+        speed_max: m/s; the shipped agents fly at up to 11.5 in simulation.
+        jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
+        tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
+        tilt_time: s.
+        thrust_min: m/s², least collective thrust when armed.
+        thrust_max: m/s², largest.
+        thrust_slew: m/s³, how fast it may change; the default lets the shipped actors swing fully in a tick of 25 Hz.
+        rate_max: (3,) rad/s, largest body rates about x, y, z: those of the shipped actors.
+        rate_slew: rad/s², how fast each may change; as `thrust_slew`.
+    """
+
+    fence_low: Vector
+    fence_high: Vector
+    start_position: Vector
+    start_yaw_degrees: float = setting(0.0, Range(-360, 360))
+    start_box: float = setting(0.3, _TOLERANCE)
+    start_yaw_tolerance_degrees: float = setting(15.0, _DEGREES)
+    start_tilt_degrees: float = setting(10.0, _DEGREES)
+    start_speed: float = setting(0.2, _TOLERANCE)
+    release_time: float = setting(0.2, Range(0, 10))
+    arm_time: float = setting(0.1, _SECONDS)
+    hold_after: float = setting(0.050, _SECONDS)
+    cut_after: float = setting(0.150, _SECONDS)
+    tick_max: float = setting(0.200, _SECONDS)
+    overruns_max: int = setting(3, Range(0, 1000))
+    overrun_window: float = setting(1.0, Range(0, 60, open_below=True))
+    speed_max: float = setting(15.0, _MOST)
+    jump_tolerance: float = setting(0.1, _TOLERANCE)
+    tilt_max_degrees: float = setting(100.0, _DEGREES)
+    tilt_time: float = setting(0.2, _TOLERANCE)
+    thrust_min: float = setting(0.0, Range(0, 100))
+    thrust_max: float = setting(30.0, Range(0, 1000, open_below=True))
+    thrust_slew: float = setting(700.0, _MOST)
+    rate_max: Vector = (10.0, 10.0, 4.0)
+    rate_slew: float = setting(500.0, _MOST)
+
+    def check(self) -> None:
+        """Refuse limits that protect nothing, or that nothing can fly within.
+
+        Raises:
+            ValueError: The message gives the limit, its value, and what is allowed.
+        """
+        check_settings(self)
+        for name in ("fence_low", "fence_high", "start_position", "rate_max"):
+            if to_numbers(getattr(self, name), 3) is None:
+                raise ValueError(f"{name}={getattr(self, name)}: must be three finite numbers.")
+        for wrong, message in (
+            (not self.hold_after < self.cut_after, f"hold_after={self.hold_after}: must be below cut_after"),
+            (
+                not is_within(self.start_position, self.fence_low, self.fence_high),
+                "start_position: must be in the fence",
+            ),
+            (min(self.rate_max) <= 0.0, f"rate_max={self.rate_max}: must be above 0 about each axis"),
+            (not self.thrust_min < GRAVITY, f"thrust_min={self.thrust_min}: must be below {GRAVITY} (hover)"),
+            (not self.thrust_max > GRAVITY, f"thrust_max={self.thrust_max}: must be above {GRAVITY} (hover)"),
+        ):
+            if wrong:
+                raise ValueError(f"{message}.")
+
+
+def to_number(value: Any) -> float:
+    """Return a number, or not-a-number for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def to_numbers(values: Any, count: int) -> Vector | None:
+    """Return so many finite numbers, or None."""
+    try:
+        numbers = tuple(to_number(value) for value in values)
+    except TypeError:
+        return None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
+def is_within(point: Vector, low: Vector, high: Vector) -> bool:
+    """Return whether a point is inside a box, or on its faces."""
+    return all(least <= value <= most for value, least, most in zip(point, low, high, strict=True))

@@ -1,0 +1,120 @@
+"""When a pose was measured, by the loop's own clock, and where the vehicle is by now.
+
+A motion-capture system stamps poses with a clock of its own, and the network delays them by more or less. What is known
+is when a packet arrived; what is wanted is when it was measured.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum
+
+import numpy as np
+
+from dreamer_racing.hil.pose import Received
+from dreamer_racing.hil.vehicle import Pose
+
+WINDOW = 200
+"""Packets over which the least delay is sought [choice]: a second at 200 Hz, in which clocks drift by some 20 µs."""
+
+
+SILENCE = 0.5
+"""s without a packet after which a sender may begin anew, with lower numbers [choice]; the vehicle is cut by then."""
+
+
+class Stamping(Enum):
+    """What a pose's time is."""
+
+    receive = "receive"  # when it arrived, less a fixed latency
+    sender = "sender"  # the sender's stamp, put on our clock by the least delay of the newest packets
+
+
+class PoseClock:
+    """Puts packets on the loop's clock.
+
+    Args:
+        stamping: How.
+        latency: s, of the least delayed packet from measurement to arrival: what no stamp shows.
+
+    Attributes:
+        out_of_order: Packets so far that were older than one before, or the same again; they are left out.
+    """
+
+    def __init__(self, stamping: Stamping, latency: float) -> None:
+        self.stamping = stamping
+        self.latency = latency
+        self.out_of_order = 0
+        self._offsets: deque[float] = deque(maxlen=WINDOW)  # arrival less stamp, s
+        self._newest: Received | None = None
+
+    def read(self, received: Received) -> Pose | None:
+        """Return the pose of a packet; None if it is not newer than the newest one.
+
+        Only after a silence may numbers and stamps begin anew: else a replayed packet would be taken for a new sender.
+        """
+        packet = received.packet
+        if self._newest is not None:
+            newer = 0 < (packet.sequence - self._newest.packet.sequence) % 2**32 < 2**31
+            if not newer and received.time - self._newest.time < SILENCE:
+                self.out_of_order += 1
+                return None
+            if packet.stamp < self._newest.packet.stamp:
+                self._offsets.clear()
+        self._newest = received
+        return Pose(
+            self._measured(received), packet.position, packet.attitude, packet.linear_velocity, packet.body_rates
+        )
+
+    def _measured(self, received: Received) -> float:
+        if self.stamping is Stamping.receive:
+            return received.time - self.latency
+        self._offsets.append(received.time - received.packet.stamp)
+        measured = received.packet.stamp + min(self._offsets) - self.latency
+        return min(measured, received.time - self.latency)
+
+
+def extrapolate(pose: Pose, time: float) -> Pose:
+    """Return where the vehicle is by then, if it goes on as it did: with its velocity, turning with its body rates.
+
+    Args:
+        pose: As measured.
+        time: s, by the loop's clock; before the pose's own, the pose is returned as it is.
+    """
+    elapsed = time - pose.time
+    if elapsed <= 0.0:
+        return pose
+    return pose._replace(
+        time=time,
+        position=pose.position + elapsed * pose.linear_velocity,
+        attitude=turn(pose.attitude, elapsed * pose.body_rates),
+    )
+
+
+def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Turn an attitude (4,) wxyz by a rotation vector (3,) in rad, in the body frame."""
+    angle = float(np.linalg.norm(rotation))
+    half = 0.5 * angle
+    scale = 0.5 if angle < 1e-9 else np.sin(half) / angle
+    w, (x, y, z) = np.cos(half), scale * rotation
+    a, b, c, d = attitude
+    turned = np.array(
+        (
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        )
+    )
+    return turned / np.linalg.norm(turned)
+
+
+def rotation_matrix(attitude: np.ndarray) -> np.ndarray:
+    """Return the rotation body → world (3, 3) of an attitude (4,) wxyz; its columns are forward, left and up."""
+    w, x, y, z = attitude
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )

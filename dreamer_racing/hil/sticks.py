@@ -1,0 +1,227 @@
+"""From setpoints to the sticks of a radio, which is what a Betaflight flight controller is flown with, and back.
+
+Rates and thrust are mapped apart: `RateMap` says what the flight controller makes of the sticks and stays as it is
+configured, `ThrustMap` says what motors and battery make of the throttle and changes in flight.
+
+| stick | +1 means | in `Setpoint` | channel |
+|---|---|---|---|
+| roll | roll right | +x | 1 |
+| pitch | stick forward, nose down | +y | 2 |
+| throttle, 0 to 1 | all of it | +collective thrust | 3 |
+| yaw | yaw right | −z | 4 |
+
+Reference: Betaflight, src/main/fc/rc.c (rates, throttle) and src/main/flight/mixer.c (motor idle).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
+from dreamer_racing.settings import ALLOWED, Range, check_settings
+
+LOWEST, CENTRE, HIGHEST = 1000.0, 1500.0, 2000.0
+"""Ends and centre of a channel, µs."""
+CHANNELS = 16
+FIRST_SWITCH = 4
+"""Index of AUX1, the first channel that is no stick."""
+
+_RATE = Range(0, math.radians(2000), open_below=True)  # Betaflight's rc_rate ends at 200, in units of 10 deg/s
+_PHYSICAL = Range(0, 1e4, open_below=True)
+
+
+class Sticks(NamedTuple):
+    """Where the sticks are.
+
+    Args:
+        roll: In [−1, 1], + right.
+        pitch: In [−1, 1], + forward.
+        yaw: In [−1, 1], + right.
+        throttle: In [0, 1], the share of its way: 1000 µs to 2000 µs.
+    """
+
+    roll: float
+    pitch: float
+    yaw: float
+    throttle: float
+
+
+@dataclass(frozen=True)
+class RateMap:
+    """What body rates the sticks ask for: so much of the largest, linearly.
+
+    In Betaflight: ``rates_type = ACTUAL``, expo 0, and rc_rate and srate both a tenth of the largest rate in deg/s.
+
+    Attributes:
+        roll: rad/s at full stick.
+        pitch: rad/s at full stick.
+        yaw: rad/s at full stick.
+
+    Raises:
+        ValueError: See `check`.
+
+    Example:
+        >>> RateMap(roll=10.0, pitch=10.0, yaw=4.0).to_sticks(np.array([5.0, -10.0, 1.0]))
+        (0.5, -1.0, -0.25)
+    """
+
+    roll: float = field(metadata={ALLOWED: _RATE})
+    pitch: float = field(metadata={ALLOWED: _RATE})
+    yaw: float = field(metadata={ALLOWED: _RATE})
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Refuse rates that no flight controller can be set to.
+
+        Raises:
+            ValueError: The message gives the field, its value, and what is allowed.
+        """
+        check_settings(self, "RateMap.")
+
+    def to_sticks(self, body_rates: np.ndarray) -> tuple[float, float, float]:
+        """Return roll, pitch and yaw stick for body rates (3,) in rad/s; full stick where they are larger."""
+        roll, pitch, yaw = (float(rate) for rate in body_rates)
+        return _clamp(roll / self.roll, -1, 1), _clamp(pitch / self.pitch, -1, 1), _clamp(-yaw / self.yaw, -1, 1)
+
+    def from_sticks(self, roll: float, pitch: float, yaw: float) -> np.ndarray:
+        """Return the body rates (3,) in rad/s that sticks ask for."""
+        return np.array([roll * self.roll, pitch * self.pitch, -yaw * self.yaw])
+
+
+@dataclass(frozen=True)
+class ThrustMap:
+    """What thrust a throttle makes: that of the motors' command squared, and of the battery's voltage squared.
+
+    ``motor = idle + (1 − idle) (µs − min_check) / (2000 − min_check)``, and
+    ``thrust = full_thrust (voltage / reference_voltage)² motor²``.
+
+    Attributes:
+        mass: kg, with battery.
+        full_thrust: N, of all motors at full command and the reference voltage, as measured on a stand.
+        reference_voltage: V, the battery's under that load.
+        voltage: V, the battery's now; `dataclasses.replace` keeps it up to date.
+        idle: Motor command at throttle 0: Betaflight's motor_idle (dshot_idle_value).
+        min_check: µs, the channel's value up to which the throttle counts as 0.
+
+    Raises:
+        ValueError: See `check`.
+
+    Example:
+        >>> thrust = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
+        >>> round(thrust.to_motor(9.81), 3), round(thrust.to_sticks(9.81), 3)
+        (0.607, 0.604)
+    """
+
+    mass: float = field(metadata={ALLOWED: _PHYSICAL})
+    full_thrust: float = field(metadata={ALLOWED: _PHYSICAL})
+    reference_voltage: float = field(metadata={ALLOWED: _PHYSICAL})
+    voltage: float = field(metadata={ALLOWED: _PHYSICAL})
+    idle: float = field(default=0.055, metadata={ALLOWED: Range(0, 0.2)})  # Betaflight's default and largest
+    min_check: float = field(default=1050.0, metadata={ALLOWED: Range(LOWEST, CENTRE)})  # Betaflight's default, µs
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Refuse what no drone that flies is like.
+
+        Raises:
+            ValueError: The message gives the field, its value, and what is allowed.
+        """
+        check_settings(self, "ThrustMap.")
+        low, high = 0.5 * self.reference_voltage, 1.5 * self.reference_voltage
+        if not low <= self.voltage <= high:
+            raise ValueError(
+                f"ThrustMap.voltage={self.voltage} V: must be between {low:g} and {high:g} V, half and one and a half "
+                "times reference_voltage. Is one of a cell and the other of the whole battery?"
+            )
+        if not self.collective_thrust_max > GRAVITY:
+            raise ValueError(
+                f"ThrustMap.full_thrust={self.full_thrust} N: must lift mass={self.mass} kg, of "
+                f"{GRAVITY * self.mass:.3g} N, but is {self.collective_thrust_max * self.mass:.3g} N at "
+                f"{self.voltage:g} V. Is it that of all motors together?"
+            )
+
+    @property
+    def collective_thrust_max(self) -> float:
+        """Collective thrust at full command and the voltage now, m/s²."""
+        return self.full_thrust * (self.voltage / self.reference_voltage) ** 2 / self.mass
+
+    def to_motor(self, collective_thrust: float) -> float:
+        """Return the motor command in [0, 1] for a collective thrust in m/s²; 1 where it is more than there is."""
+        return math.sqrt(_clamp(collective_thrust / self.collective_thrust_max, 0, 1))
+
+    def to_sticks(self, collective_thrust: float) -> float:
+        """Return the throttle in [0, 1] for a collective thrust in m/s².
+
+        Thrust below that of idling motors is a throttle below ``min_check``, as arming in Betaflight needs it.
+        """
+        share = (self.to_motor(collective_thrust) - self.idle) / (1 - self.idle)
+        return _clamp((self.min_check + share * (HIGHEST - self.min_check) - LOWEST) / (HIGHEST - LOWEST), 0, 1)
+
+    def from_sticks(self, throttle: float) -> float:
+        """Return the collective thrust in m/s² that armed motors make at a throttle in [0, 1]."""
+        microseconds = LOWEST + (HIGHEST - LOWEST) * throttle
+        share = max((microseconds - self.min_check) / (HIGHEST - self.min_check), 0.0)
+        return self.collective_thrust_max * (self.idle + (1 - self.idle) * share) ** 2
+
+
+def to_sticks(setpoint: Setpoint, rates: RateMap, thrust: ThrustMap) -> Sticks:
+    """Return the sticks that ask for a setpoint, or for what comes closest to it."""
+    return Sticks(*rates.to_sticks(setpoint.body_rates), thrust.to_sticks(setpoint.collective_thrust))
+
+
+def from_sticks(sticks: Sticks, rates: RateMap, thrust: ThrustMap) -> Setpoint:
+    """Return the setpoint that sticks ask for."""
+    return Setpoint(thrust.from_sticks(sticks.throttle), rates.from_sticks(sticks.roll, sticks.pitch, sticks.yaw))
+
+
+def channels(command: Command, rates: RateMap, thrust: ThrustMap, arm_channel: int = FIRST_SWITCH) -> tuple[float, ...]:
+    """Return the 16 channels of a radio that ask for a command.
+
+    The order is Betaflight's ``map AETR1234``: roll, pitch, throttle, yaw, AUX1, … Where the command is not armed,
+    the throttle is down and the other sticks are centred, whatever the setpoint.
+
+    Args:
+        command: What to do; the setpoint's numbers are finite where it is armed.
+        rates: What the flight controller makes of roll, pitch and yaw.
+        thrust: What it makes of the throttle.
+        arm_channel: Index of the switch that arms: 2000 µs when armed, 1000 µs otherwise, as all other switches always.
+
+    Returns:
+        (16,) µs in [1000, 2000], not rounded.
+
+    Raises:
+        ValueError: ``arm_channel`` is no switch.
+    """
+    check_arm_channel(arm_channel)
+    sticks = to_sticks(command.setpoint, rates, thrust) if command.armed else Sticks(0.0, 0.0, 0.0, 0.0)
+    values = [LOWEST] * CHANNELS
+    for index, stick in ((0, sticks.roll), (1, sticks.pitch), (3, sticks.yaw)):
+        values[index] = CENTRE + (HIGHEST - CENTRE) * stick
+    values[2] = LOWEST + (HIGHEST - LOWEST) * sticks.throttle
+    values[arm_channel] = HIGHEST if command.armed else LOWEST
+    return tuple(values)
+
+
+def check_arm_channel(arm_channel: int) -> None:
+    """Refuse a channel that is no switch.
+
+    Raises:
+        ValueError: It is a stick, or there is none of that index.
+    """
+    if arm_channel not in range(FIRST_SWITCH, CHANNELS):
+        raise ValueError(
+            f"arm_channel={arm_channel}: an index of {FIRST_SWITCH} (AUX1) to {CHANNELS - 1} (AUX12); those before are "
+            "the sticks'."
+        )
+
+
+def _clamp(value: float, low: float, high: float) -> float:
+    return float(min(max(value, low), high))

@@ -1,0 +1,131 @@
+"""A flight controller that is the real firmware: Betaflight, built for a computer (SITL), in a process of its own.
+
+It gets the state of the vehicle (UDP port 9003) and answers with motor commands (9002), both little endian:
+
+| packet | bytes | what |
+|---|---|---|
+| state | 144 | 18 f64: time, body rates, acceleration, attitude wxyz, velocity, position, air pressure in Pa |
+| motors | 16 | 4 f32 in [0, 1]; idle is above 0, disarmed is 0 |
+
+The firmware turns these around: acceleration as a whole, body rates about y, about z also before 2026.6. Its channels
+(9004) come from `hil.links`. Everything is for one machine: nothing here is meant to leave it.
+
+Reference: Betaflight, src/platform/SIMULATOR/sitl.c (updateState) and target/SITL/target.h (fdm_packet, servo_packet);
+measured answers of the firmware.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.hil.vehicle import Pose
+from dreamer_racing.plant.commands import TIMEOUT, Failsafe
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+STATE_PORT, MOTOR_PORT = 9003, 9002
+_STATE, _MOTORS = struct.Struct("<18d"), struct.Struct("<4f")
+_STAMP = 1.0  # s, always: the firmware sets the pace of its clock by stamps, and loses the radio if they jitter
+
+
+class Dialect(NamedTuple):
+    """How a firmware lays out its packets.
+
+    Args:
+        rotors: (4,) index of the rotor of each motor command: M1 … M4 are rear right, front right, rear left, front
+            left, indices 0 … 3.
+        yaw_rate_sign: Of the body rate about z that it is sent, against FLU.
+    """
+
+    rotors: tuple[int, int, int, int]
+    yaw_rate_sign: float
+
+
+DIALECTS = {"2026.6": Dialect((0, 1, 2, 3), 1.0), "before": Dialect((1, 2, 3, 0), -1.0)}
+"""By the firmware's version: 2026.6 and later, or before."""
+
+
+def encode_state(pose: Pose, specific_force: np.ndarray, dialect: Dialect) -> bytes:
+    """Return the packet that tells the firmware where the vehicle is.
+
+    Args:
+        pose: Of the vehicle.
+        specific_force: (3,) m/s², body frame: +9.81 upwards at rest.
+        dialect: Of the firmware.
+    """
+    x, y, z = pose.body_rates
+    rates = (x, -y, dialect.yaw_rate_sign * z)
+    pressure = 101325.0 * (1.0 - 2.25577e-5 * pose.position[2]) ** 5.25588  # Pa, standard atmosphere
+    vectors = (rates, -specific_force, pose.attitude, pose.linear_velocity, pose.position)
+    return _STATE.pack(_STAMP, *(float(number) for vector in vectors for number in vector), pressure)
+
+
+def decode_motors(data: bytes, dialect: Dialect) -> np.ndarray | None:
+    """Return the motor commands (4,) in [0, 1] by rotor; None if the packet is none."""
+    if len(data) != _MOTORS.size:
+        return None
+    motors = np.array(_MOTORS.unpack(data))
+    if not np.isfinite(motors).all():
+        return None
+    rotors = np.empty(4)
+    rotors[list(dialect.rotors)] = motors.clip(0.0, 1.0)
+    return rotors
+
+
+class BetaflightSitl:
+    """Flies the vehicle by the firmware: `Controls`.
+
+    Args:
+        vehicle: Which; its delay and body-rate controller are out of play.
+        send: Sends a state packet to the firmware.
+        firmware: One of `DIALECTS`.
+        timeout: s, of `Failsafe`.
+
+    Attributes:
+        received: Motor packets.
+        malformed: Messages that were none.
+        failsafe: Decides whether motors may turn.
+
+    Raises:
+        ValueError: Unknown firmware.
+    """
+
+    def __init__(
+        self, vehicle: PlantVehicle, send: Callable[[bytes], object], firmware: str, timeout: float = TIMEOUT
+    ) -> None:
+        if firmware not in DIALECTS:
+            raise ValueError(f"betaflight={firmware}: the firmware's version is one of {', '.join(DIALECTS)}.")
+        self._vehicle, self._send, self._dialect = vehicle, send, DIALECTS[firmware]
+        self._sent = 0
+        self.failsafe = Failsafe(timeout)
+        self.received = self.malformed = 0
+
+    @property
+    def due(self) -> float:
+        """When the next state is to be sent: once every physics step."""
+        return self._sent * self._vehicle.parameters.physics_dt
+
+    def act(self, time: float) -> None:
+        """Send the state, and cut the motors if nothing was heard for too long."""
+        if self.failsafe.expire(time):
+            self._vehicle.cut()
+        self._sent += 1
+        self._send(encode_state(self._vehicle.pose(), self._vehicle.specific_force, self._dialect))
+
+    def take(self, data: bytes, time: float) -> bool:
+        """Take a motor packet; return whether it was one."""
+        motors = decode_motors(data, self._dialect)
+        if motors is None:
+            self.malformed += 1
+            return False
+        self.received += 1
+        armed = self.failsafe.hear(bool((motors > 0.0).any()), time)
+        self._vehicle.turn_rotors(motors if armed else np.zeros(4))
+        return True
+
+    def summary(self) -> str:
+        """Say what came in."""
+        return f"{self.received} motor packets ({self.malformed} malformed), {self.failsafe.events} failsafe(s)"

@@ -1,0 +1,137 @@
+"""What moves the drone: command packets, and what is done when they stop."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Protocol
+
+from dreamer_racing.hil.links.udp import decode_command
+from dreamer_racing.hil.vehicle import at_rest
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+LOGGER = logging.getLogger(__name__)
+
+TIMEOUT = 0.25
+"""s without a valid message after which motors are cut [choice]: twelve commands at 50 Hz."""
+
+
+class Failsafe:
+    """Decides whether motors may turn: not after a silence, and not before a message that is disarmed.
+
+    As with a radio's arming switch, being armed from the first message on, or again after a silence, is not enough.
+
+    Args:
+        timeout: s of silence.
+
+    Attributes:
+        events: Silences so far that found the vehicle cleared to arm.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self._timeout = timeout
+        self._heard = -math.inf
+        self._cleared = self._complained = False
+        self.events = 0
+
+    @property
+    def deadline(self) -> float:
+        """When motors are to be cut if nothing is heard until then, s; infinite if they are."""
+        return self._heard + self._timeout if self._cleared else math.inf
+
+    def hear(self, armed: bool, time: float) -> bool:
+        """Note a valid message; return whether it may arm, or keep armed."""
+        self._heard = time
+        if not armed:
+            self._cleared = True
+        elif not (self._cleared or self._complained):
+            self._complained = True
+            LOGGER.warning("plant: armed without having been disarmed: motors stay off until it is disarmed once")
+        return armed and self._cleared
+
+    def expire(self, time: float) -> bool:
+        """Return whether a silence has just become too long."""
+        if time < self.deadline:
+            return False
+        self._cleared = self._complained = False
+        self.events += 1
+        LOGGER.warning("plant: nothing heard for %.2f s: motors cut until disarmed and armed again", self._timeout)
+        return True
+
+
+class Controls(Protocol):
+    """What tells the vehicle what to do."""
+
+    @property
+    def due(self) -> float:
+        """When there is something to do without a message, s of physics."""
+        ...
+
+    def act(self, time: float) -> None:
+        """Do what is due by a time."""
+        ...
+
+    def take(self, data: bytes, time: float) -> bool:
+        """Take a datagram; return whether it was one to fly by."""
+        ...
+
+    def summary(self) -> str:
+        """Say in a phrase what came in."""
+        ...
+
+
+class CommandReceiver:
+    """Flies the vehicle by command packets (`hil.links.udp`).
+
+    Args:
+        vehicle: Which.
+        timeout: s, of `Failsafe`.
+
+    Attributes:
+        received: Valid packets that were newer than any before.
+        lost: Packets that never came, by the gaps in the sequence.
+        stale: Valid packets that were not newer; they are ignored, so that none acts twice or late.
+        malformed: Messages that were no commands.
+        failsafe: Decides whether motors may turn.
+    """
+
+    def __init__(self, vehicle: PlantVehicle, timeout: float = TIMEOUT) -> None:
+        self._vehicle = vehicle
+        self._newest: int | None = None
+        self.failsafe = Failsafe(timeout)
+        self.received = self.lost = self.stale = self.malformed = 0
+
+    @property
+    def due(self) -> float:
+        """When motors are to be cut."""
+        return self.failsafe.deadline
+
+    def act(self, time: float) -> None:
+        """Cut the motors if nothing was heard for too long; then a sender may begin to count anew."""
+        if self.failsafe.expire(time):
+            self._newest = None
+            self._vehicle.cut()
+
+    def take(self, data: bytes, time: float) -> bool:
+        """Take a datagram; return whether the vehicle was given it."""
+        packet = decode_command(data)
+        if packet is None:
+            self.malformed += 1
+            return False
+        ahead = 1 if self._newest is None else (packet.sequence - self._newest) % 2**32
+        if not 0 < ahead < 2**31:
+            self.stale += 1
+            return False
+        self._newest = packet.sequence
+        self.received += 1
+        self.lost += ahead - 1
+        armed = self.failsafe.hear(packet.command.armed, time)
+        self._vehicle.command(packet.command if armed else at_rest())
+        return True
+
+    def summary(self) -> str:
+        """Say what came in."""
+        return (
+            f"{self.received} commands ({self.lost} lost, {self.stale} stale, {self.malformed} malformed), "
+            f"{self.failsafe.events} failsafe(s)"
+        )

@@ -1,0 +1,84 @@
+"""Poses on their way out, as motion capture and a network leave them: sampled, disturbed, late or lost."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from dreamer_racing.hil.pose import PosePacket, encode_pose
+from dreamer_racing.hil.stamping import turn
+from dreamer_racing.hil.vehicle import Pose
+from dreamer_racing.settings import NOT_NEGATIVE, SHARE, Range, setting
+
+
+@dataclass
+class Delivery:
+    """What becomes of poses between the vehicle and whoever receives them."""
+
+    rate: float = setting(200.0, Range(10, 1000))  # Hz, at which poses are measured
+    latency: float = setting(0.0, Range(0, 1))  # s, from a measurement to its departure
+    jitter: float = setting(0.0, Range(0, 1))  # s; uniform in [0, jitter] on top, so that packets may overtake others
+    loss: float = setting(0.0, SHARE)  # share of packets that are never sent, each on its own
+    position_noise: float = setting(0.0, NOT_NEGATIVE)  # m, standard deviation along each axis
+    attitude_noise: float = setting(0.0, NOT_NEGATIVE)  # rad, standard deviation about each body axis
+    clock_offset: float = 0.0  # s, of the stamps' clock before that of the physics
+    seed: int = setting(0, NOT_NEGATIVE)  # of noise, jitter and loss
+
+
+class PoseDelivery:
+    """Holds poses back until they are due.
+
+    Args:
+        delivery: What becomes of them.
+
+    Attributes:
+        sent: Packets that left.
+        dropped: Packets that were lost instead.
+    """
+
+    def __init__(self, delivery: Delivery) -> None:
+        self._delivery = delivery
+        self._random = np.random.default_rng(delivery.seed)
+        self._measured = 0
+        self._waiting: list[tuple[float, int, bytes]] = []  # heap of times of departure, sequence numbers and packets
+        self.sent = self.dropped = 0
+
+    @property
+    def next_measurement(self) -> float:
+        """When the next pose is to be measured, s of physics."""
+        return self._measured / self._delivery.rate
+
+    @property
+    def next_departure(self) -> float:
+        """When the next packet is to leave, s of physics; infinite if none is waiting."""
+        return self._waiting[0][0] if self._waiting else math.inf
+
+    def measure(self, pose: Pose) -> None:
+        """Take the pose that is due now, and send it off or lose it."""
+        sequence, self._measured = self._measured, self._measured + 1
+        delivery, random = self._delivery, self._random
+        draws = random.standard_normal(6)
+        lost, delay = random.random() < delivery.loss, delivery.latency + delivery.jitter * random.random()
+        if lost:
+            self.dropped += 1
+            return
+        packet = PosePacket(
+            sequence,
+            pose.time + delivery.clock_offset,
+            pose.position + delivery.position_noise * draws[:3],
+            turn(pose.attitude, delivery.attitude_noise * draws[3:]),
+            pose.linear_velocity,
+            pose.body_rates,
+        )
+        heapq.heappush(self._waiting, (pose.time + delay, sequence, encode_pose(packet)))
+
+    def depart(self, time: float) -> list[bytes]:
+        """Return the packets that leave by a time, s of physics, in the order of departure."""
+        leaving = []
+        while self.next_departure <= time:
+            leaving.append(heapq.heappop(self._waiting)[2])
+        self.sent += len(leaving)
+        return leaving

@@ -1,0 +1,58 @@
+"""The scripted pilot as who flies a vehicle, by poses instead of images: the rest can be tried without an agent."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from dreamer_racing.envs.drone.parameters import (
+    QuadrotorParameters,
+    at_control_rate,
+    load_preset,
+    without_randomisation,
+)
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.race.racing_line import LineLimits
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.vehicle import Pose, Setpoint
+
+
+class PilotFlyer:
+    """A `dreamer_racing.hil.flyer.Flyer` that flies the planned racing line.
+
+    Args:
+        track: To fly.
+        preset: Of the vehicle, as far as the pilot knows.
+        rate: Hz, of its choices.
+        limits: What the line may ask for; None for the pilot's own.
+
+    Attributes:
+        rate: As given.
+        camera: None: it needs no image.
+    """
+
+    camera: Camera | None = None
+
+    def __init__(
+        self,
+        track: Track,
+        preset: str | QuadrotorParameters = "faithful",
+        rate: float = 50.0,
+        limits: LineLimits | None = None,
+    ) -> None:
+        self.rate = rate
+        parameters = at_control_rate(without_randomisation(load_preset(preset)), rate)
+        self._pilot = ScriptedPilot(track, parameters, limits)
+        self._thrust_scale = parameters.collective_thrust_scale
+        self._rate_max = np.array(parameters.body_rate_max)
+
+    def reset(self) -> None:
+        """Begin a flight."""
+        self._pilot.reset()
+
+    def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
+        """Choose by the pose."""
+        state = (torch.from_numpy(part)[None] for part in pose[1:])
+        action = self._pilot.act(*state, torch.tensor([target_gate]))[0].double().numpy()
+        return Setpoint(self._thrust_scale * (1.0 + float(action[0])), self._rate_max * action[1:])

@@ -1,0 +1,276 @@
+"""One drone of this project's own physics, not quite the one that a policy was trained on.
+
+SI units, world z up, body frame FLU, attitude wxyz.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.race import Race
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.envs.simulator.scene import build_drone
+from dreamer_racing.envs.tracks import GROUND_HEIGHT, Track, load_track
+from dreamer_racing.hil.vehicle import Command, Pose, at_rest
+from dreamer_racing.settings import Range, setting
+
+LOGGER = logging.getLogger(__name__)
+
+LIFT_OFF = 0.5
+"""Share of its weight that a drone must be asked to carry before the stand lets go [choice]."""
+
+SPIN_UP = 5.0
+"""Motor lags for which it must be asked that: rotors then give 98.7 % of the thrust that they are to [choice]."""
+
+
+@dataclass
+class Mismatch:
+    """How a drone differs from the nominal one of its preset."""
+
+    mass: float = setting(1.0, Range(0.5, 2.0))  # relative; the flight controller reckons with the nominal one
+    thrust: float = setting(1.0, Range(0.4, 2.0))  # relative, of all rotors: battery voltage
+    drag: float = setting(1.0, Range(0.0, 10.0))  # relative
+    motor_lag: float | None = setting(None, Range(0.001, 0.5))  # s, first order on rotor speed; null: the preset's
+    delay: float | None = setting(None, Range(0.0, 0.5))  # s, from a command to what acts on it; null: the preset's
+
+    def apply(self, nominal: QuadrotorParameters) -> QuadrotorParameters:
+        """Return the parameters of the drone that differs so from a nominal one."""
+        x, y, z = nominal.drag
+        return replace(
+            nominal,
+            mass=nominal.mass * self.mass,
+            rotor_thrust_max=nominal.rotor_thrust_max * self.thrust,
+            rate_gain=nominal.rate_gain * self.thrust,  # torques come from the same rotors
+            drag=(x * self.drag, y * self.drag, z * self.drag),
+            motor_time_constant=nominal.motor_time_constant if self.motor_lag is None else self.motor_lag,
+            command_delay=nominal.command_delay if self.delay is None else self.delay,
+        )
+
+
+class PlantVehicle:
+    """A drone that takes commands and flies, until it crashes.
+
+    It begins on a stand at the track's start pose, which holds it until it has been armed and asked for more than half
+    of its weight for as long as its rotors take to spin up (`LIFT_OFF`, `SPIN_UP`): at hover it then stays where it is.
+    A lap is timed from there. Passes and crashes are those of `Race`, judged once a control step of the preset; after a
+    crash the motors are off for good, and what is in the air falls to the ground and stays.
+
+    Args:
+        track: Name, path, or a `Track`.
+        preset: Name of the nominal drone's physics, or its parameters; without their randomisation.
+        mismatch: How this one differs.
+
+    Attributes:
+        track: The track.
+        parameters: The drone's own.
+        control_dt: s, a control step of the preset.
+        time: s, of physics since it was made; a reset does not turn it back.
+        armed: Whether motors may turn, by the command that acts now.
+        on_stand: Whether the stand still holds it.
+        crash: Why it crashed; `CrashCause.NONE` while it has not.
+        gates_passed: In order, since it was last on the stand.
+        lap_times: s, of the laps since then.
+
+    Raises:
+        ValueError: Unknown preset.
+        TrackError: Unknown or broken track.
+
+    Example:
+        >>> vehicle = PlantVehicle("circle")
+        >>> vehicle.command(Command(True, hover()))
+        >>> vehicle.advance(1.0)
+        >>> vehicle.pose().position
+        array([ 4.  , -2.5 ,  1.35])
+    """
+
+    def __init__(
+        self,
+        track: str | Track,
+        preset: str | QuadrotorParameters = "faithful",
+        mismatch: Mismatch | None = None,
+    ) -> None:
+        self.track = load_track(track)
+        nominal = without_randomisation(load_preset(preset))
+        self._differs = mismatch or Mismatch()
+        self.parameters = self._differs.apply(nominal)
+        self.control_dt = nominal.control_dt
+        self._nominal_mass = nominal.mass
+        self._race = Race(self.track, num_envs=1, control_dt=self.control_dt)
+        self._build()
+        self._steps = 0
+        self._until = 0.0  # s, to which physics was asked to go
+        self.reset()
+
+    def _build(self) -> None:
+        """Make the engine, and the two ways to fly in it: by commands, and by rotor speeds."""
+        own = self.parameters
+        model = build_drone(own).compile()
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken state is for the race to see
+        data = mujoco.MjData(model)
+
+        def integrate() -> None:
+            mujoco.mj_step(model, data)
+
+        self._qpos, self._qvel = data.qpos, data.qvel
+        qpos, qvel, force = (torch.from_numpy(array[None]) for array in (data.qpos, data.qvel, data.qfrc_applied))
+        # a command may change at any physics step, and its delay is kept here: armed or not is delayed with it
+        controller = Quadrotor(replace(own, control_dt=own.physics_dt, command_delay=0.0), 1)
+        rotors = Quadrotor(replace(controller.parameters, motor_time_constant=math.inf), 1)
+        rotors.rotor_speed = controller.rotor_speed  # with an endless lag they stay what they are set to
+        self._by_commands = FusedFlight(controller, qpos, qvel, force, integrate)
+        self._by_rotors = FusedFlight(rotors, qpos, qvel, force, integrate)
+        self._setpoint = controller.setpoints[0, 0].numpy()  # (4,) N and rad/s
+        self._rotor_speed = controller.rotor_speed[0].numpy()  # (4,) √N
+        self._decay = controller.motor_decay
+
+    def reset(self) -> None:
+        """Put the drone back on the stand: whole, disarmed, rotors at rest, with no gate passed."""
+        yaw = 0.5 * math.radians(self.track.start_yaw_degrees)
+        self._start = np.array((*self.track.start_position, math.cos(yaw), 0.0, 0.0, math.sin(yaw)))
+        self._pending: deque[tuple[int, Command]] = deque()  # commands, and the physics step from which they act
+        self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
+        self._acceleration = np.zeros(3)
+        self._lift_off_step: int | None = None
+        self.on_stand, self.crash, self.gates_passed = True, CrashCause.NONE, 0
+        self.lap_times: list[float] = []
+        self._rotor_speed[:] = 0.0
+        self._act(at_rest())
+        self._hold(self._start)
+        self._path = [self._qpos[:3].copy()]
+
+    @property
+    def time(self) -> float:
+        """Seconds of physics since it was made."""
+        return self._steps * self.parameters.physics_dt
+
+    @property
+    def specific_force(self) -> np.ndarray:
+        """What an accelerometer in its centre shows: (3,) m/s², body frame, +9.81 upwards at rest."""
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, self._qpos[3:])
+        return rotation.reshape(3, 3).T @ (self._acceleration + np.array((0.0, 0.0, GRAVITY)))
+
+    def pose(self) -> Pose:
+        """Return where it is and how it moves, at its own `time`."""
+        numbers = (self._qpos[:3], self._qpos[3:], self._qvel[:3], self._qvel[3:])
+        return Pose(self.time, *(array.copy() for array in numbers))
+
+    def command(self, command: Command) -> None:
+        """Take a command, which acts after the drone's delay; body rates beyond the flight controller's are clipped.
+
+        Raises:
+            ValueError: It is not finite.
+        """
+        if not (math.isfinite(command.setpoint.collective_thrust) and np.isfinite(command.setpoint.body_rates).all()):
+            raise ValueError(f"{command}: a setpoint must be finite.")
+        delay = round(self.parameters.command_delay / self.parameters.physics_dt)
+        self._pending.append((self._steps + delay, command))
+
+    def turn_rotors(self, motors: np.ndarray) -> None:
+        """Take the motor commands of a flight controller that is not this one's own, without delay.
+
+        Args:
+            motors: (4,) in [0, 1], in Betaflight's order; thrust goes with their square. Armed: any of them above 0.
+        """
+        self.armed = bool((motors > 0.0).any())
+        self._target_speed = motors * math.sqrt(self.parameters.rotor_thrust_max)
+
+    def cut(self) -> None:
+        """Stop the motors now, whatever was commanded."""
+        self._pending.clear()
+        self._target_speed = None
+        self._act(at_rest())
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass: whole physics steps, of which none is lost if calls ask for parts of one."""
+        self._until += seconds
+        step = self.parameters.physics_dt
+        for _ in range(math.floor(self._until / step + 1e-6) - self._steps):
+            self._step()
+
+    def _act(self, command: Command) -> None:
+        """Let the flight controller do as it is told; it reckons with the nominal mass and thrust."""
+        self.armed = command.armed
+        limits = self.parameters.body_rate_max
+        thrust = max(command.setpoint.collective_thrust, 0.0) * self._nominal_mass * self._differs.thrust
+        self._setpoint[0] = thrust
+        self._setpoint[1:] = np.clip(command.setpoint.body_rates, np.negative(limits), limits)
+
+    def _step(self) -> None:
+        """Make one physics step, and see to what holds the drone."""
+        while self._pending and self._pending[0][0] <= self._steps:
+            self._act(self._pending.popleft()[1])
+        self._steps += 1
+        before = self._qvel[:3].copy()
+        own_controller = self._target_speed is None and self.armed and self.crash is CrashCause.NONE
+        if own_controller:
+            self._by_commands.step(0)
+        else:
+            self._turn_and_step()
+        if self.on_stand:
+            self._hold(self._start)
+            self._maybe_let_go()
+        elif self.crash is CrashCause.NONE:
+            self._judge()
+        elif not self._qpos[2] > GROUND_HEIGHT:  # nor if it is no number
+            self._lie()
+        self._acceleration = (self._qvel[:3] - before) / self.parameters.physics_dt
+
+    def _turn_and_step(self) -> None:
+        """Make a physics step with rotors that follow their own commands, or run down."""
+        given = self._target_speed if self.crash is CrashCause.NONE else None
+        target = np.zeros(4) if given is None else given
+        lag = self._rotor_speed - target
+        self._rotor_speed[:] = target + math.sqrt(self._decay) * lag  # of the step's middle
+        self._by_rotors.step(0)
+        self._rotor_speed[:] = target + self._decay * lag
+
+    def _hold(self, place: np.ndarray) -> None:
+        """Keep the body at a place (7,), at rest."""
+        self._qpos[:], self._qvel[:] = place, 0.0
+
+    def _lie(self) -> None:
+        """Keep what has fallen on the ground, as it fell; where it broke if its state was lost."""
+        place = self._qpos if np.isfinite(self._qpos).all() else self._start
+        self._hold(np.array((*place[:2], GROUND_HEIGHT, *place[3:])))
+
+    def _maybe_let_go(self) -> None:
+        """Let the drone go once it has been asked to carry itself for long enough."""
+        asked = self._setpoint[0] if self._target_speed is None else float(np.square(self._target_speed).sum())
+        if not (self.armed and asked > LIFT_OFF * self.parameters.mass * GRAVITY):
+            self._lift_off_step = None
+            return
+        if self._lift_off_step is None:
+            lags = SPIN_UP * self.parameters.motor_time_constant
+            self._lift_off_step = self._steps + round(lags / self.parameters.physics_dt)
+        if self._steps >= self._lift_off_step:
+            self.on_stand = False
+            position = torch.from_numpy(self._start[:3]).unsqueeze(0)
+            self._race.begin(torch.tensor([True]), position, torch.tensor([0]))
+            LOGGER.info("plant: the stand let go at %.2f s", self.time)
+
+    def _judge(self) -> None:
+        """Keep the path of a control step, and at its end have it judged."""
+        self._path.append(self._qpos[:3].copy())
+        if len(self._path) <= round(self.control_dt / self.parameters.physics_dt):
+            return
+        path = torch.from_numpy(np.stack(self._path)).unsqueeze(1)  # (P + 1, 1, 3)
+        outcome = self._race.step(path, torch.from_numpy(self._qvel[3:]).unsqueeze(0), torch.tensor([False]))
+        self._path = self._path[-1:]
+        self.gates_passed = int(outcome.gates_passed)
+        if outcome.lap_time > 0.0:
+            self.lap_times.append(float(outcome.lap_time))
+            LOGGER.info("plant: lap %d in %.2f s", len(self.lap_times), self.lap_times[-1])
+        self.crash = CrashCause(int(outcome.crash))
+        if self.crash is not CrashCause.NONE:
+            LOGGER.info("plant: crash at %.2f s: %s", self.time, self.crash.name.lower())

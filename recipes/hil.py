@@ -1,0 +1,308 @@
+"""Fly a vehicle, real or simulated in a process of its own: poses in, images drawn from them, commands out.
+
+    python recipes/plant.py track=kidney preset=easy                      # in one terminal: a vehicle
+    python recipes/hil.py actor=kidney arm=true laps=3                    # in another: an agent flies it
+    python recipes/hil.py actor=pilot track=figure8 arm=true laps=3       # or the scripted pilot
+    python recipes/hil.py actor=kidney link=crsf device=/dev/ttyUSB0 mass=0.62 full_thrust=17 ... operator=keyboard arm=true
+    python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
+    python recipes/hil.py report=runs/hil_kidney_20260101-120000
+
+Read docs/hil.md before anything with propellers. Nothing here needs torch, but for actor=pilot and report=.
+"""
+
+import json
+import math
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from composing.command_line import CONFIG_DIR, new_run_dir, plain_errors, start_logging
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.camera import NoseCamera
+from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
+from dreamer_racing.hil.links import LinkConfig, make_link
+from dreamer_racing.hil.loop import FlightLoop
+from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
+from dreamer_racing.hil.pose import PoseSource, UdpPose
+from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+from dreamer_racing.hil.safety import SafetyLimits
+from dreamer_racing.hil.stamping import Stamping
+from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
+
+AGENTS = Path(__file__).parents[1] / "agents"
+PILOT = "pilot"
+PILOT_RATE = 50.0  # Hz
+SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
+FENCE_BELOW = 0.2  # m below the track's floor, where a vehicle may stand
+STATISTICS = "statistics.json"
+
+
+@dataclass
+class HilConfig:
+    """`recipes/hil.py`."""
+
+    actor: str | None = None  # pilot, an agent that ships by its name, or the path of an .onnx file or an agent
+    track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
+    arm: bool = False  # whether the vehicle may be armed at all
+    laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
+    duration: float | None = setting(None, POSITIVE)  # s, after which it is disarmed; null: as long as it takes
+    rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
+    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
+    run_dir: str | None = None  # null: runs/hil_<track>_<time>
+    replay: str | None = None  # a flight to play through the chain again
+    report: str | None = None  # a flight to draw and to sum up
+    against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to draw beside it
+
+    pose: str = "udp"  # udp
+    pose_host: str = "127.0.0.1"  # to listen on
+    pose_port: int = setting(9100, Range(1, 65535))
+    stamping: Stamping = Stamping.receive  # a pose's time: receive (arrival less latency) | sender (its stamp)
+    latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
+
+    operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
+    operator_host: str = "127.0.0.1"  # to listen on
+    operator_port: int = setting(9102, Range(1, 65535))
+
+    link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
+    link_host: str = "127.0.0.1"  # to send to
+    link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
+    device: str | None = None  # serial port
+    baud: int | None = setting(None, Range(1))  # null: the protocol's own
+    arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
+    rate_max: list[float] | None = None  # rad/s at full stick about roll, pitch, yaw; null: the actor's own limits
+    mass: float | None = setting(None, POSITIVE)  # kg, with battery
+    full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
+    reference_voltage: float | None = setting(None, POSITIVE)  # V
+    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now
+
+    limits: dict[str, Any] | None = None  # of safety, by their names: see dreamer_racing/hil/safety.py
+    renderer: str = "auto"  # auto | egl | osmesa
+    record: bool = True  # write the flight to a file
+
+
+ConfigStore.instance().store(name="hil_schema", node=HilConfig)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="hil")
+def main(config: DictConfig) -> None:
+    """Fly, or look at a flight."""
+    start_logging()
+    with plain_errors():
+        settings = cast(HilConfig, OmegaConf.to_object(config))
+        check(settings)
+        try:
+            status = replay(settings) if settings.replay else report(settings) if settings.report else fly(settings)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
+    raise SystemExit(status)
+
+
+def check(config: HilConfig) -> None:
+    """Refuse what does not go together.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+    """
+    check_settings(config)
+    wanted = [name for name in ("actor", "replay", "report") if getattr(config, name) is not None]
+    if len(wanted) != 1:
+        raise ValueError(
+            f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
+            "agent that ships, actor=pilot track=kidney the scripted pilot."
+        )
+    if config.operator not in ("auto", *OPERATORS):
+        raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
+    if config.operator == "timed" and config.link not in SIMULATED:
+        raise ValueError(
+            f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
+        )
+    if config.pose not in POSES:
+        raise ValueError(f"pose={config.pose}: there are {', '.join(POSES)}.")
+    if config.against and not config.report:
+        raise ValueError(f"against={config.against} is for report=.")
+
+
+OPERATORS = ("keyboard", "udp", "timed")
+POSES = ("udp",)
+
+
+def fly(config: HilConfig) -> int:
+    """Fly one flight; return the exit status: 0 if it was flown to its end."""
+    flyer, contract = make_flyer(config)
+    track = load_track(config.track or contract["source"]["track"])
+    chain_config = make_chain_config(config, track)
+    rates = config.rate_max or list(rate_limits(contract))
+    folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
+    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
+    chain = FlightChain(flyer, track, chain_config, camera)
+    link = make_link(link_config(config, rates))
+    poses, operator = make_poses(config), make_operator(config)
+    about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
+    recorder = FlightRecorder(folder / FILE, about) if config.record else None
+    loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder)
+    print(
+        f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={str(config.arm).lower()}: {folder}"
+    )
+    try:
+        ended = loop.run(config.duration)
+    finally:
+        for part in (link, poses, operator, chain, *([recorder] if recorder else [])):
+            part.close()
+    summary = {
+        "ended": ended,
+        "passes": [[passed.gate, passed.time, passed.offset] for passed in chain.progress.passes],
+        "laps": lap_times(chain, track),
+        "loop": loop.statistics.summary(),
+        "poses": {"rejected": poses.rejected, "out_of_order": chain.clock.out_of_order},
+    }
+    if recorder:
+        (folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    say(summary)
+    finished = config.laps is None or len(chain.progress.passes) >= config.laps * track.num_gates
+    return 0 if finished else 1
+
+
+def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
+    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands."""
+    assert config.actor is not None, "checked"
+    if config.actor == PILOT:
+        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
+
+        if config.track is None:
+            raise ValueError("track= is missing: actor=pilot has none of its own.")
+        rate = config.rate or PILOT_RATE
+        return PilotFlyer(load_track(config.track), config.preset, rate), {"source": {"track": config.track}}
+    path = AGENTS / config.actor if (AGENTS / config.actor).is_dir() else Path(config.actor)
+    flyer = ActorFlyer(path)
+    check_contract(flyer.contract, config.track or flyer.contract["source"]["track"], config.rate)
+    return flyer, flyer.contract
+
+
+def rate_limits(contract: dict[str, Any]) -> tuple[float, float, float]:
+    """Return the body rates, rad/s about x, y, z, that an action of ±1 asks for."""
+    if "action" not in contract:
+        return QuadrotorParameters().body_rate_max
+    x, y, z = (channel["scale"] for channel in contract["action"]["channels"][1:])
+    return x, y, z
+
+
+def make_chain_config(config: HilConfig, track: Track) -> ChainConfig:
+    """Return what the chain needs, with the fence at the track's box and the start at the track's."""
+    low, high = track.bounds_low, track.bounds_high
+    given = dict(config.limits or {})
+    if unknown := sorted(set(given) - {field.name for field in fields(SafetyLimits)}):
+        raise ValueError(f"limits.{unknown[0]}: there is no such limit; see docs/hil.md.")
+    limits = {
+        "fence_low": (low[0], low[1], low[2] - FENCE_BELOW),
+        "fence_high": high,
+        "start_position": track.start_position,
+        "start_yaw_degrees": (track.start_yaw_degrees + 180.0) % 360.0 - 180.0,
+        **{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()},
+    }
+    return ChainConfig(SafetyLimits(**limits), config.stamping, config.latency, config.laps, config.arm)
+
+
+def link_config(config: HilConfig, rates: list[float]) -> LinkConfig:
+    """Return what the link needs; maps of sticks only where all of their numbers are given."""
+    thrust = None
+    numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
+    if all(number is not None for number in numbers.values()):
+        thrust = ThrustMap(**numbers)
+    elif missing := [name for name, number in numbers.items() if number is None]:
+        if config.link not in ("simulated", "udp"):
+            raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
+    port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
+    return LinkConfig(
+        config.link, config.link_host, port, config.device, config.baud, RateMap(*rates), thrust, config.arm_channel
+    )
+
+
+def make_poses(config: HilConfig) -> PoseSource:
+    """Open where poses come from."""
+    return UdpPose(config.pose_port, config.pose_host)
+
+
+def make_operator(config: HilConfig) -> OperatorSource:
+    """Open where the operator's word comes from, and say which it is if that was left open."""
+    name = config.operator
+    if name == "auto":
+        name = "timed" if config.link in SIMULATED else "keyboard"
+        print(f"operator: {name} (operator=auto, link={config.link})")
+    if name == "udp":
+        return UdpOperator(config.operator_port, config.operator_host)
+    return TimedOperator() if name == "timed" else KeyboardOperator()
+
+
+def lap_times(chain: FlightChain, track: Track) -> list[float]:
+    """Return the times of whole laps from the first gate on, s."""
+    firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
+    return [later - earlier for earlier, later in zip(firsts, firsts[1:], strict=False)]
+
+
+def as_json(config: HilConfig) -> dict[str, Any]:
+    """Return the configuration as JSON values."""
+    return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
+
+
+def say(summary: dict[str, Any]) -> None:
+    """Print what came of a flight."""
+    print(f"ended: {summary['ended']}")
+    print(
+        f"gates passed: {len(summary['passes'])}, laps: {', '.join(f'{lap:.2f} s' for lap in summary['laps']) or 'none'}"
+    )
+    for name, row in summary["loop"].items():
+        if isinstance(row, dict):
+            print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
+    print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
+
+
+def replay(config: HilConfig) -> int:
+    """Play a flight through the chain again; return 0 if every tick comes out as it was written, 1 otherwise."""
+    assert config.replay is not None, "checked"
+    flight = Flight(Path(config.replay))
+    flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
+    settings = cast(HilConfig, flown)
+    flyer, contract = make_flyer(settings)
+    track = load_track(settings.track or contract["source"]["track"])
+    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
+    chain = FlightChain(flyer, track, make_chain_config(settings, track), camera)
+    for index, tick in enumerate(flight.ticks):
+        again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
+        if differing := [name for name, value in again.items() if not same(value, tick["out"][name])]:
+            name = differing[0]
+            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again[name]} now", file=sys.stderr)
+            return 1
+    chain.close()
+    print(f"replayed: {len(flight.ticks)} ticks, every one as it was written{'' if flight.whole else ' (cut off)'}")
+    return 0
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two JSON values are equal, bit for bit, not-a-number included."""
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+        return math.isnan(other)
+    return one == other
+
+
+def report(config: HilConfig) -> int:
+    """Draw a flight and sum it up."""
+    from dreamer_racing.figures.hil import write_report
+
+    assert config.report is not None, "checked"
+    for line in write_report(Path(config.report), None if config.against is None else Path(config.against)):
+        print(line)
+    return 0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""Serial ports, over pairs of pseudo-terminals: frames arrive as they were sent, and nothing ever waits."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import sys
+import termios
+import time
+import tty
+
+import pytest
+
+serial = pytest.importorskip("serial")
+
+from dreamer_racing.hil.links import LinkConfig, make_link  # noqa: E402
+from dreamer_racing.hil.links.crsf import decode_crsf  # noqa: E402
+from dreamer_racing.hil.links.msp import decode_msp  # noqa: E402
+from dreamer_racing.hil.links.sbus import decode_sbus  # noqa: E402
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialSettings, SerialTransport  # noqa: E402
+from dreamer_racing.hil.sticks import RateMap, ThrustMap  # noqa: E402
+from dreamer_racing.hil.vehicle import at_rest  # noqa: E402
+
+RATES = RateMap(roll=10.0, pitch=10.0, yaw=4.0)
+THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
+MSP = PROTOCOLS["msp"]
+RESTING = (1500.0, 1500.0, 1000.0, 1500.0, *[1000.0] * 12)
+
+
+@pytest.fixture
+def wire():
+    """The far end of a wire, and the path of the near one."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield far, os.ttyname(near)
+    for descriptor in (far, near):
+        os.close(descriptor)
+
+
+def read(descriptor: int, size: int) -> bytes:
+    data = b""
+    while len(data) < size and select.select([descriptor], [], [], 5.0)[0]:
+        data += os.read(descriptor, size - len(data))
+    return data
+
+
+@pytest.mark.parametrize(
+    ("name", "decode"), [("crsf", decode_crsf), ("sbus", lambda data: decode_sbus(data).channels), ("msp", decode_msp)]
+)
+def test_frames_arrive(wire, name, decode):
+    far, path = wire
+    link = make_link(LinkConfig(name, device=path, rates=RATES, thrust=THRUST))
+    sent = link.send(at_rest())
+    assert read(far, len(sent)) == sent and decode(sent) == pytest.approx(RESTING)
+    link.close()
+    link.close()
+
+
+def test_mavlink_over_a_serial_port(wire):
+    common = pytest.importorskip("pymavlink.dialects.v20.common")
+    far, path = wire
+    link = make_link(LinkConfig("mavlink", device=path, thrust=THRUST))
+    sent = link.send(at_rest())
+    kinds = [message.get_type() for message in common.MAVLink(None).parse_buffer(read(far, len(sent)))]
+    assert kinds == ["COMMAND_LONG", "SET_ATTITUDE_TARGET"]
+    link.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "baud", "parity", "stop_bits"),
+    [("crsf", 420_000, "N", 1), ("sbus", 100_000, "E", 2), ("msp", 115_200, "N", 1), ("mavlink", 57_600, "N", 1)],
+)
+def test_settings_of_protocols(monkeypatch, name, baud, parity, stop_bits):
+    opened = {}
+    monkeypatch.setattr(serial, "Serial", lambda device, baudrate, **others: opened.update(others, baud=baudrate))
+    SerialTransport("/dev/radio", PROTOCOLS[name])
+    assert (opened["baud"], opened["parity"], opened["stopbits"]) == (baud, parity, stop_bits)
+    assert opened["write_timeout"] == 0 and opened["exclusive"]
+
+
+def test_the_rate_can_be_chosen(wire):
+    far, path = wire
+    link = make_link(LinkConfig("msp", device=path, baud=230_400, rates=RATES, thrust=THRUST))
+    assert termios.tcgetattr(far)[4] == termios.B230400
+    link.close()
+
+
+def fill(path: str) -> None:
+    """Write to a wire's near end until it takes no more."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        while True:
+            os.write(descriptor, b"0")
+    except BlockingIOError:
+        os.close(descriptor)
+
+
+@pytest.mark.parametrize("filled", [True, False])
+def test_a_full_buffer_waits_for_nobody(wire, filled):
+    """There is no room, or too little: commands are dropped and counted, and the next one heard is whole and new."""
+    far, path = wire
+    link = make_link(LinkConfig("msp", device=path, rates=RATES, thrust=THRUST))
+    if filled:
+        fill(path)
+    start = time.monotonic()
+    while not link.dropped and time.monotonic() < start + 5.0:
+        link.send(at_rest())
+    assert link.dropped == 1 and time.monotonic() < start + 5.0
+    sent = link.send(at_rest())
+    waiting = b""
+    while select.select([far], [], [], 0.2)[0]:
+        waiting += os.read(far, 4096)
+    assert sent and waiting.endswith(sent)
+    link.close()
+
+
+def test_a_device_that_is_pulled_out():
+    far, near = os.openpty()
+    tty.setraw(near)
+    path = os.ttyname(near)
+    transport = SerialTransport(path, MSP)
+    os.close(near)
+    os.close(far)
+    with pytest.raises(OSError, match=f"device={path}: it is gone: Input/output error"):
+        transport.write(b"frame")
+    transport.close()
+
+
+def test_no_such_device():
+    with pytest.raises(OSError, match="device=/dev/no_radio: there is no such device. Is it plugged in"):
+        SerialTransport("/dev/no_radio", MSP)
+
+
+def test_a_device_of_another_user(monkeypatch):
+    """Root may open anything, so pyserial's answer is made up."""
+
+    def refuse(*args, **kw):
+        raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(OSError, match="device=/dev/ttyUSB0: you may not use it: sudo usermod -aG dialout"):
+        SerialTransport("/dev/ttyUSB0", MSP)
+
+
+def test_a_device_in_use(wire):
+    first = SerialTransport(wire[1], MSP)
+    with pytest.raises(OSError, match=f"device={wire[1]}: another program uses it"):
+        SerialTransport(wire[1], MSP)
+    first.close()
+
+
+def test_no_serial_port():
+    with pytest.raises(OSError, match="device=/dev/null: Could not configure port"):
+        SerialTransport("/dev/null", MSP)
+
+
+@pytest.mark.parametrize("baud", [0, -1, 2**40])
+def test_no_such_rate(wire, baud):
+    with pytest.raises(ValueError, match=f"baud={baud}: "):
+        SerialTransport(wire[1], SerialSettings(baud, "N", 1))
+
+
+def test_without_pyserial(monkeypatch):
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(ImportError, match=r"pip install 'dreamer_racing\[hil\]'"):
+        SerialTransport("/dev/ttyUSB0", MSP)

@@ -1,0 +1,114 @@
+"""The operator's word: heard, lapsed, and never mistaken."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+
+import numpy as np
+import pytest
+
+from dreamer_racing.hil.operator import (
+    DEAD_MAN,
+    PACKET_SIZE,
+    KeyboardOperator,
+    Operator,
+    TimedOperator,
+    UdpOperator,
+    decode_operator,
+    encode_operator,
+)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def switch(clock):
+    operator = UdpOperator(0, clock=clock)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+        operator.say = lambda data: sending.sendto(data, operator.address)
+        yield operator
+    operator.close()
+
+
+def test_an_enable_lapses_when_nothing_comes(switch, clock):
+    assert switch.poll() == Operator(False, False)
+    switch.say(encode_operator(1, Operator(True, False)))
+    assert switch.poll() == Operator(True, False)
+    clock.now = DEAD_MAN - 0.01
+    assert switch.poll().enable
+    clock.now = DEAD_MAN
+    assert not switch.poll().enable
+
+
+def test_a_kill_is_remembered_whatever_comes_after(switch, clock):
+    switch.say(encode_operator(5, Operator(True, True)))
+    switch.say(encode_operator(6, Operator(True, False)))
+    clock.now = 100.0
+    assert switch.poll().kill
+
+
+def test_a_replayed_enable_is_refused_and_a_replayed_kill_is_not(switch):
+    switch.say(encode_operator(9, Operator(False, False)))
+    switch.say(encode_operator(8, Operator(True, False)))
+    switch.say(encode_operator(9, Operator(True, False)))
+    assert switch.poll() == Operator(False, False) and switch.rejected == 2
+    switch.say(encode_operator(8, Operator(False, True)))
+    assert switch.poll().kill
+
+
+def test_nonsense_is_counted(switch):
+    good = encode_operator(1, Operator(True, False))
+    for data in (b"", good[:-1], good + b"x", b"DRO2" + good[4:], good[:8] + b"\x02" + good[9:]):
+        switch.say(data)
+    assert switch.poll() == Operator(False, False) and switch.rejected == 5
+
+
+def test_a_hundred_thousand_damaged_packets_enable_nothing():
+    generator = np.random.default_rng(0)
+    good = np.frombuffer(encode_operator(1, Operator(False, False)), np.uint8)
+    damaged = np.tile(good, (100_000, 1))
+    damaged[np.arange(100_000), generator.integers(0, PACKET_SIZE, 100_000)] ^= generator.integers(
+        1, 256, 100_000, dtype=np.uint8
+    )
+    assert not any(decode_operator(row.tobytes()) for row in damaged)
+
+
+def test_keys():
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs, "r", buffering=1) as terminal:
+        operator = KeyboardOperator(terminal)
+        assert operator.poll() == Operator(False, False)
+        os.write(ours, b"e")
+        assert operator.poll() == Operator(True, False)
+        os.write(ours, b"e")
+        assert operator.poll() == Operator(False, False)
+        os.write(ours, b" ")
+        assert operator.poll().kill
+        operator.close()
+        operator.close()
+    os.close(ours)
+
+
+def test_without_a_terminal_there_are_no_keys(tmp_path):
+    (tmp_path / "file").touch()
+    with (tmp_path / "file").open() as file, pytest.raises(OSError, match="operator=keyboard needs a terminal"):
+        KeyboardOperator(file)
+
+
+def test_a_timed_operator_enables_by_itself(clock):
+    operator = TimedOperator(0.5, clock)
+    assert operator.poll() == Operator(False, False)
+    clock.now = 0.5
+    assert operator.poll() == Operator(True, False)

@@ -1,0 +1,65 @@
+"""Flights on disk: read as written, whole or cut off anywhere, and nothing else taken for one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    path = tmp_path / "flight" / FILE
+    with FlightRecorder(path, {"track": "circle"}) as recorder:
+        for index in range(50):
+            recorder.tick(0.04 * index, {"index": index, "numbers": np.full(3, 0.1 * index), "sent": bytes([index])})
+    return path
+
+
+def test_a_flight_is_read_as_it_was_written(recorded):
+    flight = Flight(recorded.parent)
+    assert flight.whole and flight.about["track"] == "circle" and len(flight.ticks) == 50
+    assert flight.ticks[7] == {"index": 7, "numbers": [0.1 * 7] * 3, "sent": "07"}
+
+
+def test_a_flight_whose_loop_is_killed_is_there_up_to_its_last_tick(tmp_path):
+    recorder = FlightRecorder(tmp_path / FILE, {})
+    recorder.tick(0.0, {"index": 0})
+    recorder.tick(0.1, {"index": 1})
+    flight = Flight(tmp_path)  # nothing was closed
+    assert not flight.whole and [tick["index"] for tick in flight.ticks] == [0, 1]
+    recorder.close()
+    recorder.close()
+
+
+def test_a_file_may_end_anywhere(recorded):
+    data = recorded.read_bytes()
+    counts = []
+    for end in range(600, len(data), 97):
+        recorded.write_bytes(data[:end])
+        counts.append(len(Flight(recorded).ticks))
+    assert counts == sorted(counts) and counts[0] < 5 and counts[-1] == 50
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense, and more of it", bytes(range(256)) * 8])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / FILE).write_bytes(content)
+    with pytest.raises(ValueError, match="is no flight"):
+        Flight(tmp_path)
+
+
+def test_a_flight_is_never_overwritten(recorded):
+    with pytest.raises(FileExistsError):
+        FlightRecorder(recorded, {})
+
+
+def test_there_must_be_one(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"There is no flight .*: give a folder in which recipes/hil.py flew"):
+        Flight(tmp_path / "nowhere")
+
+
+def test_a_newer_version_is_refused(tmp_path):
+    FlightRecorder(tmp_path / FILE, {"format_version": 99}).close()
+    with pytest.raises(ValueError, match="a flight of version 99; this release reads version 1"):
+        Flight(tmp_path)

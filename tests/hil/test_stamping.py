@@ -1,0 +1,93 @@
+"""Times of poses and what is made of them, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dreamer_racing.hil.pose import Received, make_packet
+from dreamer_racing.hil.stamping import WINDOW, PoseClock, Stamping, extrapolate, rotation_matrix, turn
+from dreamer_racing.hil.vehicle import Pose
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def received(sequence: int, stamp: float, time: float) -> Received:
+    packet = make_packet(sequence, stamp, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+    assert packet is not None
+    return Received(time, packet)
+
+
+def pose(time: float = 0.0, velocity: tuple = (0, 0, 0), rates: tuple = (0, 0, 0)) -> Pose:
+    return Pose(time, np.zeros(3), LEVEL, np.array(velocity, float), np.array(rates, float))
+
+
+def times(clock: PoseClock, packets: list[Received]) -> list[float | None]:
+    return [None if (read := clock.read(packet)) is None else round(read.time, 9) for packet in packets]
+
+
+def test_by_arrival_a_fixed_latency_is_taken_off():
+    assert times(PoseClock(Stamping.receive, 0.004), [received(0, 77.0, 10.0)]) == [9.996]
+
+
+def test_by_stamp_the_least_delay_tells_the_clocks_apart():
+    packets = [received(0, 0.00, 100.007), received(1, 0.01, 100.012), received(2, 0.02, 100.029)]
+    # delays of 7, 2 and 9 ms: from the second on the clocks are known to be 100.002 s apart
+    assert times(PoseClock(Stamping.sender, 0.0), packets) == [100.007, 100.012, 100.022]
+    assert times(PoseClock(Stamping.sender, 0.002), packets) == [100.005, 100.01, 100.02]
+
+
+def test_old_and_repeated_packets_are_left_out_and_wrapping_is_no_step_back():
+    clock = PoseClock(Stamping.receive, 0.0)
+    wrapped = [
+        received(2**32 - 1, 0.0, 1.0),
+        received(0, 0.1, 1.1),
+        received(0, 0.1, 1.2),
+        received(2**32 - 2, 0.0, 1.3),
+    ]
+    assert times(clock, wrapped) == [1.0, 1.1, None, None]
+    assert clock.out_of_order == 2
+
+
+def test_a_sender_may_begin_anew_after_a_silence_only():
+    clock = PoseClock(Stamping.sender, 0.0)
+    assert times(clock, [received(5000, 900.0, 1.0), received(0, 3.0, 1.4)]) == [1.0, None]
+    assert times(clock, [received(0, 3.0, 1.5), received(1, 3.01, 1.515)]) == [1.5, 1.51]
+
+
+def test_a_clock_that_is_slow_is_followed_within_the_window():
+    clock = PoseClock(Stamping.sender, 0.0)
+    drift = 1e-4  # 100 ppm
+    read = times(clock, [received(k, 0.005 * k * (1 - drift), 50.0 + 0.005 * k) for k in range(4 * WINDOW)])
+    assert 50.0 + 0.005 * (4 * WINDOW - 1) - read[-1] < WINDOW * 0.005 * drift * 1.1
+
+
+def test_extrapolation_flies_on():
+    later = extrapolate(pose(1.0, velocity=(8.0, 0.0, -1.0), rates=(0.0, 0.0, math.pi)), 1.5)
+    assert later.time == 1.5 and later.position == pytest.approx([4.0, 0.0, -0.5])
+    assert rotation_matrix(later.attitude)[:, 0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)  # a quarter to the left
+    assert extrapolate(pose(1.0, velocity=(8, 0, 0)), 0.9).position.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("axis", "turned", "towards"),
+    [
+        (0, 1, (0, 0, 1)),  # rolling right lifts the left side
+        (1, 0, (0, 0, -1)),  # pitching by +y puts the nose down
+        (2, 0, (0, 1, 0)),  # yawing by +z turns the nose left
+    ],
+)
+def test_the_sign_of_every_axis(axis, turned, towards):
+    rotation = np.zeros(3)
+    rotation[axis] = math.pi / 2
+    assert rotation_matrix(turn(LEVEL, rotation))[:, turned] == pytest.approx(towards, abs=1e-12)
+
+
+def test_small_turns_add_up():
+    attitude, rates = LEVEL, np.array([0.3, -0.7, 1.1])
+    for _ in range(1000):
+        attitude = turn(attitude, 1e-3 * rates)
+    assert rotation_matrix(attitude) == pytest.approx(rotation_matrix(turn(LEVEL, rates)), abs=1e-9)
+    assert turn(LEVEL, np.zeros(3)).tolist() == LEVEL.tolist()
