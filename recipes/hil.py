@@ -1,9 +1,10 @@
-"""Fly a vehicle, real or simulated in a process of its own: poses in, images drawn from them, commands out.
+r"""Fly a vehicle, real or simulated in a process of its own: poses in, images drawn from them, commands out.
 
     python recipes/plant.py track=kidney preset=easy                      # in one terminal: a vehicle
     python recipes/hil.py actor=kidney arm=true laps=3                    # in another: an agent flies it
     python recipes/hil.py actor=pilot track=figure8 arm=true laps=3       # or the scripted pilot
-    python recipes/hil.py actor=kidney link=crsf device=/dev/ttyUSB0 mass=0.62 full_thrust=17 ... operator=keyboard arm=true
+    python recipes/hil.py actor=kidney arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
+        mass=0.62 full_thrust=17 reference_voltage=15.2 voltage=15.8      # or a real vehicle, by a radio's receiver
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
     python recipes/hil.py report=runs/hil_kidney_20260101-120000
 
@@ -14,6 +15,7 @@ import json
 import math
 import sys
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -148,9 +150,7 @@ def fly(config: HilConfig) -> int:
     about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
     recorder = FlightRecorder(folder / FILE, about) if config.record else None
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder)
-    print(
-        f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={str(config.arm).lower()}: {folder}"
-    )
+    print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
     try:
         ended = loop.run(config.duration)
     finally:
@@ -212,13 +212,11 @@ def make_chain_config(config: HilConfig, track: Track) -> ChainConfig:
 
 def link_config(config: HilConfig, rates: list[float]) -> LinkConfig:
     """Return what the link needs; maps of sticks only where all of their numbers are given."""
-    thrust = None
     numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
-    if all(number is not None for number in numbers.values()):
-        thrust = ThrustMap(**numbers)
-    elif missing := [name for name, number in numbers.items() if number is None]:
-        if config.link not in ("simulated", "udp"):
-            raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
+    missing = [name for name, number in numbers.items() if number is None]
+    if missing and config.link not in ("simulated", "udp"):
+        raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
+    thrust = None if missing else ThrustMap(**numbers)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
     return LinkConfig(
         config.link, config.link_host, port, config.device, config.baud, RateMap(*rates), thrust, config.arm_channel
@@ -244,7 +242,7 @@ def make_operator(config: HilConfig) -> OperatorSource:
 def lap_times(chain: FlightChain, track: Track) -> list[float]:
     """Return the times of whole laps from the first gate on, s."""
     firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
-    return [later - earlier for earlier, later in zip(firsts, firsts[1:], strict=False)]
+    return [later - earlier for earlier, later in pairwise(firsts)]
 
 
 def as_json(config: HilConfig) -> dict[str, Any]:
@@ -254,10 +252,9 @@ def as_json(config: HilConfig) -> dict[str, Any]:
 
 def say(summary: dict[str, Any]) -> None:
     """Print what came of a flight."""
+    laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
     print(f"ended: {summary['ended']}")
-    print(
-        f"gates passed: {len(summary['passes'])}, laps: {', '.join(f'{lap:.2f} s' for lap in summary['laps']) or 'none'}"
-    )
+    print(f"gates passed: {len(summary['passes'])}, laps: {laps}")
     for name, row in summary["loop"].items():
         if isinstance(row, dict):
             print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dreamer_racing.hil.operator import Operator
-from dreamer_racing.hil.safety import Reason, Safety, SafetyLimits, State, Tick, farewell
+from dreamer_racing.hil.safety import Reason, Safety, SafetyLimits, State, Tick
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
 PERIOD = 1 / 32  # s: exact in binary, as are the times below
@@ -121,6 +121,7 @@ def test_it_does_not_arm_but_under_all_conditions(changes, reason):
         {"pose": {"position": (0.71, 0.29, 0.29)}},
         {"pose": {"attitude": turned(2, 14.9)}},
         {"pose": {"attitude": turned(0, -9.9)}},
+        {"pose": {"attitude": 1.05 * turned(1, 9.9)}},
         {"pose": {"velocity": (0.0, 0.14, 0.14)}},
         {"setpoint": None},
     ],
@@ -179,6 +180,7 @@ def test_kill_forgets_that_the_enable_was_released():
         ({"pose": {"position": (1.0, math.nan, 0.0)}}, Reason.NOT_FINITE),
         ({"pose": {"velocity": (math.inf, 0.0, 0.0)}}, Reason.NOT_FINITE),
         ({"pose": {"attitude": np.zeros(4)}}, Reason.NOT_FINITE),
+        ({"pose": {"attitude": 0.8 * turned(0, 20.0)}}, Reason.NOT_FINITE),
         ({"pose": {"position": (1.0, 0.0)}}, Reason.NOT_FINITE),
         ({"pose": {"velocity": (0.0, 10.7, 10.7)}}, Reason.SPEED),
         ({"pose": {"position": (1.6, 0.0, 0.0)}}, Reason.POSE_JUMP),  # 15 m/s / 32 + 0.1 m = 0.57 m
@@ -226,7 +228,8 @@ def test_tilt_cuts_when_it_lasts(axis, degrees, reasons):
     flight = Flight(tilt_time=0.25).flying()
     tilted = {"pose": {"attitude": turned(axis, degrees)}}
     assert flight.ticks(8, **tilted).state is State.FLYING  # as long as allowed
-    assert flight.tick(**tilted).reasons == reasons
+    verdict = flight.tick(**tilted)
+    assert verdict.reasons == reasons and verdict.command.armed == (not reasons)
 
 
 def test_tilt_counts_anew_after_being_upright():
@@ -366,8 +369,29 @@ def test_a_clock_that_was_wrong_is_trusted_again_but_not_what_was_measured_by_it
     assert flight.ready().tick().state is State.FLYING
 
 
-def test_farewell_is_at_rest():
-    assert not farewell().armed and farewell().setpoint.collective_thrust == 0.0
+@pytest.mark.parametrize("older", ["by its time", "by its age"])
+def test_the_older_of_a_pose_s_two_ages_counts(older):
+    flight = Flight(arm_time=0.01).flying()
+    flight.now += 0.06
+    delay = 0.04  # between measurement and arrival, of which only one of the two knows
+    pose = pose_at(flight.now - delay if older == "by its time" else flight.now)
+    tick = Tick(flight.now, pose, 0.0 if older == "by its time" else delay, SETPOINT, ON, True)
+    assert flight.safety.step(tick).state is State.FLYING
+    assert flight.tick(after=0.02, lost=True).state is State.HOLD
+
+
+def test_an_actor_that_never_speaks_has_as_long_as_one_that_falls_silent():
+    flight = Flight(arm_time=0.01, cut_after=0.125).ready()
+    flight.tick(setpoint=None)
+    assert flight.ticks(4, setpoint=None).state is State.HOLD
+    assert flight.tick(setpoint=None).reasons == (Reason.SETPOINT_LOST,)
+
+
+def test_each_flight_begins_with_the_least_thrust():
+    flight = Flight(thrust_slew=1.0).flying()
+    assert flight.ticks(20).command.setpoint.collective_thrust > 0.5
+    flight.ticks(8, operator=OFF)
+    assert flight.tick().command.setpoint.collective_thrust == 0.0
 
 
 @pytest.mark.parametrize(
