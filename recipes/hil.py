@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.betaflight import rate_map
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
@@ -36,7 +37,7 @@ from dreamer_racing.hil.pose import PoseSource, UdpPose
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
-from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
 
 AGENTS = Path(__file__).parents[1] / "agents"
@@ -79,7 +80,6 @@ class HilConfig:
     device: str | None = None  # serial port
     baud: int | None = setting(None, Range(1))  # null: the protocol's own
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
-    rate_max: list[float] | None = None  # rad/s at full stick about roll, pitch, yaw; null: the actor's own limits
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
     reference_voltage: float | None = setting(None, POSITIVE)  # V
@@ -141,11 +141,10 @@ def fly(config: HilConfig) -> int:
     flyer, contract = make_flyer(config)
     track = load_track(config.track or contract["source"]["track"])
     chain_config = make_chain_config(config, track)
-    rates = config.rate_max or list(rate_limits(contract))
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     chain = FlightChain(flyer, track, chain_config, camera)
-    link = make_link(link_config(config, rates))
+    link = make_link(link_config(config, contract))
     poses, operator = make_poses(config), make_operator(config)
     about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
     recorder = FlightRecorder(folder / FILE, about) if config.record else None
@@ -179,19 +178,21 @@ def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
-        return PilotFlyer(load_track(config.track), config.preset, rate), {"source": {"track": config.track}}
+        return PilotFlyer(load_track(config.track), config.preset, rate), pilot_contract(config.track)
     path = AGENTS / config.actor if (AGENTS / config.actor).is_dir() else Path(config.actor)
     flyer = ActorFlyer(path)
     check_contract(flyer.contract, config.track or flyer.contract["source"]["track"], config.rate)
     return flyer, flyer.contract
 
 
-def rate_limits(contract: dict[str, Any]) -> tuple[float, float, float]:
-    """Return the body rates, rad/s about x, y, z, that an action of ±1 asks for."""
-    if "action" not in contract:
-        return QuadrotorParameters().body_rate_max
-    x, y, z = (channel["scale"] for channel in contract["action"]["channels"][1:])
-    return x, y, z
+def pilot_contract(track: str) -> dict[str, Any]:
+    """Return what an actor's contract would say of the pilot."""
+    drone = QuadrotorParameters()
+    channels = [
+        {"name": f"body_rate_{axis}", "scale": rate} for axis, rate in zip("xyz", drone.body_rate_max, strict=True)
+    ]
+    thrust = {"name": "collective_thrust", "scale": drone.collective_thrust_scale}
+    return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
 
 
 def make_chain_config(config: HilConfig, track: Track) -> ChainConfig:
@@ -210,8 +211,8 @@ def make_chain_config(config: HilConfig, track: Track) -> ChainConfig:
     return ChainConfig(SafetyLimits(**limits), config.stamping, config.latency, config.laps, config.arm)
 
 
-def link_config(config: HilConfig, rates: list[float]) -> LinkConfig:
-    """Return what the link needs; maps of sticks only where all of their numbers are given."""
+def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
+    """Return what the link needs: sticks as `dreamer_racing.hil.betaflight` has the flight controller set."""
     numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
     missing = [name for name, number in numbers.items() if number is None]
     if missing and config.link not in ("simulated", "udp"):
@@ -219,7 +220,7 @@ def link_config(config: HilConfig, rates: list[float]) -> LinkConfig:
     thrust = None if missing else ThrustMap(**numbers)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
     return LinkConfig(
-        config.link, config.link_host, port, config.device, config.baud, RateMap(*rates), thrust, config.arm_channel
+        config.link, config.link_host, port, config.device, config.baud, rate_map(contract), thrust, config.arm_channel
     )
 
 

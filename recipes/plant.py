@@ -1,12 +1,14 @@
 """A drone to fly instead of a real one: this project's physics in a process of its own, not quite as in training.
 
-    python recipes/plant.py track=figure8 mass=1.1 thrust=0.9 delay=0.02 loss=0.01
+    python recipes/plant.py track=figure8 mass=1.1 thrust=0.9 delay=0.02 packet_loss=0.01
     python recipes/plant.py track=kidney betaflight=2026.6
 
-It takes commands from UDP port 9101 and sends poses to port 9100, both on this machine, until it is stopped by Ctrl+C or
-SIGTERM. The drone stands on a launch stand at the track's start pose; disarmed commands, then armed ones with thrust, let
-it go. At the end it says what came of it. With betaflight= a Betaflight firmware built for this machine (SITL), which
-must be running, flies it by its motors: channels go to the firmware.
+It takes commands from UDP port 9101 and sends poses to port 9100, both on this machine, until it is stopped by Ctrl+C
+or SIGTERM, and says at the end what came of it. The drone stands on a launch stand at the track's start pose, until a
+disarmed command and then armed ones with thrust have come.
+
+With betaflight= a Betaflight firmware built for this machine (SITL), which must be running, flies it by its motors:
+channels go to the firmware.
 """
 
 from dataclasses import dataclass
@@ -54,9 +56,7 @@ def check(config: PlantConfig) -> None:
     """
     check_settings(config)
     if config.betaflight is not None and config.delay is not None:
-        raise ValueError(
-            f"delay={config.delay} is of commands, and betaflight={config.betaflight} gets none: leave it out."
-        )
+        raise ValueError(f"delay={config.delay} is of commands, and betaflight={config.betaflight}: leave one out.")
 
 
 if __name__ == "__main__":

@@ -51,6 +51,7 @@ class Reason(enum.Enum):
     GEOFENCE = "geofence"
     SPEED = "speed"
     TILT = "tilt"
+    STRANDED = "stranded"
     NO_SETPOINT = "no setpoint"
     SETPOINT_LOST = "setpoint lost"
     OUTSIDE_START_BOX = "outside start box"
@@ -174,9 +175,8 @@ class Safety:
 
     def step(self, tick: Tick) -> Verdict:
         """Judge a tick."""
-        findings = self._check_clock(tick) | self._check_people(tick)
-        if Reason.CLOCK not in findings:
-            findings |= self._check_loop(tick) | self._take_pose(tick) | self._check_flight(tick)
+        findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
+        findings |= self._take_pose(tick) | self._check_flight()
         if self.armed:
             findings |= self._check_setpoint(tick)
             self._fly_on(findings, tick.finish)
@@ -208,6 +208,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
+            self._moved_at = None
 
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
@@ -237,6 +238,7 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._now
+        self._moved_at: float | None = None  # when it was last seen to move in this flight
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
@@ -303,11 +305,9 @@ class Safety:
                 return {Reason.POSE_JUMP: f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"}
         return {}
 
-    def _check_flight(self, tick: Tick) -> Findings:
+    def _check_flight(self) -> Findings:
         limits, seen = self.limits, self._seen
         age = self._now - self._measured_at
-        if tick.pose is not None and not math.isnan(to_number(tick.pose_age)):
-            age = max(age, to_number(tick.pose_age))
         findings: Findings = {}
         if age > limits.hold_after:
             reason = Reason.POSE_LOST if age > limits.cut_after else Reason.POSE_STALE
@@ -324,6 +324,12 @@ class Safety:
             self._upright_at = self._now
         elif self._now - self._upright_at > limits.tilt_time:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
+        if seen.speed > limits.start_speed:
+            self._moved_at = self._now
+        elif self.armed and self._moved_at is not None and self._now - self._moved_at > limits.still_time:
+            findings[Reason.STRANDED] = (
+                f"it has not moved for {self._now - self._moved_at:.3g} s: is it lying somewhere?"
+            )
         return findings
 
     def _check_setpoint(self, tick: Tick) -> Findings:
@@ -355,11 +361,6 @@ class Safety:
             if value > limit:
                 findings[reason] = f"{text.format(value)} (allowed: {limit:g})"
         return findings
-
-
-def farewell() -> Command:
-    """Return what a program sends for a moment before it goes, whatever has happened: disarmed, no thrust."""
-    return at_rest()
 
 
 def _read_pose(pose: Pose) -> _Seen | None:

@@ -21,10 +21,10 @@ class Delivery:
     rate: float = setting(200.0, Range(10, 1000))  # Hz, at which poses are measured
     latency: float = setting(0.0, Range(0, 1))  # s, from a measurement to its departure
     jitter: float = setting(0.0, Range(0, 1))  # s; uniform in [0, jitter] on top, so that packets may overtake others
-    loss: float = setting(0.0, SHARE)  # share of packets that are never sent, each on its own
-    position_noise: float = setting(0.0, NOT_NEGATIVE)  # m, standard deviation along each axis
-    attitude_noise: float = setting(0.0, NOT_NEGATIVE)  # rad, standard deviation about each body axis
-    clock_offset: float = 0.0  # s, of the stamps' clock before that of the physics
+    packet_loss: float = setting(0.0, SHARE)  # share of packets that are never sent, each on its own
+    position_noise: float = setting(0.0, Range(0, 1))  # m, standard deviation along each axis
+    attitude_noise: float = setting(0.0, Range(0, 1))  # rad, standard deviation about each body axis
+    clock_offset: float = setting(0.0, Range(-1e9, 1e9))  # s, of the stamps' clock before that of the physics
     seed: int = setting(0, NOT_NEGATIVE)  # of noise, jitter and loss
 
 
@@ -61,7 +61,7 @@ class PoseDelivery:
         sequence, self._measured = self._measured, self._measured + 1
         delivery, random = self._delivery, self._random
         draws = random.standard_normal(6)
-        lost, delay = random.random() < delivery.loss, delivery.latency + delivery.jitter * random.random()
+        lost, delay = random.random() < delivery.packet_loss, delivery.latency + delivery.jitter * random.random()
         if lost:
             self.dropped += 1
             return

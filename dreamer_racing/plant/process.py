@@ -116,7 +116,7 @@ class Plant:
         return (
             f"plant: {self.time:.2f} s, {vehicle.gates_passed} gates in order, "
             f"{len(vehicle.lap_times)} laps{f' ({laps} s)' if laps else ''}, "
-            f"crash: {vehicle.crash.name.lower()}, {self.controls.summary()}, "
+            f"crash: {vehicle.fate}, {self.controls.summary()}, "
             f"{self._poses.sent} poses sent, {self._poses.dropped} lost{late}"
         )
 
@@ -138,8 +138,9 @@ def fly_in_real_time(
         wait = start + min(plant.due, duration) / speed - time.monotonic()
         plant.note_delay(-wait)
         if select.select([incoming], [], [], min(max(wait, 0.0), _PATIENCE))[0]:
-            now = (time.monotonic() - start) * speed
-            plant.advance_to(min(now, duration, plant.time + _PATIENCE))
+            now = min((time.monotonic() - start) * speed, duration)
+            if now < plant.due + LATE * speed:  # else they came during what was late: as if at its beginning
+                plant.advance_to(now)
             for data in _drain(incoming):
                 plant.take(data)
         elif wait <= _PATIENCE:

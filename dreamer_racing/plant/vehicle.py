@@ -78,6 +78,7 @@ class PlantVehicle:
         armed: Whether motors may turn, by the command that acts now.
         on_stand: Whether the stand still holds it.
         crash: Why it crashed; `CrashCause.NONE` while it has not.
+        fate: The same in words, with whether it was disarmed then, and fell only because of that.
         gates_passed: In order, since it was last on the stand.
         lap_times: s, of the laps since then.
 
@@ -141,7 +142,8 @@ class PlantVehicle:
         self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
-        self.on_stand, self.crash, self.gates_passed = True, CrashCause.NONE, 0
+        self.on_stand, self.gates_passed = True, 0
+        self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:] = 0.0
         self._act(at_rest())
@@ -273,4 +275,6 @@ class PlantVehicle:
             LOGGER.info("plant: lap %d in %.2f s", len(self.lap_times), self.lap_times[-1])
         self.crash = CrashCause(int(outcome.crash))
         if self.crash is not CrashCause.NONE:
-            LOGGER.info("plant: crash at %.2f s: %s", self.time, self.crash.name.lower())
+            words = self.crash.name.lower().replace("_", " ")
+            self.fate = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
+            LOGGER.info("plant: crash: %s", self.fate)

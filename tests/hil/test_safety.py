@@ -232,6 +232,15 @@ def test_tilt_cuts_when_it_lasts(axis, degrees, reasons):
     assert verdict.reasons == reasons and verdict.command.armed == (not reasons)
 
 
+def test_what_has_flown_and_lies_still_is_cut():
+    flight = Flight(still_time=0.5).flying()
+    assert flight.ticks(40).state is State.FLYING  # it has not left the start yet
+    flight.tick(pose={"velocity": (0.0, 0.3, 0.0)})
+    assert flight.ticks(16).state is State.FLYING  # as long as allowed
+    verdict = flight.tick()
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.STRANDED,)
+
+
 def test_tilt_counts_anew_after_being_upright():
     flight = Flight(tilt_time=0.25).flying()
     for _ in range(3):

@@ -1,0 +1,115 @@
+"""Sources of poses, by name.
+
+| name | comes over | message | needs |
+|---|---|---|---|
+| ``udp`` | UDP | the packet of `hil.pose` | port |
+| ``mavlink`` | UDP, or serial port | ODOMETRY unless another is named | port or device |
+| ``ros2`` | ROS 2 | PoseStamped unless Odometry is named | topic, and an installed ROS 2 |
+
+All give poses in the frames of `Pose`, stamped by the sender's clock. Velocities that a message lacks are made from
+successive poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from dreamer_racing.hil.links.serial_port import PROTOCOLS
+from dreamer_racing.hil.pose import PoseSource, UdpPose
+from dreamer_racing.hil.pose_sources import mavlink, ros2
+from dreamer_racing.hil.pose_sources.inlets import Inlet, SerialInlet, UdpInlet
+from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
+from dreamer_racing.hil.pose_sources.messages import SMOOTHING
+from dreamer_racing.hil.pose_sources.ros2 import Ros2Pose
+from dreamer_racing.settings import Range, check_settings, setting
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """Which source of poses, and what it needs.
+
+    Attributes:
+        name: One of `POSE_SOURCES`.
+        host: Address to listen on over UDP; other machines reach it only if this says so.
+        port: UDP port to listen on; 0 for a free one.
+        device: Path of a serial port; where it is given, ``mavlink`` listens to it and not to the UDP port.
+        baud: Bits a second of the serial port; the protocol's own unless given.
+        topic: Of ROS 2.
+        message: Which message is the pose; the source's first one unless given.
+        smoothing: s, time constant of velocities that are made from poses; 0: they are not smoothed.
+
+    Raises:
+        ValueError: A number is out of its range.
+    """
+
+    name: str
+    host: str = "127.0.0.1"
+    port: int | None = setting(None, Range(0, 65535))
+    device: str | None = None
+    baud: int | None = setting(None, Range(1))
+    topic: str | None = None
+    message: str | None = None
+    smoothing: float = setting(SMOOTHING, Range(0, 1))
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+def make_poses(config: PoseConfig) -> PoseSource:
+    """Make a source of poses and open what it listens to.
+
+    Raises:
+        ValueError: There is no source of that name, or something that it needs is not given, or cannot be.
+        OSError: Device or port cannot be used.
+        ImportError: A package is missing; the message says how to get it.
+
+    Example:
+        >>> make_poses(PoseConfig("udp", port=0)).close()
+    """
+    if config.name not in POSE_SOURCES:
+        raise ValueError(f"name={config.name}: the pose sources are {', '.join(POSE_SOURCES)}.")
+    return POSE_SOURCES[config.name](config)
+
+
+def _udp(config: PoseConfig) -> PoseSource:
+    return UdpPose(_given(config.port, "port", config), config.host)
+
+
+def _mavlink(config: PoseConfig) -> PoseSource:
+    message = _message(config, mavlink.MESSAGES)
+    return MavlinkPose(_inlet(config), message, config.smoothing)
+
+
+def _ros2(config: PoseConfig) -> PoseSource:
+    return Ros2Pose(_given(config.topic, "topic", config), _message(config, ros2.MESSAGES), config.smoothing)
+
+
+POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
+"""What makes a source of poses, by its name."""
+
+
+def _given(value: T | None, field: str, config: PoseConfig) -> T:
+    """Return a setting; refuse one that is missing."""
+    if value is None:
+        raise ValueError(f"{field} is not given: the pose source {config.name} needs it.")
+    return value
+
+
+def _message(config: PoseConfig, messages: Iterable[str]) -> str:
+    """Return the name of the message that is wanted; refuse one that the source does not know."""
+    known = list(messages)
+    message = known[0] if config.message is None else config.message
+    if message not in known:
+        raise ValueError(f"message={message}: the pose source {config.name} knows {', '.join(known)}.")
+    return message
+
+
+def _inlet(config: PoseConfig) -> Inlet:
+    if config.device is None:
+        return UdpInlet(_given(config.port, "port or device", config), config.host)
+    settings = PROTOCOLS["mavlink"]
+    return SerialInlet(config.device, settings if config.baud is None else settings._replace(baud=config.baud))

@@ -1,0 +1,109 @@
+"""Where bytes come in, without ever waiting: UDP, or a serial port."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from typing import Protocol
+
+from dreamer_racing.hil.links.serial_port import SerialSettings, _open
+from dreamer_racing.hil.pose import _RECEIVED_AT, _arrival, bind
+
+
+class Inlet(Protocol):
+    """Gives the bytes that have arrived.
+
+    Attributes:
+        whole: Whether pieces hold whole messages, as datagrams do; else a message may end in a later piece.
+    """
+
+    whole: bool
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield what has arrived, oldest first, with the time at which it did (s, ``time.monotonic``).
+
+        Raises:
+            OSError: The device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give back socket or device; may be called twice."""
+        ...
+
+
+class UdpInlet:
+    """Listens on a UDP port; pieces are datagrams, with the time at which the kernel received them.
+
+    Args:
+        port: To listen on; 0 for a free one.
+        host: Address to listen on; other machines reach it only if this says so.
+
+    Attributes:
+        address: Host and port that it listens on.
+
+    Raises:
+        OSError: The port is in use, or may not be used; the message names it.
+    """
+
+    whole = True
+    _MOST = 256  # datagrams taken in at a time: a flood must not stop the loop
+    _SIZE = 2048  # bytes; more than an Ethernet frame holds
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._socket = bind(host, port)
+        self.address: tuple[str, int] = self._socket.getsockname()
+        if _RECEIVED_AT is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, _RECEIVED_AT, 1)
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield datagrams."""
+        for _ in range(self._MOST):
+            try:
+                data, ancillary, _, _ = self._socket.recvmsg(self._SIZE, 64)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+            yield _arrival(ancillary), data
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialInlet:
+    """Reads from a serial port; bytes count as arrived when they are read, up to a tick late.
+
+    Args:
+        device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
+        settings: Of the protocol.
+
+    Raises:
+        ImportError: pyserial is not installed.
+        OSError: The device is missing, of no use, or another's; the message says which.
+        ValueError: The device has no such baud rate.
+    """
+
+    whole = False
+    _MOST = 16384  # bytes at a time: more than 0.1 s at 921,600 baud
+
+    def __init__(self, device: str, settings: SerialSettings) -> None:
+        self._device = device
+        self._port = _open(device, settings)
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield the bytes in the buffer, if there are any."""
+        try:
+            # Not pyserial's own read, which asks for a number of bytes and calls select for each piece.
+            data = os.read(self._port.fileno(), self._MOST)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
+        if data:
+            yield time.monotonic(), data
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()

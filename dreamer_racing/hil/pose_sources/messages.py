@@ -1,0 +1,115 @@
+"""What all sources of messages are made of: a way to read a message, and what makes a pose packet of what it says."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.hil.pose import PosePacket, Received, make_packet
+from dreamer_racing.hil.stamping import SILENCE, rotation_matrix
+from dreamer_racing.hil.velocity import VelocityEstimator
+
+LARGEST = 1e6
+"""m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]."""
+
+SMOOTHING = 0.01
+"""s, time constant of velocities that are made from poses [choice]: two poses of a motion capture at 200 Hz."""
+
+
+class Measurement(NamedTuple):
+    """What a message says, in the frames of `Pose`; not yet judged.
+
+    Args:
+        stamp: s, the sender's own clock.
+        position: (3,) m, world.
+        attitude: (4,) wxyz.
+        linear_velocity: (3,) m/s, world, or body where ``in_body``; None: it is made from poses, as are body rates.
+        body_rates: (3,) rad/s, body frame.
+        in_body: Whether ``linear_velocity`` is along the body's axes.
+    """
+
+    stamp: float
+    position: np.ndarray
+    attitude: np.ndarray
+    linear_velocity: np.ndarray | None = None
+    body_rates: np.ndarray | None = None
+    in_body: bool = False
+
+
+class MessagePose(ABC):
+    """A `PoseSource` of messages without sequence numbers; a subclass says what they measured.
+
+    Packets are numbered by counting. A stamp that is not newer than the newest one is a copy or came late, and does not
+    count; only after a silence may stamps begin anew, as in `PoseClock`.
+
+    Args:
+        smoothing: s, time constant of velocities that are made from poses, see `VelocityEstimator`.
+
+    Attributes:
+        rejected: Messages so far that made no pose: those of `PoseSource`, those with an old stamp, and the first one
+            of poses without velocities, and after a gap or a jump.
+    """
+
+    def __init__(self, smoothing: float) -> None:
+        self.rejected = 0
+        self._velocities = VelocityEstimator(smoothing)
+        self._sequence = 0
+        self._newest = (-math.inf, -math.inf)  # arrival and stamp, s
+
+    @abstractmethod
+    def listen(self) -> Iterator[tuple[float, Measurement | None]]:
+        """Yield the messages that have arrived, without waiting.
+
+        Yields:
+            When it arrived (s, ``time.monotonic``), and what it says; None if it is damaged or of no use.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give back socket or device; may be called twice."""
+
+    def poll(self) -> list[Received]:
+        """Return what has arrived since the last call, oldest first, without waiting."""
+        received = []
+        for arrival, measured in self.listen():
+            packet = None if measured is None else self._packet(arrival, measured)
+            if packet is None:
+                self.rejected += 1
+            else:
+                received.append(Received(arrival, packet))
+        return received
+
+    def _packet(self, arrival: float, measured: Measurement) -> PosePacket | None:
+        """Return what is known now; None if that is no pose."""
+        stamp, position, attitude, velocity, rates, in_body = measured
+        velocity, rates = (np.zeros(3) if vector is None else vector for vector in (velocity, rates))
+        if not plausible(position, attitude, velocity, rates):
+            return None
+        packet = make_packet(self._sequence, stamp, position, attitude, velocity, rates)
+        if packet is None or not self._is_new(arrival, stamp):
+            return None
+        if measured.linear_velocity is None or measured.body_rates is None:
+            estimated = self._velocities.update(stamp, packet.position, packet.attitude)
+            if estimated is None:
+                return None
+            packet = packet._replace(**estimated._asdict())
+        elif in_body:
+            packet = packet._replace(linear_velocity=rotation_matrix(packet.attitude) @ velocity)
+        self._sequence += 1
+        return packet
+
+    def _is_new(self, arrival: float, stamp: float) -> bool:
+        newest_arrival, newest_stamp = self._newest
+        if stamp <= newest_stamp and arrival - newest_arrival < SILENCE:
+            return False
+        self._newest = arrival, stamp
+        return True
+
+
+def plausible(*vectors: np.ndarray) -> bool:
+    """Whether all numbers are finite, and of a size that can be calculated with."""
+    return all(bool((np.abs(vector) <= LARGEST).all()) for vector in vectors)

@@ -1,0 +1,101 @@
+"""How fast a vehicle moves and turns, from where it was: for sources that measure poses only."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+GAP = 0.1
+"""s between two poses beyond which the difference says nothing about now [choice]."""
+
+SPEED_MAX = 50.0
+"""m/s above which a pose has jumped instead of moved [choice]: more than twice what racing drones reach."""
+
+RATE_MAX = 50.0
+"""rad/s above which an attitude has jumped instead of turned [choice]: almost three times 1000 deg/s."""
+
+
+class Velocity(NamedTuple):
+    """How a vehicle moves.
+
+    Args:
+        linear_velocity: (3,) m/s, world.
+        body_rates: (3,) rad/s, body frame.
+    """
+
+    linear_velocity: np.ndarray
+    body_rates: np.ndarray
+
+
+class VelocityEstimator:
+    """Differences of successive poses, through a first-order low-pass.
+
+    The filter starts at the first difference, so that steady motion is known exactly from the second pose on. What
+    comes out is late by half the time between two poses, and by the time constant.
+
+    Args:
+        time_constant: s, of the low-pass: after it, 63 % of a step have come through; 0: there is no filter.
+
+    Example:
+        >>> level = np.array([1.0, 0.0, 0.0, 0.0])
+        >>> estimator = VelocityEstimator(time_constant=0.01)
+        >>> estimator.update(0.0, np.zeros(3), level) is None
+        True
+        >>> estimator.update(0.5**4, np.array([0.25, 0.0, 0.0]), level).linear_velocity.tolist()
+        [4.0, 0.0, 0.0]
+    """
+
+    def __init__(self, time_constant: float) -> None:
+        self._time_constant = time_constant
+        self._last: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._velocity: Velocity | None = None
+
+    def update(self, time: float, position: np.ndarray, attitude: np.ndarray) -> Velocity | None:
+        """Take in a pose, and return how the vehicle moves.
+
+        Args:
+            time: s, when the pose was measured.
+            position: (3,) m, world; finite.
+            attitude: (4,) wxyz, unit length; of either sign.
+
+        Returns:
+            None for the first pose, and for one after a gap or a jump or a step back in time, which is a first one too.
+        """
+        last, self._last = self._last, (time, position, attitude)
+        elapsed = math.inf if last is None else time - last[0]
+        if last is None or not 0.0 < elapsed <= GAP:
+            self._velocity = None
+            return None
+        moved, turned = position - last[1], rotation_between(last[2], attitude)
+        if np.linalg.norm(moved) > SPEED_MAX * elapsed or np.linalg.norm(turned) > RATE_MAX * elapsed:
+            self._velocity = None
+            return None
+        self._velocity = self._filtered(Velocity(moved / elapsed, turned / elapsed), elapsed)
+        return self._velocity
+
+    def _filtered(self, measured: Velocity, elapsed: float) -> Velocity:
+        if self._velocity is None or self._time_constant == 0.0:
+            return measured
+        gain = -math.expm1(-elapsed / self._time_constant)  # exact for an input that is constant meanwhile
+        return Velocity(*(old + gain * (new - old) for old, new in zip(self._velocity, measured, strict=True)))
+
+
+def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the rotation vector (3,), rad, body frame, that turns one attitude into another, the short way round.
+
+    The inverse of `stamping.turn`: the logarithm of first⁻¹ second. It is the same for q and −q.
+
+    Args:
+        first: (4,) wxyz, unit length.
+        second: (4,) wxyz, unit length.
+    """
+    a, b, c, d = first
+    w, x, y, z = second
+    cosine = a * w + b * x + c * y + d * z  # of half the angle
+    axis = np.array((a * x - b * w - c * z + d * y, a * y + b * z - c * w - d * x, a * z - b * y + c * x - d * w))
+    sine = float(np.linalg.norm(axis))
+    half = math.atan2(sine, abs(cosine))
+    scale = 2.0 if sine < 1e-9 else 2.0 * half / sine
+    return math.copysign(scale, cosine) * axis
