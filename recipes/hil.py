@@ -14,7 +14,8 @@ Read docs/hil.md before anything with propellers. Nothing here needs torch, but 
 import json
 import math
 import sys
-from dataclasses import dataclass, fields
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -44,7 +45,6 @@ AGENTS = Path(__file__).parents[1] / "agents"
 PILOT = "pilot"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
-FENCE_BELOW = 0.2  # m below the track's floor, where a vehicle may stand
 STATISTICS = "statistics.json"
 
 
@@ -140,33 +140,32 @@ def fly(config: HilConfig) -> int:
     """Fly one flight; return the exit status: 0 if it was flown to its end."""
     flyer, contract = make_flyer(config)
     track = load_track(config.track or contract["source"]["track"])
-    chain_config = make_chain_config(config, track)
+    chain = make_chain(config, flyer, track)
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
-    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
-    chain = FlightChain(flyer, track, chain_config, camera)
-    link = make_link(link_config(config, contract))
-    poses, operator = make_poses(config), make_operator(config)
-    about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
-    recorder = FlightRecorder(folder / FILE, about) if config.record else None
-    loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder)
-    print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
-    try:
+    with ExitStack() as opened:
+        opened.callback(chain.close)
+        link = opened.enter_context(closing(make_link(link_config(config, contract))))
+        poses = opened.enter_context(closing(make_poses(config)))
+        operator = opened.enter_context(closing(make_operator(config)))
+        recorder = None
+        if config.record:
+            about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
+            recorder = opened.enter_context(FlightRecorder(folder / FILE, about))
+        print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
+        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder)
         ended = loop.run(config.duration)
-    finally:
-        for part in (link, poses, operator, chain, *([recorder] if recorder else [])):
-            part.close()
+    passes = chain.progress.passes
     summary = {
         "ended": ended,
-        "passes": [[passed.gate, passed.time, passed.offset] for passed in chain.progress.passes],
-        "laps": lap_times(chain, track),
+        "passes": [list(passed) for passed in passes],
+        "laps": lap_times(chain),
         "loop": loop.statistics.summary(),
         "poses": {"rejected": poses.rejected, "out_of_order": chain.clock.out_of_order},
     }
-    if recorder:
+    if config.record:
         (folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     say(summary)
-    finished = config.laps is None or len(chain.progress.passes) >= config.laps * track.num_gates
-    return 0 if finished else 1
+    return 0 if config.laps is None or len(passes) >= config.laps * track.num_gates else 1
 
 
 def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
@@ -195,20 +194,12 @@ def pilot_contract(track: str) -> dict[str, Any]:
     return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
 
 
-def make_chain_config(config: HilConfig, track: Track) -> ChainConfig:
-    """Return what the chain needs, with the fence at the track's box and the start at the track's."""
-    low, high = track.bounds_low, track.bounds_high
-    given = dict(config.limits or {})
-    if unknown := sorted(set(given) - {field.name for field in fields(SafetyLimits)}):
-        raise ValueError(f"limits.{unknown[0]}: there is no such limit; see docs/hil.md.")
-    limits = {
-        "fence_low": (low[0], low[1], low[2] - FENCE_BELOW),
-        "fence_high": high,
-        "start_position": track.start_position,
-        "start_yaw_degrees": (track.start_yaw_degrees + 180.0) % 360.0 - 180.0,
-        **{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()},
-    }
-    return ChainConfig(SafetyLimits(**limits), config.stamping, config.latency, config.laps, config.arm)
+def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
+    """Make the chain of a flyer."""
+    limits = SafetyLimits.of_track(track, **(config.limits or {}))
+    settings = ChainConfig(limits, config.stamping, config.latency, config.laps, config.arm)
+    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
+    return FlightChain(flyer, track, settings, camera)
 
 
 def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
@@ -240,7 +231,7 @@ def make_operator(config: HilConfig) -> OperatorSource:
     return TimedOperator() if name == "timed" else KeyboardOperator()
 
 
-def lap_times(chain: FlightChain, track: Track) -> list[float]:
+def lap_times(chain: FlightChain) -> list[float]:
     """Return the times of whole laps from the first gate on, s."""
     firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
     return [later - earlier for earlier, later in pairwise(firsts)]
@@ -270,8 +261,8 @@ def replay(config: HilConfig) -> int:
     settings = cast(HilConfig, flown)
     flyer, contract = make_flyer(settings)
     track = load_track(settings.track or contract["source"]["track"])
-    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
-    chain = FlightChain(flyer, track, make_chain_config(settings, track), camera)
+    settings.renderer = config.renderer
+    chain = make_chain(settings, flyer, track)
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
         if differing := [name for name, value in again.items() if not same(value, tick["out"][name])]:

@@ -135,9 +135,9 @@ class FlightChain:
 
     def _moves(self) -> bool:
         """Whether the newest pose is one of a vehicle that has left the start."""
-        return (
-            self._newest is not None and np.linalg.norm(self._newest.linear_velocity) > self._config.limits.start_speed
-        )
+        if self._newest is None:
+            return False
+        return float(np.linalg.norm(self._newest.linear_velocity)) > self._config.limits.start_speed
 
     def _choose(self, pose: Pose | None) -> tuple[Setpoint | None, np.ndarray | None, float, float]:
         """Return setpoint and image, and how long drawing and choosing took, s."""

@@ -208,7 +208,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._moved_at = None
+            self._moved_at = math.inf
 
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
@@ -238,7 +238,7 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._now
-        self._moved_at: float | None = None  # when it was last seen to move in this flight
+        self._moved_at = math.inf  # when it was last seen to move in this flight; infinite: not yet
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
@@ -326,7 +326,7 @@ class Safety:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
         if seen.speed > limits.start_speed:
             self._moved_at = self._now
-        elif self.armed and self._moved_at is not None and self._now - self._moved_at > limits.still_time:
+        elif self.armed and self._now - self._moved_at > limits.still_time:
             findings[Reason.STRANDED] = (
                 f"it has not moved for {self._now - self._moved_at:.3g} s: is it lying somewhere?"
             )

@@ -6,13 +6,17 @@ Where nothing else is said, the numbers are this project's own choice, for a tra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.vehicle import GRAVITY
 from dreamer_racing.settings import Range, check_settings, setting
 
 Vector = tuple[float, ...]
+
+BELOW_FLOOR = 0.2
+"""m below a track's floor where its fence ends [choice]: a vehicle that lies there has been measured a little lower."""
 
 _SECONDS, _TOLERANCE, _DEGREES = Range(0, 1, open_below=True), Range(0, 10), Range(0, 180, open_below=True)
 _MOST = Range(0, 1e4, open_below=True)
@@ -75,6 +79,25 @@ class SafetyLimits:
     thrust_slew: float = setting(700.0, _MOST)
     rate_max: Vector = (10.0, 10.0, 4.0)
     rate_slew: float = setting(500.0, _MOST)
+
+    @classmethod
+    def of_track(cls, track: Track, **changed: Any) -> Self:
+        """Return the limits for a track: its box, with room for a stand below its floor, and its start.
+
+        Raises:
+            ValueError: There is no limit of a name.
+        """
+        names = {field.name for field in fields(cls)}
+        if unknown := sorted(set(changed) - names):
+            raise ValueError(f"limits.{unknown[0]}: there is no such limit; there are {', '.join(sorted(names))}.")
+        x, y, z = track.bounds_low
+        own: dict[str, Any] = {
+            "fence_low": (x, y, z - BELOW_FLOOR),
+            "fence_high": track.bounds_high,
+            "start_position": track.start_position,
+            "start_yaw_degrees": (track.start_yaw_degrees + 180.0) % 360.0 - 180.0,
+        }
+        return cls(**{**own, **{name: tuple(v) if isinstance(v, list) else v for name, v in changed.items()}})
 
     def check(self) -> None:
         """Refuse limits that protect nothing, or that nothing can fly within.

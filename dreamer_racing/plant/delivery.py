@@ -56,8 +56,8 @@ class PoseDelivery:
         """When the next packet is to leave, s of physics; infinite if none is waiting."""
         return self._waiting[0][0] if self._waiting else math.inf
 
-    def measure(self, pose: Pose) -> None:
-        """Take the pose that is due now, and send it off or lose it."""
+    def measure(self, pose: Pose, time: float) -> None:
+        """Take the pose that is due at a time, s of physics, and send it off or lose it."""
         sequence, self._measured = self._measured, self._measured + 1
         delivery, random = self._delivery, self._random
         draws = random.standard_normal(6)
@@ -73,7 +73,7 @@ class PoseDelivery:
             pose.linear_velocity,
             pose.body_rates,
         )
-        heapq.heappush(self._waiting, (pose.time + delay, sequence, encode_pose(packet)))
+        heapq.heappush(self._waiting, (time + delay, sequence, encode_pose(packet)))
 
     def depart(self, time: float) -> list[bytes]:
         """Return the packets that leave by a time, s of physics, in the order of departure."""

@@ -53,6 +53,7 @@ class PilotFlyer:
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
         """Choose by the pose."""
-        state = (torch.from_numpy(part)[None] for part in pose[1:])
-        action = self._pilot.act(*state, torch.tensor([target_gate]))[0].double().numpy()
+        parts = (pose.position, pose.attitude, pose.linear_velocity, pose.body_rates)
+        position, attitude, velocity, rates = (torch.from_numpy(part)[None] for part in parts)
+        action = self._pilot.act(position, attitude, velocity, rates, torch.tensor([target_gate]))[0].double().numpy()
         return Setpoint(self._thrust_scale * (1.0 + float(action[0])), self._rate_max * action[1:])

@@ -88,7 +88,7 @@ class Plant:
             if self.controls.due <= due:
                 self.controls.act(due)
             if self._poses.next_measurement <= due:
-                self._poses.measure(self.vehicle.pose())
+                self._poses.measure(self.vehicle.pose(), due)
             for packet in self._poses.depart(due):
                 self._send(packet)
         self._fly_to(until)

@@ -87,10 +87,11 @@ class PlantVehicle:
         TrackError: Unknown or broken track.
 
     Example:
+        >>> from dreamer_racing.hil.vehicle import hover
         >>> vehicle = PlantVehicle("circle")
         >>> vehicle.command(Command(True, hover()))
         >>> vehicle.advance(1.0)
-        >>> vehicle.pose().position
+        >>> vehicle.pose().position.round(2)
         array([ 4.  , -2.5 ,  1.35])
     """
 

@@ -8,45 +8,94 @@ import signal
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.hil.chain import describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import ActorFlyer, check_contract
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.hil.loop import FAREWELL
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
-from dreamer_racing.hil.safety import State
+from dreamer_racing.hil.safety import SafetyLimits, State
+from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.lock_step import BEGAN, LockStep, make_chain
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
-from tests.hil.flights import BEGAN, Hover, SimulatedTime, fly, make_chain
 
 AGENTS = Path(__file__).parents[2] / "agents"
 FIGURE8 = load_track("figure8")
 CIRCLE = load_track("circle")
 
 
+class Hover:
+    """Asks to stay where it is."""
+
+    rate = 50.0
+    camera = None
+
+    def __init__(self) -> None:
+        self.resets = 0
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
+        return hover()
+
+
+class Watched(LockStep):
+    """Remembers what was sent, and lets something happen before each tick."""
+
+    def __init__(self, track: Track, preset: str = "easy", delivery: Delivery | None = None, **mismatch: float) -> None:
+        super().__init__(PlantVehicle(track, preset, Mismatch(**mismatch)), delivery)
+        self.sent: list[tuple[float, Command]] = []
+        self.happens = lambda elapsed: None
+
+    @property
+    def vehicle(self) -> PlantVehicle:
+        return self.plant.vehicle
+
+    def sleep_until(self, deadline: float) -> None:
+        self.happens(self.elapsed)
+        super().sleep_until(deadline)
+
+    def send(self, command: Command) -> bytes:
+        self.sent.append((self.elapsed, command))
+        return super().send(command)
+
+
+def chain_of(flyer: Flyer, plant: LockStep, laps: int | None = 3, arm: bool = True, **limits: object) -> FlightChain:
+    track = plant.plant.vehicle.track
+    config = ChainConfig(SafetyLimits.of_track(track, **limits), laps=laps, arm=arm)
+    return make_chain(flyer, plant.plant.vehicle, config)
+
+
+def fly_hovering(plant: Watched, duration: float = 30.0) -> str:
+    return plant.fly(chain_of(Hover(), plant), Hover.rate, duration)
+
+
 def test_the_pilot_flies_three_laps_with_delay_and_loss():
     flyer = PilotFlyer(FIGURE8, "faithful")
-    time = SimulatedTime(PlantVehicle(FIGURE8, "faithful", Mismatch(delay=0.02)), loss=0.01)
-    chain = make_chain(flyer, FIGURE8, speed_max=25.0)
-    assert fly(flyer, time, chain) == "disarmed: the flight is over"
+    plant = Watched(FIGURE8, "faithful", Delivery(packet_loss=0.01), delay=0.02)
+    chain = chain_of(flyer, plant, speed_max=25.0)
+    assert plant.fly(chain, flyer.rate, 30.0) == "disarmed: the flight is over"
     assert [passed.gate for passed in chain.progress.passes] == [*range(6)] * 3
-    assert time.vehicle.gates_passed == 18 and len(time.vehicle.lap_times) == 3
-    # as the race itself saw them, to within the poses' period
-    laps = [b.time - a.time for a, b in pairwise(chain.progress.passes[5::6])]
-    assert laps == pytest.approx(time.vehicle.lap_times[1:], abs=0.03)
+    assert plant.vehicle.gates_passed == 18 and len(plant.vehicle.lap_times) == 3
+    # as the race itself saw them, to within the time between two poses
+    laps = [later.time - earlier.time for earlier, later in pairwise(chain.progress.passes[5::6])]
+    assert laps == pytest.approx(plant.vehicle.lap_times[1:], abs=0.03)
 
 
 def test_a_shipped_agent_flies_by_its_images_and_its_flight_plays_back_bit_for_bit(tmp_path):
     flyer = ActorFlyer(AGENTS / "circle")
-    track = load_track(flyer.contract["source"]["track"])
-    time = SimulatedTime(PlantVehicle(track, "easy"))
-    chain = make_chain(flyer, track, laps=1)
+    plant = Watched(load_track(flyer.contract["source"]["track"]))
+    chain = chain_of(flyer, plant, laps=1)
     with FlightRecorder(tmp_path / FILE, {}) as recorder:
-        assert fly(flyer, time, chain, recorder) == "disarmed: the flight is over"
+        assert plant.fly(chain, flyer.rate, 30.0, recorder) == "disarmed: the flight is over"
     chain.close()
-    assert time.vehicle.gates_passed == 4
-    again = make_chain(ActorFlyer(AGENTS / "circle"), track, laps=1)
+    assert plant.vehicle.gates_passed == 4
+    again = chain_of(ActorFlyer(AGENTS / "circle"), plant, laps=1)
     flight = Flight(tmp_path)
     assert flight.whole and len(flight.ticks) > 50
     for tick in flight.ticks:
@@ -56,90 +105,90 @@ def test_a_shipped_agent_flies_by_its_images_and_its_flight_plays_back_bit_for_b
 
 
 def test_nothing_is_armed_without_leave():
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"))
-    ended = fly(Hover(), time, make_chain(Hover(), CIRCLE, arm=False), duration=2.0)
+    plant = Watched(CIRCLE)
+    ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 2.0)
     assert ended.startswith("2 s are over; not armed:") and "arm=true" in ended
-    assert not any(command.armed for _, command in time.sent)
+    assert not any(command.armed for _, command in plant.sent)
 
 
 def test_lost_poses_are_held_then_cut_within_200_ms():
-    def fault(elapsed: float) -> None:
-        time.silent = elapsed > 2.0
+    plant = Watched(CIRCLE)
 
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"), event=fault)
-    ended = fly(Hover(), time, make_chain(Hover(), CIRCLE))
-    assert ended.startswith("cut: ")
-    last_armed = max(moment for moment, command in time.sent if command.armed)
+    poll = plant.poses.poll
+    plant.poses.poll = lambda: poll() if plant.elapsed <= 2.0 else []
+    assert fly_hovering(plant).startswith("cut: ")
+    last_armed = max(moment for moment, command in plant.sent if command.armed)
     assert 2.05 < last_armed < 2.2
-    assert not any(command.armed for moment, command in time.sent if moment > 2.2)
 
 
 @pytest.mark.parametrize("armed", [True, False])
 def test_the_operators_kill_wins_at_once(armed):
-    def fault(elapsed: float) -> None:
-        time.killed = elapsed > 1.5
+    plant = Watched(CIRCLE)
+    plant.enable_after = 0.5 if armed else 9.0
 
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"), enable_after=0.5 if armed else 9.0, event=fault)
-    fly(Hover(), time, make_chain(Hover(), CIRCLE), duration=3.0)
-    assert any(command.armed for _, command in time.sent) == armed
-    assert not any(command.armed for moment, command in time.sent if moment > 1.53)
+    def kill(elapsed: float) -> None:
+        plant.killed = elapsed > 1.5
+
+    plant.happens = kill
+    fly_hovering(plant, 3.0)
+    assert any(command.armed for _, command in plant.sent) == armed
+    assert not any(command.armed for moment, command in plant.sent if moment > 1.53)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_flight_with_a_second_of_disarm_frames(number):
-    sent = []
+    plant, sent = Watched(CIRCLE), []
 
-    def fault(elapsed: float) -> None:
+    def interrupt(elapsed: float) -> None:
         if elapsed > 1.5 and not sent:
             sent.append(elapsed)
             os.kill(os.getpid(), number)
 
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"), event=fault)
-    assert fly(Hover(), time, make_chain(Hover(), CIRCLE)) == number.name
-    frames = [moment for moment, command in time.sent if moment > sent[0] + 0.03]
-    assert not any(command.armed for moment, command in time.sent if moment in frames)
-    assert frames[-1] - frames[0] == pytest.approx(FAREWELL, abs=0.05)
+    plant.happens = interrupt
+    assert fly_hovering(plant) == number.name
+    frames = [(moment, command) for moment, command in plant.sent if moment > sent[0] + 0.03]
+    assert not any(command.armed for _, command in frames)
+    assert frames[-1][0] - frames[0][0] == pytest.approx(FAREWELL, abs=0.05)
 
 
 def test_whatever_breaks_the_vehicle_is_disarmed():
     class Broken(Hover):
         def act(self, pose, image, target_gate):
-            if self.resets and pose.time > BEGAN + 1.5:
+            if pose.time > BEGAN + 1.5:
                 raise RuntimeError("out of order")
-            return super().act(pose, image, target_gate)
+            return hover()
 
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"))
+    plant = Watched(CIRCLE)
     with pytest.raises(RuntimeError, match="out of order"):
-        fly(Broken(), time, make_chain(Broken(), CIRCLE))
-    assert any(command.armed for _, command in time.sent)
-    assert [command.armed for _, command in time.sent[-50:]] == [False] * 50
+        plant.fly(chain_of(Broken(), plant), 50.0, 30.0)
+    assert any(command.armed for _, command in plant.sent)
+    assert [command.armed for _, command in plant.sent[-50:]] == [False] * 50
 
 
 def test_the_actor_forgets_until_the_vehicle_moves():
     class Climb(Hover):
         def act(self, pose, image, target_gate):
-            return super().act(pose, image, target_gate)._replace(collective_thrust=14.0)
+            return hover()._replace(collective_thrust=14.0)
 
-    flyer = Climb()
-    time = SimulatedTime(PlantVehicle(CIRCLE, "easy"))
-    chain = make_chain(flyer, CIRCLE)
-    ended = fly(flyer, time, chain)
+    flyer, plant = Climb(), Watched(CIRCLE)
+    chain = chain_of(flyer, plant)
+    ended = plant.fly(chain, flyer.rate, 30.0)
     assert chain.safety.state is State.CUT and "fence" in ended
-    began = next(moment for moment, command in time.sent if command.setpoint.collective_thrust > 13.0)
+    began = next(moment for moment, command in plant.sent if command.setpoint.collective_thrust > 13.0)
     assert began * 50 - 5 < flyer.resets < (began + 0.4) * 50
 
 
 def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid():
-    class Stalls(SimulatedTime):
+    class Stalls(Watched):
         def send(self, command):
             sent = super().send(command)
-            if self.time - BEGAN == pytest.approx(1.0):
-                self.sleep_until(self.time + 0.075)  # three periods are missed, and most of a fourth
+            if self.elapsed == pytest.approx(1.0):
+                LockStep.sleep_until(self, self.now() + 0.075)  # three periods are missed, and most of a fourth
             return sent
 
-    time = Stalls(PlantVehicle(CIRCLE, "easy"))
-    fly(Hover(), time, make_chain(Hover(), CIRCLE), duration=1.3)
-    moments = [moment for moment, _ in time.sent if 0.97 < moment <= 1.17]
+    plant = Stalls(CIRCLE)
+    fly_hovering(plant, 1.3)
+    moments = [moment for moment, _ in plant.sent if 0.97 < moment <= 1.17]
     assert moments == pytest.approx([0.98, 1.0, 1.075, 1.08, 1.1, 1.12, 1.14, 1.16])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import time
 from collections.abc import Iterator
@@ -49,7 +48,7 @@ class UdpInlet:
     """
 
     whole = True
-    _MOST = 256  # datagrams taken in at a time: a flood must not stop the loop
+    _MOST = 128  # datagrams taken in at a time: a flood must not stop the loop
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
@@ -86,7 +85,6 @@ class SerialInlet:
     """
 
     whole = False
-    _MOST = 16384  # bytes at a time: more than 0.1 s at 921,600 baud
 
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
@@ -95,12 +93,9 @@ class SerialInlet:
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the bytes in the buffer, if there are any."""
         try:
-            # Not pyserial's own read, which asks for a number of bytes and calls select for each piece.
-            data = os.read(self._port.fileno(), self._MOST)
-        except BlockingIOError:
-            return
+            data = self._port.read(self._port.in_waiting)
         except OSError as error:
-            raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
+            raise OSError(f"device={self._device}: it is gone: {error}.") from error
         if data:
             yield time.monotonic(), data
 

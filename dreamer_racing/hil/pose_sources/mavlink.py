@@ -7,9 +7,9 @@
 | ``VISION_POSITION_ESTIMATE`` | in it, as angles | made from poses | made from poses |
 | ``ATT_POS_MOCAP`` | in it | made from poses | made from poses |
 
-MAVLink's world is NED (x north, y east, z down) or a local FRD (x wherever forward was, y to its right, z down), its body
-FRD (x forward, y right, z down). Ours is z up, with the same x: a track's x axis points north, its y axis west. Both
-worlds, and both bodies, differ by half a turn about x, so that
+MAVLink's world is NED (x north, y east, z down), or FRD (x where forward was at the start, y to its right, z down); its
+body is FRD (x forward, y right, z down). Our world has the same x and its z up: a track's x axis points north, its y
+axis west. MAVLink's world and ours, its body and ours, differ by half a turn about x, so that
 
 - a vector (x, y, z) becomes (x, −y, −z), be it a position, a velocity, or body rates;
 - an attitude (w, x, y, z), FRD → NED, becomes (w, x, −y, −z), FLU → z up: the axis of a rotation is a vector.

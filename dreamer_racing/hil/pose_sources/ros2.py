@@ -118,7 +118,7 @@ def _import(name: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise ImportError(
-            f"The pose source ros2 needs {package} ({error}). It comes with ROS 2, not from pip: apt install "
-            f"ros-$ROS_DISTRO-{package.replace('_', '-')}, and in this terminal source /opt/ros/$ROS_DISTRO/setup.bash; "
-            "Python must be the version that this ROS is built for."
+            f"The pose source ros2 needs {package}, which comes with ROS 2, not from pip: apt install "
+            f"ros-$ROS_DISTRO-{package.replace('_', '-')}; source /opt/ros/$ROS_DISTRO/setup.bash in this terminal; "
+            f"and use the Python that this ROS is built for ({error})."
         ) from error

@@ -1,0 +1,116 @@
+"""The loop and a plant in one process, without sockets or a clock: a flight takes as long as it takes to compute.
+
+Packets are those of the real thing, and so is everything that reads them; only time is told by the plant's physics.
+"""
+
+from __future__ import annotations
+
+from dreamer_racing.hil.camera import NoseCamera
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
+from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.links.udp import CommandPacket, encode_command
+from dreamer_racing.hil.loop import FlightLoop
+from dreamer_racing.hil.operator import Operator
+from dreamer_racing.hil.pose import Received, decode_pose
+from dreamer_racing.hil.recording import FlightRecorder
+from dreamer_racing.hil.vehicle import Command
+from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.process import Plant
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+BEGAN = 1000.0
+"""s, by the loop's clock, when the plant's physics began: two clocks that are told apart."""
+
+ENABLE_AFTER = 0.5
+"""s after which the operator gives the enable [choice]."""
+
+
+class LockStep:
+    """A plant as a `FlightLoop` sees it: its clock, its link, and where its poses and its operator's word come from.
+
+    Args:
+        vehicle: The drone.
+        delivery: What becomes of its poses.
+        failsafe: s without a command after which the plant cuts its motors.
+
+    Attributes:
+        plant: The drone with its wires.
+        enable_after: s after which the operator gives the enable.
+        killed: Whether the operator kills; settable.
+    """
+
+    def __init__(self, vehicle: PlantVehicle, delivery: Delivery | None = None, failsafe: float = TIMEOUT) -> None:
+        self.plant = Plant(vehicle, CommandReceiver(vehicle, failsafe), delivery or Delivery(), self._deliver)
+        self.enable_after, self.killed = ENABLE_AFTER, False
+        self.poses, self.operator = _Poses(), _Operator(self)
+        self._sequence = 0
+
+    @property
+    def elapsed(self) -> float:
+        """S of physics since it was made."""
+        return self.plant.time
+
+    def now(self) -> float:
+        """Return s, by the loop's clock."""
+        return BEGAN + self.plant.time
+
+    def sleep_until(self, deadline: float) -> None:
+        """Let the plant fly until then."""
+        self.plant.advance_to(deadline - BEGAN)
+
+    def send(self, command: Command) -> bytes:
+        """Send a command to the plant; return its packet."""
+        self._sequence += 1
+        data = encode_command(CommandPacket(self._sequence, self.now(), command))
+        self.plant.take(data)
+        return data
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to give back."""
+
+    def fly(self, chain: FlightChain, rate: float, duration: float, recorder: FlightRecorder | None = None) -> str:
+        """Fly until the flight is over, or for so many s; return why it ended."""
+        return FlightLoop(chain, self.poses, self.operator, self, rate, recorder, clock=self).run(duration)
+
+    def _deliver(self, data: bytes) -> None:
+        packet = decode_pose(data)
+        if packet is None:
+            self.poses.rejected += 1
+        else:
+            self.poses.arrived.append(Received(self.now(), packet))
+
+
+class _Poses:
+    """Poses that have left the plant."""
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        self.arrived: list[Received] = []
+
+    def poll(self) -> list[Received]:
+        arrived, self.arrived = self.arrived, []
+        return arrived
+
+    def close(self) -> None:
+        pass
+
+
+class _Operator:
+    """Gives the enable after a while."""
+
+    def __init__(self, lock_step: LockStep) -> None:
+        self._lock_step = lock_step
+
+    def poll(self) -> Operator:
+        lock_step = self._lock_step
+        return Operator(lock_step.elapsed >= lock_step.enable_after, lock_step.killed)
+
+    def close(self) -> None:
+        pass
+
+
+def make_chain(flyer: Flyer, vehicle: PlantVehicle, config: ChainConfig) -> FlightChain:
+    """Make the chain of a flyer on the vehicle's track, with a camera if it needs one."""
+    camera = None if flyer.camera is None else NoseCamera(vehicle.track, flyer.camera)
+    return FlightChain(flyer, vehicle.track, config, camera)

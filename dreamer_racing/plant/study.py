@@ -1,0 +1,134 @@
+"""How much a vehicle may differ from the one that a flyer was trained on: flights with one thing changed at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.safety_limits import SafetyLimits
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
+
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "delay": (0.0, 0.02, 0.04, 0.06, 0.08, 0.1),  # s, of commands
+    "mass": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
+    "thrust": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
+    "position_noise": (0.0, 0.01, 0.02, 0.05, 0.1),  # m, standard deviation
+    "rate": (50.0, 100.0, 200.0, 400.0),  # Hz, of poses
+}
+"""What is changed, and the values that it takes; field names of `Mismatch` and `Delivery`."""
+
+USUAL = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
+"""Poses as a motion-capture system gives them [choice]; without noise every flight would be the same."""
+
+LONGEST = 60.0
+"""s after which a flight is given up."""
+
+SPEED_MAX = 25.0
+"""m/s, the only limit of safety that is not its own: the pilot is faster than a first flight should be."""
+
+
+class StudyFlight(NamedTuple):
+    """What came of a flight.
+
+    Args:
+        sweep: Name of what was changed; ``none`` for the vehicle as it is.
+        value: To what.
+        seed: Of the poses' noise.
+        gates: Passed in order, by the plant's own count.
+        finished: Whether all laps were flown.
+        lap_time: Mean of the laps, s; None without one.
+        speed_max: m/s.
+        ended: Why, in words.
+    """
+
+    sweep: str
+    value: float
+    seed: int
+    gates: int
+    finished: bool
+    lap_time: float | None
+    speed_max: float
+    ended: str
+
+
+def study(
+    make_flyer: Callable[[], Flyer],
+    track: str,
+    preset: str,
+    flights: int,
+    sweeps: Sequence[str] = tuple(SWEEPS),
+    processes: int = 1,
+) -> Iterator[StudyFlight]:
+    """Fly every value of every sweep so many times, and yield what came of each, in order.
+
+    Args:
+        make_flyer: Makes who flies; called once in each process, so it must be picklable.
+        track: Its name.
+        preset: Physics of the vehicle before it is changed.
+        flights: Of each value, with different noise.
+        sweeps: Names out of `SWEEPS`.
+        processes: How many fly at a time.
+    """
+    jobs = [(sweep, value, seed) for sweep in sweeps for value in SWEEPS[sweep] for seed in range(flights)]
+    with ProcessPoolExecutor(
+        processes, get_context("spawn"), initializer=_prepare, initargs=(make_flyer, track, preset)
+    ) as pool:
+        yield from pool.map(_fly, *zip(*jobs, strict=True))
+
+
+_prepared: dict[str, Any] = {}
+"""Of this process: the flyer takes seconds to make."""
+
+
+def _prepare(make_flyer: Callable[[], Flyer], track: str, preset: str) -> None:
+    _prepared.update(flyer=make_flyer(), track=track, preset=preset)
+
+
+def _fly(sweep: str, value: float, seed: int) -> StudyFlight:
+    return fly(_prepared["flyer"], _prepared["track"], _prepared["preset"], sweep, value, seed)
+
+
+def fly(flyer: Flyer, track: str, preset: str, sweep: str, value: float, seed: int) -> StudyFlight:
+    """Fly once with one thing changed."""
+    mismatch, delivery = Mismatch(), dataclasses.replace(USUAL, seed=seed)
+    for changed in (mismatch, delivery):
+        if hasattr(changed, sweep):
+            setattr(changed, sweep, value)
+    vehicle = PlantVehicle(track, preset, mismatch)
+    laps = vehicle.track.laps
+    limits = SafetyLimits.of_track(vehicle.track, speed_max=SPEED_MAX)
+    chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=laps, arm=True))
+    plant = _Fastest(vehicle, delivery)
+    try:
+        ended = plant.fly(chain, flyer.rate, LONGEST)
+    finally:
+        chain.close()
+    times = vehicle.lap_times
+    return StudyFlight(
+        sweep=sweep,
+        value=value,
+        seed=seed,
+        gates=vehicle.gates_passed,
+        finished=len(times) >= laps,
+        lap_time=sum(times) / len(times) if times else None,
+        speed_max=plant.speed_max,
+        ended=ended,
+    )
+
+
+class _Fastest(LockStep):
+    """Notes the highest speed, m/s."""
+
+    speed_max = 0.0
+
+    def sleep_until(self, deadline: float) -> None:
+        super().sleep_until(deadline)
+        velocity = self.plant.vehicle.pose().linear_velocity
+        self.speed_max = max(self.speed_max, float((velocity @ velocity) ** 0.5))

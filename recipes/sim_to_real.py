@@ -1,0 +1,99 @@
+"""How much a real drone may differ from the simulated one: success and lap time as one thing at a time is changed.
+
+    python recipes/sim_to_real.py actor=kidney preset=easy
+    python recipes/sim_to_real.py actor=pilot track=figure8 flights=10 processes=2
+
+Flies the whole chain of recipes/hil.py (images, actor, safety, packets) against the plant of recipes/plant.py, without
+a clock: commands 0 to 100 ms late, mass and thrust 20 % off, noisy poses, few poses. Writes sim_to_real.json and .png.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+import hydra
+from composing.command_line import CONFIG_DIR, new_run_dir, plain_errors, start_logging
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.envs.drone.parameters import load_preset
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.figures.sim_to_real import plot_study
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer
+from dreamer_racing.machine import available_cpus, provenance
+from dreamer_racing.plant.pilot import PilotFlyer
+from dreamer_racing.plant.study import SWEEPS, study
+from dreamer_racing.settings import COUNT, Range, check_settings, setting
+
+AGENTS = Path(__file__).parents[1] / "agents"
+PILOT = "pilot"
+RESULT = "sim_to_real.json"
+
+
+@dataclass
+class SimToRealConfig:
+    """`recipes/sim_to_real.py`."""
+
+    actor: str = PILOT  # pilot, an agent that ships by its name, or the path of an agent
+    track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
+    preset: str = "faithful"  # physics before anything is changed: easy | faithful
+    rate: float = setting(50.0, Range(10, 500))  # Hz, of the pilot; an actor has its own
+    flights: int = setting(5, COUNT)  # of each value, with different noise
+    sweeps: list[str] | None = None  # of what is changed; null: all
+    processes: int | None = setting(None, COUNT)  # that fly at a time; null: one for each core
+    run_dir: str | None = None  # null: runs/sim_to_real_<track>_<time>
+
+
+ConfigStore.instance().store(name="sim_to_real_schema", node=SimToRealConfig)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="sim_to_real")
+def main(config: DictConfig) -> None:
+    """Fly all of it, print a table, write files."""
+    start_logging()
+    with plain_errors():
+        settings = cast(SimToRealConfig, OmegaConf.to_object(config))
+        track, make_flyer = check(settings)
+        folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track)
+        folder.mkdir(parents=True, exist_ok=True)
+    sweeps = settings.sweeps or list(SWEEPS)
+    processes = settings.processes or available_cpus()
+    flown = []
+    for flight in study(make_flyer, track, settings.preset, settings.flights, sweeps, processes):
+        flown.append(flight._asdict())
+        lap = "–" if flight.lap_time is None else f"{flight.lap_time:.2f} s"
+        print(f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}", flush=True)
+    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": settings.actor, "track": track}
+    result = {"provenance": {**made, "preset": settings.preset, "flights": settings.flights}, "flights": flown}
+    (folder / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    plot_study([result], folder / RESULT.replace("json", "png"))
+    print(f"written to {folder}")
+
+
+def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
+    """Return the track and what makes the flyer.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+        OSError: there is no such actor.
+    """
+    check_settings(config)
+    load_preset(config.preset)
+    if unknown := sorted(set(config.sweeps or ()) - set(SWEEPS)):
+        raise ValueError(f"sweeps={unknown[0]}: there are {', '.join(SWEEPS)}.")
+    if config.actor == PILOT:
+        if config.track is None:
+            raise ValueError("track= is missing: actor=pilot has none of its own.")
+        return config.track, partial(PilotFlyer, load_track(config.track), config.preset, config.rate)
+    path = AGENTS / config.actor if (AGENTS / config.actor).is_dir() else Path(config.actor)
+    contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
+    return config.track or contract["source"]["track"], partial(ActorFlyer, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""The link to Betaflight's SITL: packets as the firmware reads them, and the loop closed by a stand-in for it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.hil.vehicle import Pose
+from dreamer_racing.plant.betaflight_sitl import DIALECTS, BetaflightSitl, decode_motors, encode_state
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.process import Plant
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+FIRMWARES = ("2026.6", "before")
+IDLE = 0.055  # of the motors, armed
+
+
+class Firmware:
+    """A stand-in for Betaflight: a rate controller that reads and writes the same packets.
+
+    Written from the firmware's side: it turns the rates around as sitl.c does, holds a rate with a mixer for motors in
+    Betaflight's order, and idles when armed.
+    """
+
+    GAIN = np.array((0.045, 0.045, 0.12))  # motor command per rad/s
+
+    def __init__(self, version: str) -> None:
+        self.version = version
+        self.armed, self.throttle, self.rates = False, 0.0, np.zeros(3)  # rates: right, forward and LEFT positive
+        self.stamps: set[float] = set()
+        self.gyro = np.zeros(3)
+        self.accelerometer = np.zeros(3)
+
+    def answer(self, data: bytes) -> bytes:
+        numbers = struct.unpack("<18d", data)
+        self.stamps.add(numbers[0])
+        x, y, z = numbers[1:4]
+        self.gyro = np.array((x, -y, z if self.version == "2026.6" else -z))  # sitl.c, updateState
+        self.accelerometer = -np.array(numbers[4:7])
+        return self.pack(self.motors())
+
+    def motors(self) -> np.ndarray:
+        """M1 … M4: rear right, front right, rear left, front left."""
+        if not self.armed:
+            return np.zeros(4)
+        roll, pitch, yaw = self.GAIN * (self.rates - self.gyro)
+        mix = np.array((-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw))
+        return np.clip(self.throttle + mix, IDLE, 1.0) if self.throttle > 0.0 else np.full(4, IDLE)
+
+    def pack(self, motors: np.ndarray) -> bytes:
+        m1, m2, m3, m4 = motors
+        return struct.pack("<4f", *((m1, m2, m3, m4) if self.version == "2026.6" else (m2, m3, m4, m1)))
+
+
+def closed(version: str, preset: str = "faithful") -> tuple[Plant, Firmware]:
+    """A plant whose every state packet is answered at once."""
+    vehicle, firmware = PlantVehicle("circle", preset), Firmware(version)
+    answers: list[Callable[[bytes], bool]] = []
+    sitl = BetaflightSitl(
+        vehicle, lambda data: answers[0](firmware.answer(data)) if answers else None, version, timeout=0.25
+    )
+    plant = Plant(vehicle, sitl, Delivery(rate=100.0), lambda data: None)
+    answers.append(plant.take)
+    return plant, firmware
+
+
+def take_off(plant: Plant, firmware: Firmware) -> float:
+    """Fly at hover; return the hover command."""
+    hover = math.sqrt(0.6 * GRAVITY / 16.0)
+    plant.advance_to(plant.time + 0.1)
+    firmware.armed = True
+    plant.advance_to(plant.time + 0.2)
+    firmware.throttle = hover
+    plant.advance_to(plant.time + 0.4)
+    assert not plant.vehicle.on_stand
+    return hover
+
+
+@pytest.mark.parametrize(("version", "sign"), [("2026.6", 1.0), ("before", -1.0)])
+def test_the_state_packet_is_as_the_firmware_reads_it(version: str, sign: float) -> None:
+    pose = Pose(
+        7.5,
+        np.array((1.0, 2.0, 3.0)),
+        np.array((0.8, 0.0, 0.6, 0.0)),
+        np.array((4.0, 5.0, 6.0)),
+        np.array((0.1, 0.2, 0.3)),
+    )
+    data = encode_state(pose, np.array((0.5, -0.6, 9.81)), DIALECTS[version])
+    assert len(data) == 144
+    numbers = struct.unpack("<18d", data)
+    assert numbers[1:4] == pytest.approx((0.1, -0.2, sign * 0.3))
+    assert numbers[4:7] == pytest.approx((-0.5, 0.6, -9.81))
+    assert numbers[7:17] == pytest.approx((0.8, 0.0, 0.6, 0.0, 4.0, 5.0, 6.0, 1.0, 2.0, 3.0))
+    assert 101325.0 - numbers[17] == pytest.approx(12.0 * 3.0, rel=0.01)  # Pa: 12 a metre near the ground
+    later = encode_state(pose._replace(time=99.0), np.zeros(3), DIALECTS[version])
+    assert struct.unpack("<18d", later)[0] == numbers[0]  # a constant stamp
+
+
+def test_motors_are_put_in_order_and_within_limits() -> None:
+    data = struct.pack("<4f", 0.1, 0.2, 0.3, 0.4)
+    assert decode_motors(data, DIALECTS["2026.6"]) == pytest.approx((0.1, 0.2, 0.3, 0.4))
+    assert decode_motors(data, DIALECTS["before"]) == pytest.approx((0.4, 0.1, 0.2, 0.3))  # M2 M3 M4 M1
+    wild = decode_motors(struct.pack("<4f", -0.5, 1.5, 0.0, 1.0), DIALECTS["2026.6"])
+    assert wild == pytest.approx((0.0, 1.0, 0.0, 1.0))
+    for bad in (
+        b"",
+        data[:-1],
+        data + b"\0",
+        struct.pack("<4f", math.nan, 0, 0, 0),
+        struct.pack("<4f", math.inf, 0, 0, 0),
+    ):
+        assert decode_motors(bad, DIALECTS["2026.6"]) is None
+
+
+@pytest.mark.parametrize(
+    ("motors", "axis", "sign"),
+    [
+        ((0.055, 0.055, 0.98, 0.98), 0, 1),  # roll right: measured answers of the firmware, the body clamped
+        ((1.0, 0.055, 1.0, 0.055), 1, 1),  # pitch forward, nose down
+        ((0.23, 0.77, 0.77, 0.23), 2, -1),  # yaw right
+    ],
+)
+@pytest.mark.parametrize("version", FIRMWARES)
+def test_the_firmwares_answers_turn_the_vehicle_where_they_mean_to(
+    motors: tuple[float, ...], axis: int, sign: int, version: str
+) -> None:
+    plant, firmware = closed(version)
+    take_off(plant, firmware)
+    firmware.motors = lambda: np.array(motors)
+    plant.advance_to(plant.time + 0.03)
+    rates = plant.vehicle.pose().body_rates
+    assert np.abs(rates).argmax() == axis and sign * rates[axis] > 0.2
+    assert firmware.gyro[axis] * sign > 0.0  # and the firmware sees the turn with the sign that it asked for
+
+
+def test_the_firmwares_hover_command_is_the_known_one() -> None:
+    own = PRESETS["faithful"]
+    assert math.sqrt(own.mass * GRAVITY / (4.0 * own.rotor_thrust_max)) == pytest.approx(0.607, abs=1e-3)
+
+
+@pytest.mark.parametrize("version", FIRMWARES)
+def test_idle_motors_arm_and_leave_it_on_the_stand(version: str) -> None:
+    plant, firmware = closed(version)
+    plant.advance_to(0.2)
+    assert not plant.vehicle.armed and len(firmware.stamps) == 1
+    assert firmware.accelerometer == pytest.approx((0.0, 0.0, GRAVITY))  # as an accelerometer at rest
+    firmware.armed = True
+    plant.advance_to(0.5)
+    assert plant.vehicle.armed and plant.vehicle.on_stand
+    assert plant.controls.summary() == "501 motor packets (0 malformed), 0 failsafe(s)"  # one a physics step
+
+
+@pytest.mark.parametrize("version", FIRMWARES)
+@pytest.mark.parametrize(("axis", "rate"), [(0, 3.5), (1, -3.5), (2, 1.5)])
+def test_the_closed_loop_holds_the_rate_that_the_firmware_wants(version: str, axis: int, rate: float) -> None:
+    plant, firmware = closed(version)
+    take_off(plant, firmware)
+    assert np.abs(plant.vehicle.pose().body_rates).max() < 1e-6
+    firmware.rates[axis] = rate
+    plant.advance_to(plant.time + 0.3)
+    wanted = np.zeros(3)
+    wanted[axis] = rate
+    assert plant.vehicle.pose().body_rates == pytest.approx(wanted, abs=0.05 * abs(rate))
+    assert firmware.gyro == pytest.approx(plant.vehicle.pose().body_rates, abs=0.02 * abs(rate))
+    assert plant.vehicle.crash is CrashCause.NONE
+
+
+@pytest.mark.parametrize("version", FIRMWARES)
+def test_the_wrong_dialect_does_not_fly(version: str) -> None:
+    plant, firmware = closed(version)
+    take_off(plant, firmware)
+    firmware.version = next(other for other in FIRMWARES if other != version)
+    firmware.rates[0] = 0.5
+    plant.advance_to(plant.time + 1.0)
+    assert np.abs(plant.vehicle.pose().body_rates - firmware.rates).max() > 1.0 or plant.vehicle.crash
+
+
+def test_silence_of_the_firmware_cuts_the_motors_until_it_has_been_disarmed() -> None:
+    plant, firmware = closed("2026.6")
+    take_off(plant, firmware)
+    answer, heard = firmware.answer, plant.time
+    firmware.answer = lambda data: b"nothing"
+    plant.advance_to(heard + 0.24)
+    assert plant.vehicle.armed
+    plant.advance_to(heard + 0.26)
+    assert not plant.vehicle.armed and plant.controls.failsafe.events == 1 and plant.controls.malformed > 200
+    firmware.answer = answer
+    plant.advance_to(heard + 0.3)
+    assert not plant.vehicle.armed  # still armed over there
+    firmware.armed = False
+    plant.advance_to(heard + 0.32)
+    firmware.armed = True
+    plant.advance_to(heard + 0.34)
+    assert plant.vehicle.armed
+
+
+def test_an_unknown_firmware_is_refused() -> None:
+    with pytest.raises(ValueError, match="betaflight=4.5: the firmware's version is one of 2026.6, before"):
+        BetaflightSitl(PlantVehicle("circle"), lambda data: None, "4.5")

@@ -1,0 +1,247 @@
+"""The plant by its own clock, by the wall's, and by none."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.links.udp import CommandPacket, UdpLink, encode_command
+from dreamer_racing.hil.pose import PosePacket, UdpPose, bind, decode_pose
+from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
+from dreamer_racing.plant import process
+from dreamer_racing.plant.commands import CommandReceiver
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.process import (
+    Plant,
+    ProcessOptions,
+    check_process,
+    fly_in_lock_step,
+    fly_in_real_time,
+    open_sockets,
+)
+from dreamer_racing.plant.vehicle import PlantVehicle
+from dreamer_racing.settings import check_settings
+from dreamer_racing.training.signals import GracefulExit
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> PlantVehicle:
+    """The drone; a test gets it from `fresh`."""
+    return PlantVehicle("circle", "easy")
+
+
+@pytest.fixture
+def fresh(vehicle: PlantVehicle) -> PlantVehicle:
+    vehicle.reset()
+    return vehicle
+
+
+@pytest.fixture
+def incoming() -> Iterator[socket.socket]:
+    with bind("127.0.0.1", 0) as listening:
+        yield listening
+
+
+def make(
+    vehicle: PlantVehicle, send: Callable[[bytes], object] | None = None, **settings: float
+) -> tuple[Plant, list[PosePacket]]:
+    """A plant and the poses that leave it."""
+    poses: list[PosePacket] = []
+    plant = Plant(
+        vehicle, CommandReceiver(vehicle), Delivery(**settings), send or (lambda data: poses.append(decode_pose(data)))
+    )
+    return plant, poses
+
+
+def packet(sequence: int, command: Command) -> bytes:
+    return encode_command(CommandPacket(sequence, 0.0, command))
+
+
+def test_poses_leave_at_their_rate_stamped_with_the_time_of_the_physics(fresh: PlantVehicle) -> None:
+    plant, poses = make(fresh, rate=250.0)
+    begin = fresh.time
+    for step in range(1, 501):
+        plant.advance_to(0.002 * step)
+    assert [pose.sequence for pose in poses] == list(range(251))
+    stamps = np.array([pose.stamp for pose in poses]) - begin
+    assert stamps == pytest.approx(np.arange(251) / 250.0, abs=1e-9)
+    assert poses[0].position == pytest.approx((4.0, -2.5, 1.35))
+    plant.advance_to(0.5)  # past
+    assert plant.time == 1.0 and len(poses) == 251
+
+
+def test_the_failsafe_cuts_when_its_time_is_over_however_time_passes(fresh: PlantVehicle) -> None:
+    plant, _ = make(fresh)
+    assert plant.take(packet(0, at_rest()))
+    plant.take(packet(1, Command(True, hover())))
+    plant.advance_to(0.2)
+    plant.take(packet(2, Command(True, hover())))
+    plant.advance_to(0.449)
+    assert fresh.armed and not fresh.on_stand
+    plant.advance_to(2.0)  # in one go: the cut is where it belongs
+    assert not fresh.armed
+    fall = 0.5 * GRAVITY * 0.25**2
+    assert fall < 1.35 and fresh.fate.endswith("when disarmed")
+    seconds_to_ground = math.sqrt(2 * 1.3 / GRAVITY)
+    assert float(fresh.fate.split()[2]) - (fresh.time - 2.0) == pytest.approx(0.45 + seconds_to_ground, abs=0.05)
+    assert (
+        "2 commands" not in plant.summary()
+        and "3 commands (0 lost, 0 stale, 0 malformed), 1 failsafe(s)" in plant.summary()
+    )
+
+
+class Clock:
+    """A wall clock that only waiting moves; it stands for both modules that tell the loop the time."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def select(self, reading: list, _: list, __: list, timeout: float) -> tuple[list, list, list]:
+        self.now += timeout
+        return [], [], []
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(process, "time", clock)
+    monkeypatch.setattr(process, "select", clock)
+    return clock
+
+
+def test_real_time_does_not_drift_and_catches_up(
+    fresh: PlantVehicle, incoming: socket.socket, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant, poses = make(fresh, rate=200.0)
+    advance = fresh.advance
+
+    def slow(seconds: float) -> None:
+        clock.now += 0.06 if 0.299 < plant.time < 0.301 else 0.001
+        advance(seconds)
+
+    monkeypatch.setattr(fresh, "advance", slow)
+    fly_in_real_time(plant, incoming, GracefulExit(), duration=0.6)
+    assert plant.time == pytest.approx(0.6) and len(poses) == 121
+    assert clock.now - 1000.0 == pytest.approx(0.601, abs=1e-6)  # what a step takes does not add up
+    # each of the steps after the long one makes up for 4 of its 55 ms behind the next pose
+    assert plant.late == 13 and plant.latest == pytest.approx(0.055)
+    assert "late 13 times (by 55 ms at most)" in plant.summary()
+
+
+def test_four_times_as_fast_takes_a_quarter_of_the_time(
+    fresh: PlantVehicle, incoming: socket.socket, clock: Clock
+) -> None:
+    plant, poses = make(fresh, rate=100.0)
+    fly_in_real_time(plant, incoming, GracefulExit(), speed=4.0, duration=1.2)
+    assert clock.now - 1000.0 == pytest.approx(0.3) and len(poses) == 121 and not plant.late
+
+
+def test_it_keeps_to_the_clock_of_this_machine(fresh: PlantVehicle, incoming: socket.socket) -> None:
+    plant, poses = make(fresh, rate=200.0)
+    begin = time.monotonic()
+    fly_in_real_time(plant, incoming, GracefulExit(), duration=0.5)
+    assert time.monotonic() - begin >= 0.5 and len(poses) == 101
+
+
+def test_commands_are_taken_while_it_flies(fresh: PlantVehicle, incoming: socket.socket) -> None:
+    receiver = CommandReceiver(fresh, timeout=10.0)
+    plant, stop = Plant(fresh, receiver, Delivery(), lambda data: None), GracefulExit()
+    link = UdpLink(*incoming.getsockname())
+    thread = threading.Thread(target=fly_in_real_time, args=(plant, incoming, stop))
+    thread.start()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.sendto(b"no command", incoming.getsockname())
+    for count in range(30):
+        link.send(at_rest() if count < 5 else Command(True, hover()))
+        time.sleep(0.02)
+    deadline = time.monotonic() + 10.0
+    while (fresh.on_stand or receiver.received < 30) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    stop.signal_name = "SIGTERM"
+    thread.join(5.0)
+    link.close()
+    assert not thread.is_alive() and not fresh.on_stand and fresh.armed
+    assert "30 commands (0 lost, 0 stale, 1 malformed), 0 failsafe(s)" in plant.summary()
+
+
+def lock_step_flight(incoming: socket.socket, commands: int) -> tuple[Plant, list[PosePacket]]:
+    """Fly by commands that are sent only when the last one's poses have come."""
+    receiver = UdpPose(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.connect(receiver.address)
+        plant, _ = make(PlantVehicle("circle", "faithful"), out.send, rate=100.0, position_noise=0.001, seed=4)
+        link, poses = UdpLink(*incoming.getsockname()), []
+        thread = threading.Thread(
+            target=fly_in_lock_step, args=(plant, incoming, GracefulExit(), 0.02), kwargs={"duration": 0.02 * commands}
+        )
+        thread.start()
+        for count in range(commands):
+            thrust = GRAVITY + 0.5 * math.sin(count)
+            link.send(at_rest() if count < 2 else Command(True, Setpoint(thrust, np.array((0.1, 0.0, 0.2)))))
+            deadline = time.monotonic() + 5.0
+            while len(poses) < 2 * (count + 1) + 1 and time.monotonic() < deadline:
+                poses += [received.packet for received in receiver.poll()]
+        thread.join(5.0)
+    link.close()
+    receiver.close()
+    return plant, poses
+
+
+def test_lock_step_flies_one_control_step_a_command_and_always_the_same(incoming: socket.socket) -> None:
+    begin = time.monotonic()
+    flights = [lock_step_flight(incoming, 100) for _ in range(2)]
+    took = time.monotonic() - begin
+    for plant, poses in flights:
+        assert plant.time == pytest.approx(2.0) and len(poses) == 201
+        assert not plant.vehicle.on_stand and not plant.late
+    for one, two in zip(flights[0][1], flights[1][1], strict=True):
+        assert one.stamp == two.stamp and (one.position == two.position).all() and (one.attitude == two.attitude).all()
+    assert took < 20.0
+
+
+def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: socket.socket) -> None:
+    plant, _ = make(fresh)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for data in (packet(0, at_rest()), packet(0, at_rest()), b"?", packet(4, at_rest())):
+            out.sendto(data, incoming.getsockname())
+    fly_in_lock_step(plant, incoming, GracefulExit(), 0.02, duration=0.04)
+    assert plant.time == pytest.approx(0.04)
+    assert "2 commands (3 lost, 1 stale, 1 malformed)" in plant.summary()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"command_port": 9100}, "command_port and pose_port are both 9100"),
+        ({"betaflight": "2026.6", "state_port": 9100, "motor_port": 9100}, "motor_port and pose_port are both 9100"),
+        ({"betaflight": "4.5"}, "one of 2026.6, before"),
+        ({"betaflight": "before", "lock_step": True}, "wall clock"),
+        ({"betaflight": "before", "speed": 2.0}, "wall clock"),
+        ({"lock_step": True, "speed": 2.0}, "no clock to be faster than"),
+    ],
+)
+def test_what_excludes_each_other_is_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_process(ProcessOptions(**options))
+
+
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"failsafe": 0.0}, {"pose_port": 0}, {"command_port": 70000}])
+def test_impossible_numbers_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(options))}=.*must be at least"):
+        check_settings(ProcessOptions(**options))
+
+
+def test_a_port_in_use_is_refused_by_name(incoming: socket.socket) -> None:
+    port = incoming.getsockname()[1]
+    with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
+        open_sockets(ProcessOptions(command_port=port))

@@ -1,0 +1,277 @@
+"""The simulated drone: closed forms, the stand, what differs, and the race's own end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, without_randomisation
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
+from dreamer_racing.plant.vehicle import LIFT_OFF, Mismatch, PlantVehicle
+
+MOTOR_LAG = PRESETS["easy"].motor_time_constant
+SPUN_UP = 5.0 * MOTOR_LAG + 0.02  # s until the stand has let go, with the delay
+START = (4.0, -2.5, 1.35)  # of the circle
+
+
+def armed(thrust: float, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Command:
+    return Command(True, Setpoint(thrust, np.array(rates)))
+
+
+def flying(preset: str = "easy", **differences: float) -> PlantVehicle:
+    """A drone that has just left the stand, carrying its weight."""
+    mismatch = Mismatch(**differences)
+    vehicle = PlantVehicle("circle", preset, mismatch)
+    vehicle.command(armed(GRAVITY * mismatch.mass / mismatch.thrust))
+    vehicle.advance(10 * MOTOR_LAG)
+    assert not vehicle.on_stand
+    return vehicle
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_hover_stays_where_the_stand_was(preset: str) -> None:
+    vehicle = PlantVehicle("circle", preset)
+    vehicle.command(Command(True, hover()))
+    vehicle.advance(4.0)
+    pose = vehicle.pose()
+    assert not vehicle.on_stand and vehicle.crash is CrashCause.NONE
+    assert pose.time == pytest.approx(4.0) and pose.position == pytest.approx(START, abs=0.02)
+    assert pose.attitude == pytest.approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))  # the nose to the gate, along y
+
+
+@pytest.mark.parametrize(
+    ("command", "held"),
+    [
+        (at_rest(), True),
+        (Command(False, hover()), True),
+        (armed(0.98 * LIFT_OFF * GRAVITY), True),
+        (armed(1.02 * LIFT_OFF * GRAVITY), False),
+    ],
+)
+def test_the_stand_holds_until_it_is_armed_and_asked_for_half_of_its_weight(command: Command, held: bool) -> None:
+    vehicle = PlantVehicle("circle", "faithful")
+    vehicle.command(command)
+    vehicle.advance(SPUN_UP - 0.003)
+    assert vehicle.on_stand and vehicle.pose().position == pytest.approx(START)
+    assert vehicle.specific_force == pytest.approx((0.0, 0.0, GRAVITY))
+    vehicle.advance(0.006)
+    assert vehicle.on_stand is held
+
+
+def test_a_moment_of_thrust_is_not_enough_to_leave_the_stand() -> None:
+    vehicle = PlantVehicle("circle")
+    for _ in range(5):
+        vehicle.command(armed(GRAVITY))
+        vehicle.advance(0.1)
+        vehicle.command(armed(0.0))
+        vehicle.advance(0.1)
+    assert vehicle.on_stand
+
+
+@pytest.mark.parametrize("lag", [MOTOR_LAG, 0.001])
+def test_free_fall_after_a_cut(lag: float) -> None:
+    vehicle = flying(motor_lag=lag)
+    before, time = vehicle.pose(), 0.4
+    vehicle.cut()
+    vehicle.advance(time)
+    drop = before.position[2] + before.linear_velocity[2] * time - vehicle.pose().position[2]
+    # thrust ∝ rotor speed² runs down with half of the lag: a = −g (1 − exp(−2t / lag))
+    half = 0.5 * lag
+    run_down = GRAVITY * half * (time - half * (1.0 - math.exp(-time / half)))
+    assert drop == pytest.approx(0.5 * GRAVITY * time**2 - run_down, rel=3e-3)
+    if lag == 0.001:
+        assert drop == pytest.approx(0.5 * GRAVITY * time**2, rel=5e-3)
+    assert not vehicle.armed
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("rate", [1.5, -1.5])
+@pytest.mark.parametrize("thrust", [1.0, 0.8])
+def test_a_body_rate_step_reaches_its_rate(axis: int, rate: float, thrust: float) -> None:
+    vehicle = flying("faithful", thrust=thrust)
+    rates = [0.0, 0.0, 0.0]
+    rates[axis] = rate
+    vehicle.command(armed(GRAVITY / thrust, tuple(rates)))
+    vehicle.advance(0.4)
+    assert vehicle.pose().body_rates == pytest.approx(rates, abs=0.03 * abs(rate))
+
+
+def test_body_rates_are_clipped_to_what_the_flight_controller_is_set_to() -> None:
+    vehicle = flying()
+    vehicle.command(armed(GRAVITY, (0.0, 0.0, 50.0)))
+    vehicle.advance(0.5)
+    assert vehicle.pose().body_rates[2] == pytest.approx(4.0, rel=0.03)
+
+
+@pytest.mark.parametrize(("mass", "thrust"), [(1.0, 1.0), (1.3, 1.0), (1.0, 0.8), (1.2, 0.9)])
+def test_acceleration_goes_with_thrust_and_against_mass(mass: float, thrust: float) -> None:
+    vehicle = flying(mass=mass, thrust=thrust)
+    vehicle.command(armed(14.0))
+    vehicle.advance(0.4)
+    assert vehicle.specific_force == pytest.approx((0.0, 0.0, 14.0 * thrust / mass), rel=1e-3, abs=1e-6)
+    vehicle.command(armed(40.0))
+    vehicle.advance(0.3)
+    assert vehicle.specific_force[2] == pytest.approx(4 * 4.0 * thrust / (0.6 * mass), rel=1e-3)  # four full rotors
+
+
+@pytest.mark.parametrize("drag", [0.0, 1.0, 2.0])
+def test_drag_is_in_proportion_to_speed(drag: float) -> None:
+    vehicle = flying("faithful", drag=drag)
+    vehicle.cut()
+    vehicle.advance(0.35)
+    speed = -vehicle.pose().linear_velocity[2]
+    assert speed > 2.0
+    assert vehicle.specific_force[2] == pytest.approx(drag * 0.42 * speed / 0.6, rel=0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.06])
+def test_rotors_follow_with_their_lag(lag: float) -> None:
+    vehicle = flying(motor_lag=lag)
+    vehicle.advance(0.3)
+    vehicle.command(armed(16.0))
+    vehicle.advance(lag)
+    before, after = math.sqrt(GRAVITY), math.sqrt(16.0)
+    speed = after + (before - after) * math.exp(-1.0)
+    assert vehicle.specific_force[2] == pytest.approx(speed**2, rel=0.02)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.037])
+def test_a_command_acts_after_its_delay(delay: float) -> None:
+    vehicle = flying("faithful", delay=delay, motor_lag=0.001)
+    vehicle.advance(0.2)
+    still = vehicle.specific_force[2]
+    vehicle.command(armed(14.0))
+    steps = 0
+    while abs(vehicle.specific_force[2] - still) < 0.5:
+        vehicle.advance(0.001)
+        steps += 1
+    assert steps == round(delay / 0.001) + 1
+
+
+def test_disarming_is_delayed_like_any_command_and_a_cut_is_not() -> None:
+    vehicle = flying("faithful", delay=0.05)
+    vehicle.command(at_rest())
+    vehicle.advance(0.049)
+    assert vehicle.armed
+    vehicle.command(armed(GRAVITY))
+    vehicle.advance(0.002)
+    assert not vehicle.armed
+    vehicle.advance(0.05)
+    assert vehicle.armed
+    vehicle.command(armed(GRAVITY))
+    vehicle.cut()
+    vehicle.advance(0.1)
+    assert not vehicle.armed  # what was on its way is forgotten
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_it_flies_as_the_simulator_in_which_policies_learn(preset: str) -> None:
+    parameters = without_randomisation(PRESETS[preset])
+    vehicle = PlantVehicle("circle", preset)
+    vehicle.command(Command(True, hover()))
+    vehicle.advance(0.4)
+    before = vehicle.pose()
+    simulator = MujocoSimulator(load_track("circle"), parameters, 1, renderer=None)
+    place = (torch.tensor(values).unsqueeze(0) for values in before[1:4])
+    simulator.reset(torch.tensor([True]), *place)
+    actions = np.random.default_rng(1).uniform(-0.3, 0.3, (40, 4))
+    actions[:, 0] -= 0.1
+    for action in actions:
+        thrust = parameters.collective_thrust_scale * (1.0 + action[0])
+        vehicle.command(armed(thrust, tuple(action[1:] * parameters.body_rate_max)))
+        vehicle.advance(parameters.control_dt)
+        simulator.step(torch.tensor(action).unsqueeze(0))
+    assert vehicle.crash is CrashCause.NONE and np.linalg.norm(vehicle.pose().position - START) > 0.5
+    assert vehicle.pose().position == pytest.approx(simulator.state.position[0].numpy(), abs=2e-3)
+    assert vehicle.pose().attitude == pytest.approx(simulator.state.attitude[0].numpy(), abs=2e-3)
+
+
+@pytest.mark.slow
+def test_the_scripted_pilot_flies_a_lap_on_it() -> None:
+    vehicle = PlantVehicle("circle", "easy", Mismatch(mass=1.05))
+    pilot, own = ScriptedPilot("circle", "easy"), PRESETS["easy"]
+    while not vehicle.lap_times and vehicle.time < 6.0:
+        state = (torch.tensor(values, dtype=torch.float32).unsqueeze(0) for values in vehicle.pose()[1:])
+        action = pilot.act(*state, torch.tensor([vehicle.gates_passed % 4]))[0].double().numpy()
+        thrust = own.collective_thrust_scale * (1.0 + float(action[0]))
+        vehicle.command(armed(thrust, tuple(action[1:] * own.body_rate_max)))
+        vehicle.advance(own.control_dt)
+    assert vehicle.crash is CrashCause.NONE and vehicle.gates_passed == 4
+    assert 2.5 < vehicle.lap_times[0] < 4.0  # the line's own is about 2.7 s
+
+
+def test_a_crash_ends_it_until_it_is_put_back() -> None:
+    vehicle = flying()
+    vehicle.command(armed(20.0))
+    vehicle.advance(2.0)
+    assert vehicle.crash is CrashCause.OUT_OF_BOUNDS and vehicle.fate.startswith("out of bounds at ")
+    vehicle.advance(2.5)
+    assert vehicle.pose().position == pytest.approx((4.0, -2.5, 0.05), abs=1e-6)
+    assert vehicle.pose().linear_velocity == pytest.approx(np.zeros(3))
+    time = vehicle.time
+    vehicle.reset()
+    assert vehicle.on_stand and vehicle.crash is CrashCause.NONE and not vehicle.armed and vehicle.fate == "none"
+    assert vehicle.pose().position == pytest.approx(START) and vehicle.time == time
+    vehicle.command(armed(GRAVITY))
+    vehicle.advance(1.0)
+    assert not vehicle.on_stand and vehicle.pose().position == pytest.approx(START, abs=0.01)
+
+
+def test_falling_because_it_was_disarmed_is_said() -> None:
+    vehicle = flying()
+    vehicle.command(at_rest())
+    vehicle.advance(1.0)
+    assert vehicle.crash is CrashCause.GROUND and vehicle.fate.endswith(", when disarmed")
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_rotors_may_be_commanded_directly(preset: str) -> None:
+    vehicle = PlantVehicle("circle", preset, Mismatch(mass=1.1, thrust=0.9))
+    full = 0.9 * 4.0
+    vehicle.turn_rotors(np.full(4, 0.055))
+    vehicle.advance(1.0)
+    assert vehicle.armed and vehicle.on_stand
+    vehicle.turn_rotors(np.full(4, math.sqrt(1.1 * 0.6 * GRAVITY / 4.0 / full)))  # hover
+    vehicle.advance(1.5)
+    assert not vehicle.on_stand and vehicle.pose().position == pytest.approx(START, abs=0.01)
+    vehicle.turn_rotors(np.full(4, 1.0))
+    vehicle.advance(0.3)
+    speed = vehicle.pose().linear_velocity[2]
+    drag = vehicle.parameters.drag[2] * speed
+    assert vehicle.specific_force[2] == pytest.approx((4 * full - drag) / 0.66, rel=2e-3)
+    vehicle.turn_rotors(np.zeros(4))
+    vehicle.advance(0.001)
+    assert not vehicle.armed
+
+
+@pytest.mark.parametrize(
+    ("stronger", "axis", "sign"),
+    [((2, 3), 0, 1), ((0, 2), 1, 1), ((1, 2), 2, -1)],  # left: rolls right; rear: nose down; front right: yaws right
+)
+def test_rotors_turn_the_body_as_betaflight_means_them_to(stronger: tuple[int, int], axis: int, sign: int) -> None:
+    vehicle = flying()
+    motors = np.full(4, 0.55)
+    motors[list(stronger)] = 0.65
+    vehicle.turn_rotors(motors)
+    vehicle.advance(0.04)
+    rates = vehicle.pose().body_rates
+    assert sign * rates[axis] > 0.05 and abs(rates[axis]) > 20.0 * np.abs(np.delete(rates, axis)).max()
+
+
+def test_parts_of_a_physics_step_add_up() -> None:
+    vehicle = PlantVehicle("circle", "faithful")
+    for _ in range(10_000):
+        vehicle.advance(0.00013)
+    assert vehicle.time == pytest.approx(1.3, abs=1e-9)
+
+
+def test_a_command_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ValueError, match="must be finite"):
+        PlantVehicle("circle").command(armed(math.nan))
