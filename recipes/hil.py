@@ -34,7 +34,7 @@ from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
-from dreamer_racing.hil.pose import PoseSource, UdpPose
+from dreamer_racing.hil.pose_sources import PoseConfig, make_poses
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
@@ -64,9 +64,14 @@ class HilConfig:
     report: str | None = None  # a flight to draw and to sum up
     against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to draw beside it
 
-    pose: str = "udp"  # udp
+    pose: str = "udp"  # udp | mavlink | ros2
     pose_host: str = "127.0.0.1"  # to listen on
     pose_port: int = setting(9100, Range(1, 65535))
+    pose_device: str | None = None  # pose=mavlink: a serial port instead
+    pose_baud: int | None = setting(None, Range(1))  # of it; null: 57600
+    pose_topic: str | None = None  # pose=ros2
+    pose_message: str | None = None  # which kind of message; null: ODOMETRY, or PoseStamped
+    smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities where poses come without
     stamping: Stamping = Stamping.receive  # a pose's time: receive (arrival less latency) | sender (its stamp)
     latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
 
@@ -126,14 +131,11 @@ def check(config: HilConfig) -> None:
         raise ValueError(
             f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
         )
-    if config.pose not in POSES:
-        raise ValueError(f"pose={config.pose}: there are {', '.join(POSES)}.")
     if config.against and not config.report:
         raise ValueError(f"against={config.against} is for report=.")
 
 
 OPERATORS = ("keyboard", "udp", "timed")
-POSES = ("udp",)
 
 
 def fly(config: HilConfig) -> int:
@@ -145,7 +147,7 @@ def fly(config: HilConfig) -> int:
     with ExitStack() as opened:
         opened.callback(chain.close)
         link = opened.enter_context(closing(make_link(link_config(config, contract))))
-        poses = opened.enter_context(closing(make_poses(config)))
+        poses = opened.enter_context(closing(make_poses(pose_config(config))))
         operator = opened.enter_context(closing(make_operator(config)))
         recorder = None
         if config.record:
@@ -215,9 +217,18 @@ def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
     )
 
 
-def make_poses(config: HilConfig) -> PoseSource:
-    """Open where poses come from."""
-    return UdpPose(config.pose_port, config.pose_host)
+def pose_config(config: HilConfig) -> PoseConfig:
+    """Return where poses come from."""
+    return PoseConfig(
+        name=config.pose,
+        host=config.pose_host,
+        port=config.pose_port,
+        device=config.pose_device,
+        baud=config.pose_baud,
+        topic=config.pose_topic,
+        message=config.pose_message,
+        smoothing=config.smoothing,
+    )
 
 
 def make_operator(config: HilConfig) -> OperatorSource:

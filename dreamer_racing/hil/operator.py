@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable
 from typing import IO, Any, NamedTuple, Protocol
 
-from dreamer_racing.hil.pose import bind
+from dreamer_racing.hil.inlet import bind
 
 MAGIC = b"DRO1"
 _BODY = struct.Struct("<4sIBB")

@@ -7,19 +7,17 @@ it. Frames and units are those of `Pose`.
 
 from __future__ import annotations
 
-import socket
 import struct
-import sys
-import time
 import zlib
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from dreamer_racing.hil.inlet import UdpInlet
+
 MAGIC = b"DRP1"
 _BODY = struct.Struct("<4sId13d")
 _CHECK = struct.Struct("<I")
-_RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name
 PACKET_SIZE = _BODY.size + _CHECK.size
 """Bytes of a packet: 124."""
 
@@ -125,57 +123,22 @@ class UdpPose:
         OSError: The port is in use, or may not be used; the message names it.
     """
 
-    _MOST = 1024  # packets taken in at a time: a flood must not stop the loop
-
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self.rejected = 0
-        self._socket = bind(host, port)
-        self.address: tuple[str, int] = self._socket.getsockname()
-        if _RECEIVED_AT is not None:
-            self._socket.setsockopt(socket.SOL_SOCKET, _RECEIVED_AT, 1)
+        self._inlet = UdpInlet(port, host)
+        self.address = self._inlet.address
 
     def poll(self) -> list[Received]:
         """Return what has arrived since the last call, oldest first, without waiting."""
         received = []
-        for _ in range(self._MOST):
-            try:
-                data, ancillary, _, _ = self._socket.recvmsg(PACKET_SIZE + 1, 64)
-            except (BlockingIOError, ConnectionRefusedError):
-                break
+        for time, data in self._inlet.read():
             packet = decode_pose(data)
             if packet is None:
                 self.rejected += 1
             else:
-                received.append(Received(_arrival(ancillary), packet))
+                received.append(Received(time, packet))
         return received
 
     def close(self) -> None:
         """Close the socket."""
-        self._socket.close()
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """Return a UDP socket that listens and never waits.
-
-    Raises:
-        OSError: It cannot; the message names host and port.
-    """
-    listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        listening.bind((host, port))
-    except (OSError, OverflowError) as error:
-        listening.close()
-        raise OSError(f"cannot listen on {host}:{port}: {error}. Is another program using it?") from error
-    listening.setblocking(False)
-    return listening
-
-
-def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Return when the kernel received a packet, by the monotonic clock; now, if it does not say."""
-    now = time.monotonic()
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == _RECEIVED_AT and len(data) >= 16:
-            seconds, nanoseconds = struct.unpack_from("@ll", data)
-            age = time.time() - (seconds + 1e-9 * nanoseconds)
-            return now - min(max(age, 0.0), 1.0)  # a stepped wall clock must not make it older than it can be
-    return now
+        self._inlet.close()

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from dreamer_racing.hil.inlet import bind
 from dreamer_racing.hil.links.udp import UdpTransport
-from dreamer_racing.hil.pose import bind
 from dreamer_racing.plant.betaflight_sitl import DIALECTS, MOTOR_PORT, STATE_PORT, BetaflightSitl
 from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver, Controls
 from dreamer_racing.plant.delivery import Delivery, PoseDelivery

@@ -52,7 +52,7 @@ class SerialTransport:
 
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
-        self._port = _open(device, settings)
+        self._port = open_port(device, settings)
 
     def write(self, data: bytes) -> bool:
         """Write bytes; return whether the buffer took them all.
@@ -79,7 +79,7 @@ class SerialTransport:
         self._port.close()
 
 
-def _open(device: str, settings: SerialSettings) -> Any:
+def open_port(device: str, settings: SerialSettings) -> Any:
     """Return an open port of pyserial; raises as `SerialTransport` does."""
     try:
         import serial

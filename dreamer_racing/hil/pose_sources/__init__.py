@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
+from dreamer_racing.hil.inlet import Inlet, SerialInlet, UdpInlet
 from dreamer_racing.hil.links.serial_port import PROTOCOLS
 from dreamer_racing.hil.pose import PoseSource, UdpPose
 from dreamer_racing.hil.pose_sources import mavlink, ros2
-from dreamer_racing.hil.pose_sources.inlets import Inlet, SerialInlet, UdpInlet
 from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING
 from dreamer_racing.hil.pose_sources.ros2 import Ros2Pose

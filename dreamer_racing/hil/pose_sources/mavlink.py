@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
+from dreamer_racing.hil.inlet import Inlet
 from dreamer_racing.hil.pose import PosePacket, make_packet
-from dreamer_racing.hil.pose_sources.inlets import Inlet
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose, plausible
 from dreamer_racing.hil.stamping import turn
 

@@ -14,8 +14,8 @@ import pytest
 
 mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
 
+from dreamer_racing.hil.inlet import UdpInlet  # noqa: E402
 from dreamer_racing.hil.pose_sources import PoseConfig, make_poses  # noqa: E402
-from dreamer_racing.hil.pose_sources.inlets import UdpInlet  # noqa: E402
 from dreamer_racing.hil.pose_sources.mavlink import MESSAGES, MavlinkPose  # noqa: E402
 from dreamer_racing.hil.stamping import PoseClock, Stamping, rotation_matrix  # noqa: E402
 

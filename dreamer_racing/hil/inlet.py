@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import socket
+import struct
+import sys
 import time
 from collections.abc import Iterator
 from typing import Protocol
 
-from dreamer_racing.hil.links.serial_port import SerialSettings, _open
-from dreamer_racing.hil.pose import _RECEIVED_AT, _arrival, bind
+from dreamer_racing.hil.links.serial_port import SerialSettings, open_port
+
+RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name
 
 
 class Inlet(Protocol):
@@ -48,14 +51,14 @@ class UdpInlet:
     """
 
     whole = True
-    _MOST = 128  # datagrams taken in at a time: a flood must not stop the loop
+    _MOST = 1024  # datagrams taken in at a time: a flood must not stop the loop
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self._socket = bind(host, port)
         self.address: tuple[str, int] = self._socket.getsockname()
-        if _RECEIVED_AT is not None:
-            self._socket.setsockopt(socket.SOL_SOCKET, _RECEIVED_AT, 1)
+        if RECEIVED_AT is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, RECEIVED_AT, 1)
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield datagrams."""
@@ -64,7 +67,7 @@ class UdpInlet:
                 data, ancillary, _, _ = self._socket.recvmsg(self._SIZE, 64)
             except (BlockingIOError, ConnectionRefusedError):
                 return
-            yield _arrival(ancillary), data
+            yield arrival(ancillary), data
 
     def close(self) -> None:
         """Close the socket."""
@@ -88,7 +91,7 @@ class SerialInlet:
 
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
-        self._port = _open(device, settings)
+        self._port = open_port(device, settings)
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the bytes in the buffer, if there are any."""
@@ -102,3 +105,30 @@ class SerialInlet:
     def close(self) -> None:
         """Close the port."""
         self._port.close()
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Return a UDP socket that listens and never waits.
+
+    Raises:
+        OSError: It cannot; the message names host and port.
+    """
+    listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        listening.bind((host, port))
+    except (OSError, OverflowError) as error:
+        listening.close()
+        raise OSError(f"cannot listen on {host}:{port}: {error}. Is another program using it?") from error
+    listening.setblocking(False)
+    return listening
+
+
+def arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """Return when the kernel received a packet, by the monotonic clock; now, if it does not say."""
+    now = time.monotonic()
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == RECEIVED_AT and len(data) >= 16:
+            seconds, nanoseconds = struct.unpack_from("@ll", data)
+            age = time.time() - (seconds + 1e-9 * nanoseconds)
+            return now - min(max(age, 0.0), 1.0)  # a stepped wall clock must not make it older than it can be
+    return now

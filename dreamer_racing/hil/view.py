@@ -1,0 +1,360 @@
+"""A page on which people see what the actor sees while it flies: image, state, target gate, speed.
+
+`LiveView.show` is for `FlightLoop`'s ``watch``. It copies a frame into memory that a process of its own reads, and
+waits for nobody; that process serves the page, at the lowest priority, and is this file run as a script:
+
+| path | what |
+|---|---|
+| ``/`` | the page |
+| ``/stream`` | the images as they come, enlarged (MJPEG) |
+| ``/image.jpg`` | the newest one |
+| ``/state`` | the newest numbers (JSON) |
+
+A frame in memory, little endian: CRC-32 u32 of all that follows, bytes of numbers u32, bytes of image u32, numbers
+(JSON), image (uint8 RGB). One that is read while it is written has a wrong CRC and is read again.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import logging
+import math
+import mmap
+import os
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zlib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the process that serves needs none of it
+    from dreamer_racing.hil.chain import Outputs
+
+logger = logging.getLogger(__name__)
+
+PORT = 9103
+ROOM = 1 << 22
+"""Bytes of a frame at most [choice]: images of up to a thousand pixels in square."""
+SHOWN_WIDTH = 512
+"""Pixels to which images are enlarged, by a whole factor [choice]."""
+STREAM_RATE = 30.0
+"""Hz of images at most [choice]."""
+SILENCE = 1.0
+"""s without a tick after which the page says so [choice]."""
+
+_CHECK, _SIZES = struct.Struct("<I"), struct.Struct("<II")
+_HEAD = _CHECK.size + _SIZES.size
+_BOUNDARY = "frame"
+_START_WITHIN = 20.0  # s
+
+
+class LiveView:
+    """Serves the page for as long as it is open.
+
+    Args:
+        port: Of the page; 0 for a free one.
+        host: Address to listen on; other machines see the page only if this says so.
+
+    Attributes:
+        address: Of the page, as a browser takes it.
+        too_large: Images so far that had no room in a frame, and were left out.
+
+    Raises:
+        OSError: The port is in use, or the page cannot be served; the message says which.
+
+    Example:
+        >>> view = LiveView(port=0)
+        >>> view.address.startswith("http://127.0.0.1:")
+        True
+        >>> view.close()
+    """
+
+    def __init__(self, port: int = PORT, host: str = "127.0.0.1") -> None:
+        self.too_large = 0
+        self._shown = 0
+        listening = _listen(host, port)
+        descriptor = _memory_file()
+        try:
+            self.address = f"http://{host}:{listening.getsockname()[1]}/"
+            self._memory = mmap.mmap(descriptor, ROOM)
+            self._memory[:] = bytes(ROOM)  # touched now, so that no page is missing in flight
+            self._server = _start_server(descriptor, listening)
+        finally:
+            listening.close()
+            os.close(descriptor)
+        if not host.startswith("127."):
+            logger.warning("view: %s listens on %s: everyone who reaches that address sees the flight", PORT, host)
+
+    def show(self, outputs: Outputs) -> None:
+        """Show what came of a tick, without waiting."""
+        if self._memory.closed:
+            return
+        image = outputs.image
+        pixels = b"" if image is None else image.tobytes()
+        numbers = json.dumps(self._numbers(outputs)).encode()
+        if _HEAD + len(numbers) + len(pixels) > ROOM:
+            self.too_large += 1
+            pixels = b""
+        body = b"".join((_SIZES.pack(len(numbers), len(pixels)), numbers, pixels))
+        self._memory[: _CHECK.size + len(body)] = _CHECK.pack(zlib.crc32(body)) + body
+
+    def _numbers(self, outputs: Outputs) -> dict[str, Any]:
+        verdict, pose, image = outputs.verdict, outputs.pose, outputs.image
+        self._shown += 1
+        return {
+            "tick": self._shown,
+            "time": time.monotonic(),
+            "state": verdict.state.value,
+            "armed": verdict.command.armed,
+            "words": list(verdict.words),
+            "target_gate": outputs.target_gate + 1,
+            "passes": outputs.passes,
+            "speed": None if pose is None else math.hypot(*pose.linear_velocity.tolist()),
+            "position": None if pose is None else pose.position.tolist(),
+            "render_ms": 1e3 * outputs.render_s,
+            "act_ms": 1e3 * outputs.act_s,
+            "shape": None if image is None else list(image.shape),
+        }
+
+    def close(self) -> None:
+        """End the page; may be called twice."""
+        if self._memory.closed:
+            return
+        self._memory.close()
+        assert self._server.stdin is not None and self._server.stdout is not None
+        self._server.stdin.close()  # what it waits for
+        try:
+            self._server.wait(timeout=2.0)
+        except subprocess.TimeoutExpired:
+            self._server.kill()
+            self._server.wait()
+        self._server.stdout.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a socket to which browsers can connect."""
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a page of a moment ago is no other program
+    try:
+        listening.bind((host, port))
+        listening.listen(16)
+    except (OSError, OverflowError) as error:
+        listening.close()
+        message = f"the view cannot listen on {host}:{port}: {error}. Is another program, or flight, using it?"
+        raise OSError(message) from error
+    return listening
+
+
+def _memory_file() -> int:
+    """Return the descriptor of a file of `ROOM` bytes that has no name and, where that is possible, no disk."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("dreamer_racing_view")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.truncate(descriptor, ROOM)
+    return descriptor
+
+
+def _start_server(memory: int, listening: socket.socket) -> subprocess.Popen[bytes]:
+    """Start the process that serves, and wait until it does.
+
+    Raises:
+        OSError: It does not.
+    """
+    shared = (memory, listening.fileno())
+    # By its path, so that it imports nothing of the flight; -P, because modules beside this file have names of others.
+    command = [sys.executable, "-P", os.path.abspath(__file__), *map(str, shared)]
+    # In a session of its own: Ctrl-C in the terminal is for the flight.
+    server = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=shared, start_new_session=True
+    )
+    assert server.stdin is not None and server.stdout is not None
+    patience = threading.Timer(_START_WITHIN, server.kill)
+    patience.start()
+    ready = server.stdout.readline()
+    patience.cancel()
+    if not ready:
+        server.stdin.close()
+        server.stdout.close()
+        raise OSError(f"the view's process did not start: it ended with status {server.wait()}; see above.")
+    return server
+
+
+# --- in the process that serves ---
+
+
+class Frame:
+    """A frame that was read: its numbers, and its pixels as they are in memory."""
+
+    def __init__(self, body: bytes) -> None:
+        length, _ = _SIZES.unpack_from(body)
+        self.numbers: dict[str, Any] = json.loads(body[_SIZES.size : _SIZES.size + length])
+        self.pixels = body[_SIZES.size + length :]
+
+
+def read_frame(memory: mmap.mmap, tries: int = 20) -> Frame | None:
+    """Return the newest frame; None if there is none yet, or each try met one being written."""
+    for _ in range(tries):
+        numbers, pixels = _SIZES.unpack_from(memory, _CHECK.size)
+        end = _HEAD + numbers + pixels
+        if numbers and end <= len(memory):
+            body = memory[_CHECK.size : end]
+            if _CHECK.unpack_from(memory)[0] == zlib.crc32(body):
+                return Frame(body)
+        elif not numbers:
+            return None
+        time.sleep(0.0005)
+    return None
+
+
+def enlarged(frame: Frame) -> bytes:
+    """Return the image as JPEG, each pixel a square; grey where there is none."""
+    from PIL import Image
+
+    shape = frame.numbers["shape"]
+    if shape is None or not frame.pixels:
+        image, factor = Image.new("RGB", (64, 64), (128, 128, 128)), SHOWN_WIDTH // 64
+    else:
+        height, width, _ = shape
+        image, factor = Image.frombytes("RGB", (width, height), frame.pixels), max(SHOWN_WIDTH // width, 1)
+    file = io.BytesIO()
+    size = image.width * factor, image.height * factor
+    image.resize(size, Image.Resampling.NEAREST).save(file, "JPEG", quality=90)
+    return file.getvalue()
+
+
+def described(frame: Frame | None) -> str:
+    """Return the numbers for people, a line each."""
+    if frame is None:
+        return "no tick yet"
+    numbers = frame.numbers
+    silent = time.monotonic() - numbers["time"]
+    speed = "no pose" if numbers["speed"] is None else f"{numbers['speed']:.1f} m/s"
+    position = ", ".join(f"{value:.2f}" for value in numbers["position"] or ()) or "unknown"
+    lines = [
+        f"NO TICK FOR {silent:.0f} s" if silent > SILENCE else f"tick {numbers['tick']}",
+        f"state     {numbers['state']}{', armed' if numbers['armed'] else ''}",
+        f"gate      {numbers['target_gate']} comes next, {numbers['passes']} passed",
+        f"speed     {speed}",
+        f"position  {position} m",
+        f"took      {numbers['render_ms']:.1f} ms to draw, {numbers['act_ms']:.1f} ms to choose",
+        *("image     none: the flyer has no camera" for _ in range(numbers["shape"] is None)),
+        *numbers["words"],
+    ]
+    return "\n".join(lines)
+
+
+_PAGE = """<!doctype html>
+<meta charset="utf-8">
+<title>flight</title>
+<style>
+body {{ background: #212529; color: #f8f9fa; font: 16px monospace; display: flex; gap: 2em; margin: 2em; }}
+img {{ image-rendering: pixelated; }}
+</style>
+<img src="stream" width="{width}" alt="what the actor sees">
+<pre id="state">{text}</pre>
+<script>
+const state = document.getElementById("state");
+async function look() {{
+  try {{ state.textContent = (await (await fetch("state")).json()).text; }}
+  catch (error) {{ state.textContent = "the flight is over"; }}
+  setTimeout(look, 100);
+}}
+look();
+</script>
+"""
+
+
+class _Page(BaseHTTPRequestHandler):
+    """Answers browsers."""
+
+    memory: mmap.mmap
+    timeout = 5.0  # s that a browser may take
+
+    def do_GET(self) -> None:
+        """Answer."""
+        answer = {"/": self._page, "/state": self._state, "/image.jpg": self._image, "/stream": self._stream}
+        try:
+            answer.get(self.path.partition("?")[0], self._nothing)()
+        except (ConnectionError, TimeoutError):
+            self.close_connection = True  # the browser has gone
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing: the terminal is the flight's."""
+
+    def _page(self) -> None:
+        text = _PAGE.format(width=SHOWN_WIDTH, text=html.escape(described(read_frame(self.memory))))
+        self._send("text/html; charset=utf-8", text.encode())
+
+    def _state(self) -> None:
+        frame = read_frame(self.memory)
+        numbers = {} if frame is None else frame.numbers
+        self._send("application/json", json.dumps({**numbers, "text": described(frame)}).encode())
+
+    def _image(self) -> None:
+        frame = read_frame(self.memory)
+        if frame is None:
+            self._nothing()
+        else:
+            self._send("image/jpeg", enlarged(frame))
+
+    def _nothing(self) -> None:
+        self.send_error(404)
+
+    def _stream(self) -> None:
+        """Send each image that is new, for as long as the browser takes them."""
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        sent = None
+        while True:
+            frame = read_frame(self.memory)
+            if frame is not None and frame.numbers["tick"] != sent:
+                sent = frame.numbers["tick"]
+                data = enlarged(frame)
+                head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                self.wfile.write(head.encode() + data + b"\r\n")
+            time.sleep(1.0 / STREAM_RATE)
+
+    def _send(self, kind: str, data: bytes) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def serve(memory: int, listening: int) -> None:
+    """Serve the page until standard input ends, which it does with the flight's process, however that ends.
+
+    Args:
+        memory: Descriptor of the frame's file.
+        listening: Of the socket.
+    """
+    import PIL.Image  # noqa: F401  # what is missing is to be missed now
+
+    os.nice(19)
+    _Page.memory = mmap.mmap(memory, ROOM, access=mmap.ACCESS_READ)
+    server = ThreadingHTTPServer(("", 0), _Page, bind_and_activate=False)
+    server.socket.close()
+    server.socket = socket.socket(fileno=listening)
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True).start()
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    sys.stdin.buffer.read()
+    server.shutdown()
+    server.server_close()
+
+
+if __name__ == "__main__":
+    serve(int(sys.argv[1]), int(sys.argv[2]))
