@@ -32,9 +32,9 @@ from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import turn
 from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.simulator.scene import build_drone
+from dreamer_racing.envs.tracks import PLAIN_TRACKS
 from dreamer_racing.envs.worlds import RaceWorlds
 
-TRACKS = ("circle", "kidney", "figure8", "split_s")
 SECONDS, WARM_UP = 2.0, 3.0  # s of racing replayed, and flown before, so that it is at racing speed
 HOLD = 0.002  # s
 EASY = PRESETS["easy"]
@@ -101,7 +101,7 @@ class Recording:
 
 def record() -> Recording:
     """Fly each track for a while and record the last two seconds."""
-    rows = [_record_one(track) for track in TRACKS]
+    rows = [_record_one(track) for track in PLAIN_TRACKS]
     qpos, qvel, rotor_speed, actions = zip(*rows, strict=True)
     return Recording(torch.cat(qpos), torch.cat(qvel), torch.cat(rotor_speed), torch.cat(actions, dim=1))
 
@@ -130,7 +130,7 @@ def _record_one(track: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -> tuple[Tensor, Tensor]:
     """Replay the actions; return positions (T·10, N, 3) every `HOLD`, and the wrenches (T·10, N, 6) applied then."""
-    drones = Drones(variant, integrator, step, len(TRACKS))
+    drones = Drones(variant, integrator, step, len(PLAIN_TRACKS))
     drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
     drones.quadrotor.rotor_speed.copy_(recording.rotor_speed)
     every = round(HOLD / step)
@@ -148,7 +148,7 @@ def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -
 
 def fly_wrenches(recording: Recording, wrenches: Tensor, variant: str, integrator: str, step: float) -> Tensor:
     """Apply wrenches (T·10, N, 6), each for `HOLD`; return the positions (T·10, N, 3)."""
-    drones = Drones(variant, integrator, step, len(TRACKS))
+    drones = Drones(variant, integrator, step, len(PLAIN_TRACKS))
     drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
     positions = []
     for wrench in wrenches:
@@ -224,7 +224,7 @@ def main() -> None:
                 "body_us": body_us,
                 "drone_us": drone_us,
                 "env_steps_per_s": 1e6 / (body_us + drone_us) / round(EASY.control_dt / step),
-                **{f"loop_vs_limit_{track}": value for track, value in zip(TRACKS, against_limit, strict=True)},
+                **{f"loop_vs_limit_{track}": value for track, value in zip(PLAIN_TRACKS, against_limit, strict=True)},
             }
         )
     columns = ("variant", "integrator", "step_ms", "wrench", "loop_vs_1ms", "loop_vs_limit")

@@ -6,7 +6,8 @@
 The scripted pilot flies each track in the C engine (`mujoco`); its actions are replayed, open loop, in `mujoco_warp` on
 the device. `mm_1s` and `mm_2s` are the distances after so long. Then both draw the poses of that flight:
 `image_difference` is the mean absolute difference to MuJoCo's OpenGL renderer, of 255, `image_psnr` in dB, and
-`ray_casters` the difference to the same ray caster on CPU. `--images` writes some pairs for a person to look at.
+`ray_casters` the difference to the same ray caster on CPU. `renderer_difference` is that of `--renderer`, a name out of
+`RENDERERS`, to OpenGL. `--images` writes some pairs for a person to look at.
 """
 
 import argparse
@@ -21,41 +22,44 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import load_preset, without_randomisation
 from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator
-from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.simulator.rendering import RENDERERS
+from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
-TRACKS = ("circle", "kidney", "figure8", "split_s")
 SECONDS = 2
 VIEWS = 16  # poses drawn of a flight
-COLUMNS = ("track", "preset", "device", "mm_1s", "mm_2s", "image_difference", "image_psnr", "ray_casters")
+COLUMNS = ("track", "preset", "device", "mm_1s", "mm_2s", "image_difference", "image_psnr", "ray_casters",
+           "renderer_difference")  # fmt: skip
 
 
 def main() -> None:
     """Compare on every track."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="of mujoco_warp")
+    parser.add_argument("--renderer", default="warp", choices=RENDERERS, help="to compare with OpenGL too")
     parser.add_argument("--images", help="PNG of image pairs: above OpenGL, below mujoco_warp")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     records, pairs = [], []
     for preset in ("easy", "faithful"):
-        for track in TRACKS:
-            record, pair = compare(track, preset, arguments.device)
+        for track in PLAIN_TRACKS:
+            record, pair = compare(track, preset, arguments.device, arguments.renderer)
             records.append(record)
             pairs.append(pair)
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
     if arguments.images:
-        sheet = np.concatenate(pairs[: len(TRACKS)], axis=1)
+        sheet = np.concatenate(pairs[: len(PLAIN_TRACKS)], axis=1)
         Path(arguments.images).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(sheet).resize((2 * sheet.shape[1], 2 * sheet.shape[0]), Image.Resampling.NEAREST).save(
             arguments.images
         )
 
 
-def compare(track: str, preset: str, device: str) -> tuple[dict[str, Any], np.ndarray]:
+def compare(track: str, preset: str, device: str, renderer: str) -> tuple[dict[str, Any], np.ndarray]:
     """Return one record, and three pairs of images side by side."""
     parameters = without_randomisation(load_preset(preset))
     worlds = RaceWorlds(track, 1, parameters, evaluation=True, from_pixels=False)
@@ -73,7 +77,7 @@ def compare(track: str, preset: str, device: str) -> tuple[dict[str, Any], np.nd
         other.step(action.to(device))
         errors.append(1000 * (other.state.position.cpu() - state.position).norm().item())
         poses.append((state.position.clone(), state.attitude.clone()))
-    drawn = images(track, parameters, poses[:: len(poses) // VIEWS], device)
+    drawn = images(track, parameters, poses[:: len(poses) // VIEWS], device, renderer)
     worlds.close()
     opengl, cast, on_cpu = (drawn[name].double() for name in ("egl", "mujoco_warp", "warp"))
     psnr = 10 * torch.log10(255**2 / (opengl - cast).square().mean())
@@ -82,21 +86,22 @@ def compare(track: str, preset: str, device: str) -> tuple[dict[str, Any], np.nd
         "mm_1s": errors[len(errors) // SECONDS - 1], "mm_2s": errors[-1],
         "image_difference": (opengl - cast).abs().mean().item(), "image_psnr": psnr.item(),
         "ray_casters": (cast - on_cpu).abs().mean().item(),
+        "renderer": renderer, "renderer_difference": (opengl - drawn[renderer].double()).abs().mean().item(),
     }  # fmt: skip
     chosen = range(0, VIEWS, VIEWS // 3)[:3]
     rows = [np.concatenate([drawn[name][index].numpy() for index in chosen], axis=1) for name in ("egl", "mujoco_warp")]
     return record, np.concatenate(rows)
 
 
-def images(track: str, parameters: Any, poses: list[tuple[Tensor, Tensor]], device: str) -> dict[str, Tensor]:
-    """Draw drones at poses with every renderer."""
+def images(
+    track: str, parameters: Any, poses: list[tuple[Tensor, Tensor]], device: str, renderer: str
+) -> dict[str, Tensor]:
+    """Draw drones at poses with OpenGL, with either ray caster, and with the renderer asked for."""
     position, attitude = (torch.cat(values) for values in zip(*poses, strict=True))
     num, built = len(position), load_track(track)
-    simulators = {
-        "egl": MujocoSimulator(built, parameters, num, renderer="egl"),
-        "warp": MujocoSimulator(built, parameters, num, renderer="warp"),
-        "mujoco_warp": WarpSimulator(built, parameters, num, device=device),
-    }
+    names = dict.fromkeys(("egl", "warp", renderer))
+    simulators: dict[str, Simulator] = {n: MujocoSimulator(built, parameters, num, renderer=n) for n in names}
+    simulators["mujoco_warp"] = WarpSimulator(built, parameters, num, device=device)
     drawn = {}
     for name, simulator in simulators.items():
         everyone = torch.ones(num, dtype=torch.bool, device=simulator.device)

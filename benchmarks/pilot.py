@@ -20,15 +20,15 @@ from measuring import print_table, write_json
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import FlownLaps, ScriptedPilot, fly_laps
 from dreamer_racing.envs.race.racing_line import LineLimits
+from dreamer_racing.envs.tracks import PLAIN_TRACKS
 
-TRACKS = ("circle", "kidney", "figure8", "split_s")
 COLUMNS = ("clean", "line", "lap_first", "lap_mean", "lap_best", "speed_mean", "speed_max", "offset", "view")
 
 
 def main() -> None:
     """Fly every track in every preset."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tracks", nargs="*", default=TRACKS)
+    parser.add_argument("--tracks", nargs="*", default=PLAIN_TRACKS)
     parser.add_argument("--presets", nargs="*", default=("easy", "faithful"))
     parser.add_argument("--speed", type=float, default=LineLimits().speed, help="fraction of the thrust limit")
     parser.add_argument("--num-envs", type=int, default=32, help="runs of a randomised preset")

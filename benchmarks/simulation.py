@@ -45,6 +45,7 @@ from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
+from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
@@ -62,7 +63,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
 NAMES = {
     "none": "none", "egl": "EGL (Mesa, in software)", "osmesa": "OSMesa", "warp": "ray caster, no OpenGL library",
-    "warp_cuda": "physics on CPU, ray caster on CUDA", "cuda": "all on CUDA",
+    HYBRID: "physics on CPU, ray caster on CUDA", "cuda": "all on CUDA",
 }  # fmt: skip
 
 
@@ -72,7 +73,9 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
-    parser.add_argument("--images", nargs="*", help="of none egl osmesa warp warp_cuda cuda; default: the device's")
+    parser.add_argument(
+        "--images", nargs="*", help=f"of {' '.join(('none', *RENDERERS, HYBRID, 'cuda'))}; default: the device's"
+    )
     parser.add_argument("--looks", default="nominal", help="nominal | randomised")
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--num-envs", nargs="*", type=int, help="N to try")
@@ -103,10 +106,10 @@ def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
     """The measurements asked for: a function and its arguments."""
     on_cuda = arguments.device == "cuda"
     actor = arguments.actor or ("size12m" if on_cuda else "cpu_small")
-    for images in arguments.images or (("none", "cuda", "warp_cuda") if on_cuda else ("none", "egl", "osmesa", "warp")):
+    for images in arguments.images or (("none", "cuda", HYBRID) if on_cuda else ("none", *RENDERERS)):
         state, pixels = ((1024, 16384), (64, 512, 4096)) if on_cuda else ((32, 512, 2048), (32, 64, 256))
         for num_envs in arguments.num_envs or (state if images == "none" else pixels):
-            device = "cpu" if images == "warp_cuda" else arguments.device
+            device = "cpu" if images == HYBRID else arguments.device
             settings = {"preset": arguments.preset, "device": device, "looks": arguments.looks}
             yield measure, images, num_envs, arguments.track, settings, actor, arguments.seconds, arguments.image_size
 

@@ -29,7 +29,7 @@ from composing import schema  # noqa: E402
 from dreamer_racing.settings import ALLOWED  # noqa: E402
 from dreamer_racing.training.schedule import Clock  # noqa: E402
 
-COMMON, RECIPES = schema.RunConfig, (schema.DreamerConfig, schema.PPORunConfig, schema.SACRunConfig)
+COMMON, RECIPES = schema.RunConfig, tuple(schema.RECIPES.values())
 OTHERS = (
     schema.ExperimentConfig,
     schema.EvaluateConfig,

@@ -93,8 +93,8 @@ def read_entries(path: Path) -> Iterator[Entry]:
         raise ValueError(f"{path}: {error}.") from error
     for raw in content if isinstance(content, list) else [content]:
         for name in ("title", "files"):
-            if not raw.get(name):
-                raise ValueError(f"{path}: an entry has no {name}.")
+            if not isinstance(raw, dict) or not raw.get(name):
+                raise ValueError(f"{path}: an entry has no {name}. What one looks like: the head of docs/results.py.")
         files = raw["files"] if isinstance(raw["files"], dict) else dict.fromkeys(raw["files"], "")
         for name in files:
             if not (path.parent / name).is_file():

@@ -23,7 +23,7 @@ from composing.building import (
     resolve_common,
     seed_generators,
 )
-from composing.checks import check_dreamer, replay_ratio
+from composing.checks import check_dreamer
 from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, computes_bfloat16
 from composing.launching import launch
@@ -209,7 +209,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     latents = learner.latent_format if config.replay.context else None
     parts = {
         "replay": make_sequence_replay(config, env, curriculum, latents),
-        "ratio": replay_ratio(config),
+        "ratio": config.replay_ratio,
         "lag": ModelLag(config.schedule.wait_for_model),
         "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
     }

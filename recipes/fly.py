@@ -55,7 +55,7 @@ class FlyConfig:
     image_size: int | None = None  # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
     camera_tilt: float | None = None  # degrees upwards; null: 25
     control_rate: float | None = None  # Hz; null: 50
-    renderer: str = "auto"  # auto | egl | osmesa | warp
+    renderer: str = "auto"  # as env.renderer in training, docs/options.md
     viewer: bool = False  # watch in a window instead of writing files
     seed: int = 0
 

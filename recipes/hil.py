@@ -15,7 +15,7 @@ import json
 import math
 import sys
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -46,6 +46,16 @@ PILOT = "pilot"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
 STATISTICS = "statistics.json"
+
+
+LimitsConfig = make_dataclass(
+    "LimitsConfig",
+    [
+        (limit.name, list[float] | None if limit.type == "Vector" else float | None, field(default=None))
+        for limit in fields(SafetyLimits)
+    ],
+)
+"""`SafetyLimits` by their names; null: the default, or what the track says."""
 
 
 @dataclass
@@ -90,7 +100,7 @@ class HilConfig:
     reference_voltage: float | None = setting(None, POSITIVE)  # V
     voltage: float | None = setting(None, POSITIVE)  # V, the battery's now
 
-    limits: dict[str, Any] | None = None  # of safety, by their names: see dreamer_racing/hil/safety.py
+    limits: LimitsConfig = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all: docs/hil.md
     renderer: str = "auto"  # auto | egl | osmesa
     record: bool = True  # write the flight to a file
 
@@ -190,15 +200,18 @@ def pilot_contract(track: str) -> dict[str, Any]:
     """Return what an actor's contract would say of the pilot."""
     drone = QuadrotorParameters()
     channels = [
-        {"name": f"body_rate_{axis}", "scale": rate} for axis, rate in zip("xyz", drone.body_rate_max, strict=True)
+        {"name": f"body_rate_{axis}", "unit": "rad/s", "offset": 0.0, "scale": rate}
+        for axis, rate in zip("xyz", drone.body_rate_max, strict=True)
     ]
-    thrust = {"name": "collective_thrust", "scale": drone.collective_thrust_scale}
+    scale = drone.collective_thrust_scale
+    thrust = {"name": "collective_thrust", "unit": "m/s^2", "offset": scale, "scale": scale}
     return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
 
 
 def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     """Make the chain of a flyer."""
-    limits = SafetyLimits.of_track(track, **(config.limits or {}))
+    given = {name: value for name, value in vars(config.limits).items() if value is not None}
+    limits = SafetyLimits.of_track(track, **given)
     settings = ChainConfig(limits, config.stamping, config.latency, config.laps, config.arm)
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)

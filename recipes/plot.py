@@ -9,7 +9,7 @@ the settings in which they differ. Runs and files that cannot be read are left o
 holds what it shows, and `runs=learning_curves.csv` draws it again.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -74,7 +74,8 @@ def draw(config: PlotConfig) -> None:
         print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
     explicit = config.figure != "all" and (config.flights or config.dreams)
-    columns = {*wanted_columns(config.quantities), *COLUMNS}
+    asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
+    columns = {column for figure in asked for column in figure.columns(config)}
     runs, problems = ([], []) if explicit else read_runs(find_runs(places), columns)
     warn(problems)
     if config.figure == "all":
@@ -124,7 +125,7 @@ def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: li
 
 def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> bool:
     """Make a figure and say what it has left out; return whether there was anything to draw."""
-    files, found = FIGURES[name](config, output, runs, problems)
+    files, found = FIGURES[name].draw(config, output, runs, problems)
     warn([problem for problem in found if problem not in problems])
     print(f"{name + ':':<17} {', '.join(files) or 'none of these runs has stored anything for it'}")
     return bool(files)
@@ -242,11 +243,25 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
     return Drawn(["comparison.md", "comparison.png"], comparison.problems)
 
 
-FIGURES: dict[str, Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]] = {
-    "learning_curves": draw_learning_curves,
-    "imagined": draw_imagined,
-    "trajectories": draw_trajectories,
-    "comparison": draw_comparison,
+def no_columns(config: PlotConfig) -> Iterable[str]:
+    """Of a figure that is drawn from other files."""
+    return ()
+
+
+class Entry(NamedTuple):
+    """How `figure=` makes a figure, and from what of `metrics.csv`."""
+
+    draw: Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]
+    """Of the configuration, the output folder, the runs read, and what of them was left out, a line each."""
+    columns: Callable[[PlotConfig], Iterable[str]]
+    """Those that it looks for in a run's `metrics.columns`; no others are read."""
+
+
+FIGURES = {
+    "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities)),
+    "imagined": Entry(draw_imagined, no_columns),
+    "trajectories": Entry(draw_trajectories, no_columns),
+    "comparison": Entry(draw_comparison, lambda config: COLUMNS),
 }
 
 

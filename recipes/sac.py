@@ -21,7 +21,7 @@ from composing.building import (
     resolve_baseline,
     seed_generators,
 )
-from composing.checks import check, check_replay, replay_ratio
+from composing.checks import check, check_replay
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.schema import SACRunConfig, register
@@ -70,7 +70,7 @@ def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     curriculum = make_curriculum(config)
     replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
     return assemble(
-        SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay, ratio=replay_ratio(config)
+        SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay, ratio=config.replay_ratio
     )
 
 

@@ -10,6 +10,10 @@ from types import ModuleType
 
 import pytest
 
+from dreamer_racing import GYM_ENVIRONMENTS
+from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES
+
 ROOT = Path(__file__).parents[1]
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").glob("*.md")]
 
@@ -54,6 +58,17 @@ def test_comments_and_attributes_are_read(options):
     assert options.of_comments(source) == {"a": "of a", "b": "of b, and more"}
     docstring = "Says.\n\nAttributes:\n    a: Of a,\n        and more.\n    b: Of b.\n\nReference: none."
     assert options.of_attributes(docstring) == {"a": "Of a, and more.", "b": "Of b."}
+
+
+def test_names_that_are_chosen_from_are_all_on_their_pages(options):
+    rows = dict(re.findall(r"^\| `([\w.]+)=` (.*)$", options.PAGE.read_text(encoding="utf-8"), re.M))
+    for name in ("auto", *RENDERERS, HYBRID):
+        assert re.search(rf"\b{name}\b", rows["env.renderer"]), name
+    for registry, setting in ((WORLD_MODEL_LOSSES, "world_model"), (ACTOR_LOSSES, "actor"), (CRITIC_LOSSES, "critic")):
+        for name in registry:
+            assert f"`{name}`" in rows[f"loss.{setting}"], name
+    for name in GYM_ENVIRONMENTS:
+        assert re.search(rf"\b{name}\b", (ROOT / "README.md").read_text(encoding="utf-8")), name
 
 
 def test_the_readme_is_short():

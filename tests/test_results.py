@@ -63,7 +63,8 @@ def test_every_result_is_on_the_page(results):
     }
     own = {"provenance.json", "planned.json"}
     present = {path for path in (ROOT / "results").rglob("*") if path.is_file() and path.name not in own}
-    assert present - listed == set()
+    missing = sorted(str(path.relative_to(ROOT)) for path in present - listed)
+    assert missing == [], "name them in a provenance.json beside them; the head of docs/results.py says how"
 
 
 def test_cells_without_a_result_say_so(results, folder):
@@ -99,7 +100,7 @@ def test_pictures_are_shown_and_numbers_linked(results, folder):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"title": ""}, "an entry has no title"),
+        ({"title": ""}, "an entry has no title. What one looks like: the head of docs/results.py"),
         ({"files": {}}, "an entry has no files"),
         ({"files": ["lost.png"]}, "files names lost.png, which is not there"),
         ({"fills": ["ppo/c"]}, r"fills \['ppo/c'\]: not in planned.json"),

@@ -71,7 +71,7 @@ class RaceWorlds:
         episode_steps: control steps until an episode is truncated; if None those of 20 s, in evaluation of 30 s.
         weights: of the reward, paper Eq. 1.
         from_pixels: whether to have a renderer at all.
-        renderer: `auto`, or on CPU `egl`, `osmesa`, `warp`, or `warp_cuda`: drawn on a CUDA device.
+        renderer: `auto`, or on CPU a name out of `rendering.RENDERERS`, or `warp_cuda`: drawn on a CUDA device.
         camera: the nose camera.
         looks: `nominal`, or `randomised` for another light, colours, camera tilt, lens and noise in every episode, or
             how far each varies.

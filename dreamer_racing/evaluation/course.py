@@ -6,37 +6,23 @@ Shapes: N environments.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.evaluate import Evaluation, evaluate
+from dreamer_racing.learners.learner import Policy
 
 
-class RacingPolicy(Protocol):
-    """What is flown: a module on tensordicts of batch size [N] that writes ``action``."""
-
-    deterministic: bool
-    """Whether it takes modes instead of samples; may be set at any time."""
-
-    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, and what the policy remembers."""
-        ...
-
-    def make_primer(self) -> TensorDictPrimer:
-        """Make the transform that adds what the policy remembers to an environment."""
-        ...
-
-
-def with_memory(env: EnvBase, policy: RacingPolicy) -> TransformedEnv:
+def with_memory(env: EnvBase, policy: Policy) -> TransformedEnv:
     """Give an environment what a policy reads beside observations: where episodes begin, and what it remembers."""
     return TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
 
 
-def act(policy: RacingPolicy, tensordict: TensorDictBase) -> TensorDictBase:
+def act(policy: Policy, tensordict: TensorDictBase) -> TensorDictBase:
     """Act wherever the policy lives, with an environment on the CPU."""
     weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
     return policy(tensordict.to(weight.device)).to("cpu")
@@ -55,7 +41,7 @@ class Course:
         num_envs: N, episodes flown side by side.
     """
 
-    def __init__(self, policy: RacingPolicy, worlds: Mapping[str, Any], num_envs: int) -> None:
+    def __init__(self, policy: Policy, worlds: Mapping[str, Any], num_envs: int) -> None:
         worlds = {"seed": 0, **worlds}
         self.base = DroneRacingEnv(num_envs=num_envs, evaluation=True, **worlds)
         self._policy = policy

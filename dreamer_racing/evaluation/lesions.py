@@ -10,9 +10,9 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TensorDictPrimer
+from torchrl.envs.transforms import Transform
 
-from dreamer_racing.evaluation.protocol import RacingPolicy
+from dreamer_racing.learners.learner import Policy
 
 GREY = 128
 Lesion = Callable[[Tensor, Tensor], Tensor]
@@ -79,7 +79,7 @@ class LesionedPolicy(torch.nn.Module):
         >>> result = fly(LesionedPolicy(policy, Blank()), {"track": "circle"}, episodes=10)
     """
 
-    def __init__(self, policy: RacingPolicy, lesion: Lesion) -> None:
+    def __init__(self, policy: Policy, lesion: Lesion) -> None:
         super().__init__()
         self.policy = policy
         self._lesion = lesion
@@ -93,7 +93,7 @@ class LesionedPolicy(torch.nn.Module):
     def deterministic(self, deterministic: bool) -> None:
         self.policy.deterministic = deterministic
 
-    def make_primer(self) -> TensorDictPrimer:
+    def make_primer(self) -> Transform:
         """Make the policy's own."""
         return self.policy.make_primer()
 

@@ -11,8 +11,9 @@ from typing import Any
 
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
-from dreamer_racing.evaluation.course import Course, RacingPolicy
+from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.evaluate import Evaluation, deal
+from dreamer_racing.learners.learner import Policy
 
 EPISODES = 100
 """The fewest episodes of each condition that the protocol asks for."""
@@ -106,7 +107,7 @@ class Result:
 
 
 def run_protocol(
-    policy: RacingPolicy,
+    policy: Policy,
     worlds: Mapping[str, Any],
     episodes: int = EPISODES,
     *,
@@ -152,7 +153,7 @@ def run_protocol(
 
 
 def fly(
-    policy: RacingPolicy,
+    policy: Policy,
     worlds: Mapping[str, Any],
     episodes: int,
     deterministic: bool = True,

@@ -146,9 +146,9 @@ class ShippedAgent:
             )
         return cls(folder, agent.requires_grad_(False).to(device), about, device)
 
-    def evaluation_policy(self, deterministic: bool = False) -> DreamerPolicy:
+    def evaluation_policy(self) -> DreamerPolicy:
         """Return the acting step, which shares the agent's parameters."""
-        return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
+        return DreamerPolicy(self.agent.world_model, self.agent.actor)
 
 
 def is_agent(folder: str | Path) -> bool:

@@ -42,7 +42,7 @@ OTHER_COLOR = "#74c0fc"  # of a variant that is not the reference
 
 
 def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
-    """Draw a column a track and a row a quantity, a colour an algorithm and a line style a variant.
+    """Draw a column a track and a row a quantity, as the curves come; a colour an algorithm and a line style a variant.
 
     Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named above.
 
@@ -56,7 +56,7 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
         ValueError: an algorithm has more variants than can be told apart.
     """
     tracks = _in_order({curve.key.track for curve in curves.curves} | {key.track for key in curves.raises}, TRACKS)
-    quantities = [name for name in QUANTITIES if any(curve.quantity == name for curve in curves.curves)]
+    quantities = list(dict.fromkeys(curve.quantity for curve in curves.curves))
     keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
     styles = line_styles(keys)
     longest = max(curve.env_steps[-1] for curve in curves.curves)

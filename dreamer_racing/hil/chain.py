@@ -104,6 +104,13 @@ class FlightChain:
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
 
+    def warm_up(self) -> None:
+        """Do once what a tick does, before the first one: libraries take their time then."""
+        level = np.array([1.0, 0.0, 0.0, 0.0])
+        start = np.array(self._config.limits.start_position, float)
+        self._choose(Pose(0.0, start, level, np.zeros(3), np.zeros(3)))
+        self._flyer.reset()
+
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
         if not self._flying:  # as long as the vehicle stands still, each tick is the first of the flight

@@ -141,6 +141,7 @@ class FlightLoop:
         """
         with self._answering_signals(), _without_garbage_collection():
             try:
+                self._chain.warm_up()
                 return self._run(duration)
             finally:
                 self._say_farewell()

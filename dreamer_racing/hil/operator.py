@@ -153,17 +153,20 @@ class TimedOperator:
     """Enables by itself after a while: for a vehicle that is simulated, never for a real one.
 
     Args:
-        delay: s before it enables.
+        delay: s from the first time it is asked until it enables.
         clock: s; for tests.
     """
 
     def __init__(self, delay: float = 0.5, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._from = clock() + delay
+        self._delay, self._clock = delay, clock
+        self._from: float | None = None
 
     def poll(self) -> Operator:
         """Return what is wanted now."""
-        return Operator(self._clock() >= self._from, False)
+        now = self._clock()
+        if self._from is None:
+            self._from = now + self._delay
+        return Operator(now >= self._from, False)
 
     def close(self) -> None:
         """Do nothing."""

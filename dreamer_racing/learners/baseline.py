@@ -45,9 +45,9 @@ class BaselineLearner(ABC):
         """Return the acting step, which shares this learner's parameters."""
         return BaselinePolicy(self.actor, deterministic)
 
-    def evaluation_policy(self, deterministic: bool = False) -> BaselinePolicy:
+    def evaluation_policy(self) -> BaselinePolicy:
         """Return the acting step to evaluate: the one that is trained."""
-        return self.policy(deterministic)
+        return self.policy()
 
     def check_finite(self) -> None:
         """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""

@@ -244,10 +244,8 @@ class DreamerLearner:
         self,
         *,
         rates: float | None = None,
-        discount: float | None = None,
-        entropy_scale: float | None = None,
         min_std: float | None = None,
-        noise_correlation: float | None = None,
+        **numbers: float,
     ) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named stays.
 
@@ -255,20 +253,19 @@ class DreamerLearner:
 
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
-            discount: γ.
-            entropy_scale: Weight of the actor's entropy.
-            min_std: Smallest standard deviation of actions.
-            noise_correlation: ρ of the noise of imagined actions.
+            min_std: Smallest standard deviation of actions, of the networks' own.
+            numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
+
+        Raises:
+            TypeError: If `LossConfig` has no number of such a name.
         """
+        if unknown := numbers.keys() - {field.name for field in fields(LossConfig)}:
+            raise TypeError(f"adjust({', '.join(sorted(unknown))}=...): LossConfig has no such number.")
         if rates is not None:
             for group, rate in zip(self._groups, self._rates, strict=True):
                 group["lr"] = rate * rates
-        if discount is not None:
-            self._set_in_losses("discount", discount)
-        if entropy_scale is not None:
-            self._set_in_losses("entropy_scale", entropy_scale)
-        if noise_correlation is not None:
-            self._set_in_losses("noise_correlation", noise_correlation)
+        for name, value in numbers.items():
+            self._set_in_losses(name, value)
         if min_std is not None:
             self.agent.actor.min_std.fill_(min_std)
             self.flying_agent.actor.min_std.fill_(min_std)
@@ -341,9 +338,9 @@ class DreamerLearner:
         """Return the acting step of the networks that are trained, which shares their parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor, deterministic)
 
-    def evaluation_policy(self, deterministic: bool = False) -> DreamerPolicy:
+    def evaluation_policy(self) -> DreamerPolicy:
         """Return the acting step of `flying_agent`, which shares its parameters."""
-        return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor, deterministic)
+        return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
 
     @property
     def latent_format(self) -> LatentFormat:

@@ -1,4 +1,4 @@
-"""What every learner offers, and every policy that can be flown."""
+"""What every learner offers, and every policy that is flown."""
 
 from __future__ import annotations
 
@@ -7,28 +7,58 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Protocol
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.transforms import Transform
 
 Timer = Callable[[str], AbstractContextManager]
 """Context manager by the name of an activity, as ``RunClock.timed``."""
 
 
+class Policy(Protocol):
+    """The acting step: a module on tensordicts of batch size [N] that writes ``action``, as `BaselinePolicy` is."""
+
+    deterministic: bool
+    """Whether it takes modes instead of samples; may be set at any time, and evaluations do."""
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, and what the policy remembers."""
+        ...
+
+    def make_primer(self) -> Transform:
+        """Make the transform that adds what the policy remembers to an environment; an empty ``Compose`` if nothing."""
+        ...
+
+
 class Flyer(Protocol):
-    """What can be evaluated: every learner, and a `ShippedAgent`."""
+    """What can be evaluated: every learner, and a `ShippedAgent`.
+
+    Attributes:
+        device: Where it acts, and learns if it does.
+    """
 
     device: torch.device
 
-    def evaluation_policy(self, deterministic: bool = False) -> Any:
+    def evaluation_policy(self) -> Policy:
         """Return the acting step to evaluate, which may be one of averaged weights."""
         ...
 
 
 class Learner(Flyer, Protocol):
-    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do."""
+    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do.
+
+    Attributes:
+        updates: Those made so far.
+    """
 
     updates: int
 
-    def policy(self, deterministic: bool = False) -> Any:
+    def policy(self) -> Policy:
         """Return the acting step that is trained, which shares the learner's parameters."""
+        ...
+
+    def update(self, batch: TensorDictBase, /, timed: Timer = ...) -> dict[str, Tensor]:
+        """Learn from replayed records or a rollout; return losses and metrics, scalar tensors by their names."""
         ...
 
     def check_finite(self) -> None:

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -25,6 +25,7 @@ from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.signals import GracefulExit
 
 
@@ -38,26 +39,6 @@ class Report(Protocol):
     def close(self) -> None:
         """Free simulators."""
         ...
-
-
-class ReplayRatio(NamedTuple):
-    """How much a learner with a replay trains: so many records on per environment step made since the prefill.
-
-    Args:
-        ratio: records trained on per environment step.
-        records: that an update trains on.
-        prefill: env_steps collected before the first update.
-        setting: name of the ratio in the configuration.
-    """
-
-    ratio: float
-    records: int
-    prefill: int
-    setting: str
-
-    def updates(self, env_steps: int) -> int:
-        """Updates in a run of so many env_steps."""
-        return max(0, int((env_steps - self.prefill) * self.ratio / self.records))
 
 
 @dataclass
@@ -81,7 +62,7 @@ class Run:
     lock: RunLock
     evaluated: int = field(default=-1, init=False)  # updates at the last evaluation
 
-    remedy: ClassVar[str]  # the setting to lower once a loss is not finite
+    remedy: ClassVar[str] = "learning rate"  # what to lower once a loss is not finite, e.g. "ppo.learning_rate"
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Make the updates that are due after a rollout; after none, those that an interrupted run still owes."""

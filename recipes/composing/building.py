@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 
@@ -18,12 +17,12 @@ from composing.arena import Environment, crash_causes, make_report, reward_terms
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
-from composing.schema import DreamerConfig, RunConfig, SACRunConfig, Storage, is_race
+from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
-from dreamer_racing.learners.learner import Learner
+from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
@@ -102,7 +101,7 @@ def make_curriculum(config: RunConfig) -> BodyRateCurriculum | None:
     return BodyRateCurriculum(**settings)
 
 
-def make_collector(config: RunConfig, env: Environment, policy: TensorDictModuleBase) -> Collector:
+def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:
     """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device."""
     return Collector(
         TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
@@ -118,7 +117,7 @@ def make_collector(config: RunConfig, env: Environment, policy: TensorDictModule
 
 
 def make_run_replay(
-    config: DreamerConfig | SACRunConfig,
+    config: ReplayRunConfig,
     env: Environment,
     curriculum: BodyRateCurriculum | None,
     batch_size: int,

@@ -10,7 +10,16 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from composing.schema import RECIPES, Collection, DreamerConfig, ExperimentConfig, RunConfig, SACRunConfig, is_race
+from composing.schema import (
+    LOSS_RAMPS,
+    RECIPES,
+    Collection,
+    DreamerConfig,
+    ExperimentConfig,
+    ReplayRunConfig,
+    RunConfig,
+    is_race,
+)
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
@@ -21,7 +30,6 @@ from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.run import ReplayRatio
 from dreamer_racing.training.schedule import Clock
 
 RACE_ONLY = {
@@ -70,14 +78,6 @@ def refuse_to_replace(config: RunConfig) -> None:
     )
 
 
-def replay_ratio(config: DreamerConfig | SACRunConfig) -> ReplayRatio:
-    """How much a run with a replay trains."""
-    if isinstance(config, SACRunConfig):
-        return ReplayRatio(config.sac.replay_ratio, config.sac.batch_size, config.prefill, "sac.replay_ratio")
-    model = config.model
-    return ReplayRatio(model.replay_ratio, model.batch_size * model.batch_length, config.prefill, "model.replay_ratio")
-
-
 def check(config: RunConfig) -> None:
     """Refuse settings that no recipe could run with.
 
@@ -120,7 +120,7 @@ def check_race(config: RunConfig) -> None:
             raise ValueError(f"{group}.{error}") from error
 
 
-def check_replay(config: DreamerConfig | SACRunConfig) -> None:
+def check_replay(config: ReplayRunConfig) -> None:
     """Refuse settings with which there would be no update.
 
     Raises:
@@ -131,7 +131,7 @@ def check_replay(config: DreamerConfig | SACRunConfig) -> None:
             f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
             "first update: raise the one, or lower the other."
         )
-    replay = replay_ratio(config)
+    replay = config.replay_ratio
     if not replay.updates(config.total_env_steps):
         raise ValueError(
             f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
@@ -203,10 +203,9 @@ def check_schedule(config: DreamerConfig) -> None:
     Raises:
         ValueError: the message names the ramp.
     """
-    of_losses = ("discount", "entropy_scale", "min_std", "noise_correlation")
     targets = {
         "learning_rates": POSITIVE,
-        **{name: allowed_values(config.loss, name) for name in of_losses},
+        **{name: allowed_values(config.loss, name) for name in LOSS_RAMPS},
         "start_on_line": allowed_values(config.env, "start_on_line"),
     }
     for name, allowed in targets.items():

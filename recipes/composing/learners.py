@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from composing.schema import DreamerConfig, PPORunConfig, RunConfig, SACRunConfig
+from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.learners.learner import Learner
@@ -22,14 +22,8 @@ def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dic
 def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, float]:
     """Arguments of `DreamerLearner.adjust` at what the clocks say."""
     schedule, loss = config.schedule, config.loss
-    now = {
-        "rates": (schedule.learning_rates, 1.0),
-        "discount": (schedule.discount, loss.discount),
-        "entropy_scale": (schedule.entropy_scale, loss.entropy_scale),
-        "min_std": (schedule.min_std, loss.min_std),
-        "noise_correlation": (schedule.noise_correlation, loss.noise_correlation),
-    }
-    return {name: ramp.at(value, times) for name, (ramp, value) in now.items()}
+    of_losses = {name: getattr(schedule, name).at(getattr(loss, name), times) for name in LOSS_RAMPS}
+    return {"rates": schedule.learning_rates.at(1.0, times), **of_losses}
 
 
 def size_of(config: DreamerConfig) -> ModelSize:
@@ -56,8 +50,13 @@ def make_learner(config: RunConfig, interface: Interface, device: torch.device |
             device=device,
             seed=config.seed,
         )
-    assert isinstance(config, (PPORunConfig, SACRunConfig))
-    size = NetworkSize(config.network.layers, config.network.units)
+    if isinstance(config, PPORunConfig):
+        return PPOLearner(network_size(config.network), interface, config.ppo, device, config.seed)
     if isinstance(config, SACRunConfig):
-        return SACLearner(size, interface, config.sac, device, config.seed)
-    return PPOLearner(size, interface, config.ppo, device, config.seed)
+        return SACLearner(network_size(config.network), interface, config.sac, device, config.seed)
+    raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
+
+
+def network_size(config: NetworkConfig) -> NetworkSize:
+    """The hidden layers of a resolved configuration."""
+    return NetworkSize(config.layers, config.units)

@@ -1,6 +1,6 @@
 """Typed configuration of the recipes: hydra refuses a value of the wrong type, naming the field."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Any
 
@@ -12,6 +12,7 @@ from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.dreamer import LearnerConfig
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, setting
+from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import Ramp
 
 SUITES = ("race", "dmc")
@@ -126,7 +127,10 @@ class CheckpointConfig:
 
 @dataclass
 class ScheduleConfig:
-    """Settings that move over a run, each from its own value `to` another, by its length or by the gates passed."""
+    """Settings that move over a run, each from its own value `to` another, by its length or by the gates passed.
+
+    A ramp that has the name of a number of `LossConfig` moves that one.
+    """
 
     learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
@@ -137,6 +141,10 @@ class ScheduleConfig:
     # loss.actor=ppo: the actor waits while the held-out error is above so many times the training error; null: never
     wait_for_model: float | None = None
     wait_every: int = setting(5_000, COUNT)  # env_steps between two looks at those errors
+
+
+LOSS_RAMPS = tuple(sorted({ramp.name for ramp in fields(ScheduleConfig)} & {loss.name for loss in fields(LossConfig)}))
+"""What of `ScheduleConfig` moves a number of the losses."""
 
 
 class Collection(Enum):
@@ -169,18 +177,38 @@ class RunConfig:
 
 
 @dataclass
-class DreamerConfig(RunConfig):
+class ReplayRunConfig(RunConfig):
+    """What training recipes with a replay have in common besides."""
+
+    prefill: int = setting(MISSING, NOT_NEGATIVE)  # env_steps collected before the first update
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+    @property
+    def replay_ratio(self) -> ReplayRatio:
+        """How much the run trains."""
+        raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
+
+
+@dataclass
+class DreamerConfig(ReplayRunConfig):
     """`recipes/dreamer_v3.py`."""
 
     algorithm: str = "dreamer_v3"
     tuned: str = "auto"  # none: DreamerV3 as published | race: what races on a CPU | auto chooses, and says so
-    prefill: int = setting(4_000, NOT_NEGATIVE)  # env_steps collected before the first update
+    prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+    @property
+    def replay_ratio(self) -> ReplayRatio:
+        """How much the run trains."""
+        model = self.model
+        records = model.batch_size * model.batch_length
+        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio")
 
 
 @dataclass
@@ -203,21 +231,25 @@ class PPORunConfig(RunConfig):
 
 
 @dataclass
-class SACRunConfig(RunConfig):
+class SACRunConfig(ReplayRunConfig):
     """`recipes/sac.py`."""
 
     algorithm: str = "sac"
-    prefill: int = setting(10_000, NOT_NEGATIVE)  # env_steps collected before the first update
+    prefill: int = setting(10_000, NOT_NEGATIVE)
     rollout_steps: int = setting(1, COUNT)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     sac: SACConfig = field(default_factory=SACConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+    @property
+    def replay_ratio(self) -> ReplayRatio:
+        """How much the run trains."""
+        return ReplayRatio(self.sac.replay_ratio, self.sac.batch_size, self.prefill, "sac.replay_ratio")
 
 
 RECIPES: dict[str, type[RunConfig]] = {
     schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)
 }
-"""The training recipes by algorithm."""
+"""The training recipes by algorithm, which is the name of its file in recipes/ and in recipes/config/."""
 
 
 @dataclass
@@ -228,7 +260,7 @@ class ExperimentConfig(RunConfig):
     """
 
     name: str = MISSING  # of the experiment
-    algorithm: str = "dreamer_v3"  # dreamer_v3 | ppo | sac
+    algorithm: str = "dreamer_v3"  # of a training recipe: its file's name
     variant: str = "default"  # one of the following
     variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the algorithm's recipe by name
     overrides: list[str] = field(default_factory=list)  # of every run, e.g. "overrides=['loss.entropy_scale=1e-4']"
@@ -325,9 +357,8 @@ def is_race(config: RunConfig) -> bool:
 def register() -> None:
     """Make the schemas known to hydra."""
     store = ConfigStore.instance()
-    store.store(name="dreamer_v3_schema", node=DreamerConfig)
-    store.store(name="ppo_schema", node=PPORunConfig)
-    store.store(name="sac_schema", node=SACRunConfig)
+    for algorithm, schema in RECIPES.items():
+        store.store(name=f"{algorithm}_schema", node=schema)
     store.store(name="experiment_schema", node=ExperimentConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="perception_schema", node=PerceptionConfig)

@@ -46,13 +46,18 @@ def test_checker_finds_only_that_states_are_unbounded(observation: str) -> None:
     env.close()
 
 
-def test_each_track_is_the_one_of_its_name() -> None:
-    assert [identifier.split("/")[1] for identifier in IDS] == ["Circle-v0", "Kidney-v0", "Figure8-v0", "SplitS-v0"]
-    for identifier, track in zip(IDS, ("circle", "kidney", "figure8", "split_s"), strict=True):
-        env = gymnasium.make(identifier, observation="state")
-        assert env.unwrapped.race.worlds.track.name == track
-        vector = gymnasium.make_vec(identifier, num_envs=2, observation="state")
-        assert vector.race.worlds.track.name == track
+@pytest.mark.parametrize("name", dreamer_racing.GYM_ENVIRONMENTS)
+def test_each_track_is_the_one_of_its_name(name: str) -> None:
+    identifier, track = f"dreamer_racing/{name}-v0", dreamer_racing.GYM_ENVIRONMENTS[name]
+    assert name == "".join(word.capitalize() for word in track.split("_"))
+    env = gymnasium.make(identifier, observation="state")
+    assert env.unwrapped.race.worlds.track.name == track
+    vector = gymnasium.make_vec(identifier, num_envs=2, observation="state")
+    assert vector.race.worlds.track.name == track
+
+
+def test_names_that_others_build_on_stay() -> None:
+    assert {"Circle", "Kidney", "Figure8", "SplitS"} <= dreamer_racing.GYM_ENVIRONMENTS.keys()
 
 
 def test_importing_the_package_registers_and_is_cheap() -> None:
@@ -62,7 +67,7 @@ def test_importing_the_package_registers_and_is_cheap() -> None:
         "sum(i.startswith('dreamer_racing/') for i in gymnasium.registry))"
     )
     ran = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == ["[]", "4"]
+    assert ran.stdout.split() == ["[]", str(len(IDS))]
 
 
 def test_module_form_of_the_name() -> None:

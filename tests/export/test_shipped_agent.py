@@ -119,7 +119,8 @@ def test_a_shipped_agent_flies_as_it_was_trained(shipped: Path, env: DroneRacing
     original, restored = make_agent(), ShippedAgent.load(shipped, env)
     assert {path.name for path in shipped.iterdir()} == set(FILES)
     assert hash_weights(ActorStep(restored.agent)) == hash_weights(ActorStep(original))
-    policy, onnx = restored.evaluation_policy(deterministic=True), OnnxActor(shipped / "actor.onnx")
+    policy, onnx = restored.evaluation_policy(), OnnxActor(shipped / "actor.onnx")
+    policy.deterministic = True
     flown = env.reset().update({"is_init": torch.ones(1, 1, dtype=torch.bool), "belief": torch.zeros(1, 32),
                                 "state": torch.zeros(1, 16), "previous_action": torch.zeros(1, 4)})  # fmt: skip
     expected = ActorStep(original)(flown["pixels"], *(flown[key] for key in ("belief", "state", "previous_action")),

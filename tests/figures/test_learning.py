@@ -47,6 +47,15 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
     assert {line.get_color() for line in panels[0].lines} == set(colors)
 
 
+def test_rows_stand_in_the_order_asked_for(tmp_path, figures):
+    write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo")
+    runs, _ = read_runs(find_runs([tmp_path]))
+    for number, asked in enumerate((["success_rate", "return"], ["return", "success_rate"])):
+        plot_learning_curves(learning_curves(runs, asked), tmp_path / "figure.png")
+        labels = [axes.get_ylabel().partition("\n")[0] for axes in figures[number].axes[:-1]]
+        assert labels == [{"success_rate": "Success rate", "return": "Return"}[name] for name in asked]
+
+
 def curve(key: CurveKey, seeds: list[int], quantity: str = "return") -> Curve:
     """A curve at 0, 100, 200 ... env_steps."""
     steps, zero = 100.0 * np.arange(len(seeds)), np.zeros(len(seeds))

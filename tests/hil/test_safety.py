@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.safety import Reason, Safety, SafetyLimits, State, Tick
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
@@ -527,3 +528,13 @@ def test_the_same_ticks_give_the_same_verdicts(ticks):
     for tick in ticks:
         one, other = first.step(tick), second.step(tick)
         assert (one.state, one.reasons, one.words) == (other.state, other.reasons, other.words)
+
+
+def test_limits_of_a_track_know_its_box_and_refuse_names_that_are_none():
+    track = load_track("circle")
+    limits = SafetyLimits.of_track(track, speed_max=9.0, rate_max=[5.0, 5.0, 2.0])
+    assert limits.fence_high == track.bounds_high and limits.fence_low[2] < 0.0
+    assert limits.start_position == track.start_position and limits.speed_max == 9.0
+    assert limits.rate_max == (5.0, 5.0, 2.0)
+    with pytest.raises(ValueError, match="limits.speed: there is no such limit; there are arm_time"):
+        SafetyLimits.of_track(track, speed=9.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, find_loss, kl_losses
+from dreamer_racing.learners.dreamer import make_dreamer
+from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossConfig, find_loss, kl_losses
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
 
@@ -77,6 +79,20 @@ def test_custom_actor_updates_and_reports(example):
     metrics = learner_of(seed=0, **config).update(example["batch"])
     assert metrics["loss_actor"].isfinite()
     torch.testing.assert_close(metrics["danger"], 1 - metrics["continuation"])
+
+
+def test_the_number_of_a_custom_actor_comes_from_the_configuration_and_moves(example):
+    @dataclasses.dataclass
+    class PricedConfig(LossConfig):
+        price: float = 2.5
+
+    ACTOR_LOSSES["priced"] = example["PricedActorLoss"]  # the fixture takes it back
+    learner = make_dreamer("debug", losses=PricedConfig(actor="priced"), horizon=5, seed=0)
+    actor = learner.losses["actor"]
+    assert (actor.horizon, float(actor.price)) == (5, 2.5)
+    assert learner.update(example["batch"])["loss_actor"].isfinite()
+    learner._set_in_losses("price", 1.5)
+    assert float(actor.price) == 1.5
 
 
 def test_page_names_every_loss_and_key():

@@ -63,14 +63,16 @@ def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path)
 
 def test_a_run_goes_on_for_as_long_as_its_recipe_chose(tmp_path: Path) -> None:
     """tuned=auto became tuned=race at the run's beginning, which has a length of its own."""
+    length = OmegaConf.load(ROOT / "recipes" / "config" / "tuned" / "race.yaml").total_env_steps
+    assert length > settings(tmp_path).total_env_steps
     chosen = ["name=first", "algorithm=dreamer_v3", "track=circle", "seed=3", "budget=none", "variant=default"]
     command = next_command(tmp_path, *chosen)
     assert command is not None
     run_dir = leave_run(
-        Path(command[1].removeprefix("run_dir=")), 1_100_000, [*command[2:], "tuned=race"], finished=False
+        Path(command[1].removeprefix("run_dir=")), length - 1, [*command[2:], "tuned=race"], finished=False
     )
-    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", "total_env_steps=1200000"]
-    RunDirectory(run_dir).mark_finished(1_200_000)
+    assert next_command(tmp_path, *chosen) == ["dreamer_v3.py", f"resume={run_dir}", f"total_env_steps={length}"]
+    RunDirectory(run_dir).mark_finished(length)
     assert next_command(tmp_path, *chosen) is None
 
 
@@ -108,14 +110,15 @@ def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
+    algorithms = tuple(recipe_module("composing.schema").RECIPES)
     command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), "--multirun", "budget=smoke", "name=smoke",
-               "algorithm=dreamer_v3,ppo,sac", "track=circle", "seed=0", "device=cpu"]  # fmt: skip
+               f"algorithm={','.join(algorithms)}", "track=circle", "seed=0", "device=cpu"]  # fmt: skip
     first, second = (
         subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
         for _ in range(2)
     )
     assert first.returncode == 0 and second.returncode == 0, first.stderr + second.stderr
-    for algorithm in ("dreamer_v3", "ppo", "sac"):
+    for algorithm in algorithms:
         run_dir = tmp_path / "runs" / "smoke" / f"{algorithm}_circle_default_seed0"
         assert f"{run_dir}: started, budget=smoke" in first.stdout and f"{run_dir}: done" in first.stdout
         assert f"{run_dir}: finished, skipped" in second.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,9 +16,9 @@ from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.curves import read_curves
 from tests.figures.test_curves import write_run
 from tests.figures.test_flights import flat_dream, random_flight
-from tests.running_recipes import recipe_module
+from tests.running_recipes import ROOT, recipe_module
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "plot.py"
+RECIPE = ROOT / "recipes" / "plot.py"
 
 
 def plot(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -182,10 +183,29 @@ def test_a_defect_costs_no_other_figure_and_is_no_secret(runs, recipe, monkeypat
     def broken(*_: object) -> None:
         raise TypeError("not a figure")
 
-    monkeypatch.setitem(recipe.FIGURES, "learning_curves", broken)
+    monkeypatch.setitem(recipe.FIGURES, "learning_curves", recipe.Entry(broken, recipe.no_columns))
     with pytest.raises(TypeError, match="not a figure"):
         recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
     assert (runs / "figures" / "trajectories.png").exists()
+
+
+def test_a_figure_finds_the_columns_that_its_entry_names(runs, recipe, monkeypatch):
+    found = []
+
+    def draw(config, output: Path, read: list, problems: list[str]):
+        found.extend(sorted(read[0].metrics.columns))
+        return recipe.Drawn(["new.png"], [])
+
+    monkeypatch.setitem(recipe.FIGURES, "new", recipe.Entry(draw, lambda config: ["evaluation/success_rate"]))
+    recipe.draw(recipe.PlotConfig(figure="new", runs=str(runs / "runs"), output=str(runs / "figures")))
+    assert found == ["evaluation/success_rate"]
+
+
+def test_figures_are_named_where_one_chooses_them(recipe):
+    page, options = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("figures.md", "options.md"))
+    (meaning,) = re.findall(r"^\| `figure=` .*$", options, re.M)
+    for name in (*recipe.FIGURES, "all"):
+        assert f"\n| `{name}` |" in page and re.search(rf"\b{name}\b", meaning), name
 
 
 def test_figures_of_an_experiment_do_not_depend_on_each_other(runs):

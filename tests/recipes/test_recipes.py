@@ -14,6 +14,7 @@ import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torchrl.envs.transforms import Transform
 
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
@@ -22,6 +23,7 @@ from dreamer_racing.evaluation.lesions import LESIONS
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.directory import latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
+from dreamer_racing.training.schedule import Clock
 from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module, rows
 
 SMALL = [
@@ -65,6 +67,30 @@ def test_every_model_config_names_a_known_size() -> None:
     named = {path.stem: OmegaConf.load(path)["size"] for path in (CONFIG / "model").glob("*.yaml")}
     assert named.pop("auto") == "auto"
     assert named.keys() == set(SIZES) and all(name == size for name, size in named.items())
+
+
+@pytest.mark.parametrize("name", recipe_module("composing.schema").RECIPES)
+def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> None:
+    schema, recipe = recipe_module("composing.schema"), recipe_module(name)
+    config = OmegaConf.to_object(recipe.resolve(compose(name, "budget=smoke", "device=cpu", "env.from_pixels=false")))
+    assert type(config) is schema.RECIPES[name] and callable(recipe.build)
+    if isinstance(config, schema.ReplayRunConfig):
+        ratio = config.replay_ratio
+        assert OmegaConf.select(OmegaConf.structured(config), ratio.setting) == ratio.ratio
+        assert ratio.updates(config.total_env_steps) > 0
+    interface = Interface(pixels=False, vector_dim=21)
+    learner = recipe_module("composing.learners").make_learner(config, interface, "cpu")
+    assert (learner.updates, learner.device) == (0, torch.device("cpu"))
+    for policy in (learner.policy(), learner.evaluation_policy()):
+        assert policy.deterministic is False and isinstance(policy.make_primer(), Transform)
+    learner.check_finite()
+    learner.load_state_dict(learner.state_dict())
+
+
+def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
+    config = recipe_module("composing.schema").RunConfig()
+    with pytest.raises(NotImplementedError, match=r"make_learner\(\) knows no learner of a RunConfig"):
+        recipe_module("composing.learners").make_learner(config, Interface(), "cpu")
 
 
 def test_a_run_leaves_what_it_promises(run_dir: Path) -> None:
@@ -287,6 +313,7 @@ REFUSED = [
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
+    (["schedule.noise_correlation.to=1"], ["schedule.noise_correlation.to=1.0: must be at least 0 and at most 0.99"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
     (["model.imagine_recent=true"], ["model.imagine_recent=true, and replay.recent_share=0 draws none"]),
     (
@@ -574,6 +601,20 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     assert learners.scheduled(config, learners.clock_times(config, 100_000, passes))["min_std"] == pytest.approx(0.1)
     passes.best = 0.6
     assert learners.scheduled(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(0.075)
+
+
+def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
+    learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
+    assert set(names) == {"discount", "entropy_scale", "min_std", "noise_correlation"}
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
+    overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates")]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    begin, end = (learners.scheduled(config, {Clock.run: share}) for share in (0.0, 1.0))
+    assert begin == {"rates": 1.0} | {name: getattr(config.loss, name) for name in names}
+    assert end == dict.fromkeys(("rates", *names), 0.5)
+    learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
+    learner.adjust(**end)
+    assert float(learner.losses["actor"].noise_correlation) == learner.discount == 0.5
 
 
 def test_nothing_goes_by_gates_where_there_are_none():

@@ -27,9 +27,7 @@ def test_an_episode_counts_the_gates_after_its_first():
 
 def test_laps_count_each_pass():
     passes = PassShare(3)
-    passes.update(
-        episodes([7, 1, 1], [2, 1, 1], [0, 2, 3])
-    )  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
+    passes.update(episodes([7, 1, 1], [2, 1, 1], [0, 2, 3]))  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
     assert passes.shares.tolist() == pytest.approx([1.0, 2 / 4, 1.0], abs=0.01)
     assert passes.share == pytest.approx(0.5, abs=0.01) and passes.hardest_gate == 1
 

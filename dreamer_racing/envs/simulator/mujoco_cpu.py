@@ -22,7 +22,7 @@ class MujocoSimulator(Simulator):
         parameters: the drone.
         num_envs: N worlds.
         camera: the nose camera.
-        renderer: `auto`, `egl`, `osmesa`, `warp`, `warp_cuda`, or None for no images.
+        renderer: as `make_renderer` takes it, or None for no images.
         num_threads: physics and rendering threads; the CPUs of this process if None.
         generator: source of the randomisation of physics and looks.
         looks: how far looks vary; None for the same in every episode.

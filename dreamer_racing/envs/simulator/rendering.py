@@ -27,7 +27,12 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.looks import Looks
-from dreamer_racing.envs.simulator.opengl import RendererUnavailableError, open_scene, require_library
+from dreamer_racing.envs.simulator.opengl import (
+    GL_LIBRARIES,
+    RendererUnavailableError,
+    open_scene,
+    require_library,
+)
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.scene import Camera
 
@@ -74,7 +79,11 @@ class Worker(Protocol):
     """Draws frames in one thread."""
 
     def draw(self, position: Tensor, axes: Tensor, out: Tensor, looks: Looks | None = None) -> None:
-        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3)."""
+        """Draw from camera positions (m, 3) and axes (m, 3, 3; rows right, up, backwards) into out (m, H, W, 3).
+
+        Frames that have looks take the colours of their materials and the field of view from them; the axes are tilted
+        as they say already, and the noise comes later.
+        """
         ...
 
     def close(self) -> None:
@@ -86,7 +95,7 @@ class Renderer:
     """Spreads frames over workers, each of which lives in a thread of its own.
 
     Args:
-        name: `egl`, `osmesa` or `warp`.
+        name: out of `RENDERERS`, or `HYBRID`.
         make_worker: makes one worker; called once in each thread.
         camera: the nose camera.
         num_workers: K.
@@ -168,7 +177,7 @@ def make_renderer(
     """Make the renderer of that name, or the first that works for `auto`; log which and why.
 
     Args:
-        name: `auto`, `egl`, `osmesa`, `warp` or `warp_cuda`.
+        name: `auto`, or a name out of `RENDERERS`, or `HYBRID`.
         model: the compiled scene.
         camera: the nose camera.
         num_envs: the most frames drawn at once.
@@ -201,10 +210,14 @@ def make_renderer(
 def _worker_factory(
     name: str, model: mujoco.MjModel, camera: Camera, frames: int, varied_looks: bool
 ) -> Callable[[], Worker]:
-    if name in ("warp", HYBRID):
-        device = "cpu" if name == "warp" else "cuda"
-        if device == "cuda" and not torch.cuda.is_available():
+    """Return what makes the workers of a renderer, once it is sure that they can work here."""
+    if name in GL_LIBRARIES:
+        require_library(name)
+        return lambda: OpenGLWorker(name, model, camera)
+    if name == "warp":
+        return lambda: RayCaster(model, camera, frames, "cpu", varied_looks)
+    if name == HYBRID:
+        if not torch.cuda.is_available():
             raise RendererUnavailableError(f"{name} needs a CUDA device, and torch {torch.__version__} finds none.")
-        return lambda: RayCaster(model, camera, frames, device, varied_looks)
-    require_library(name)
-    return lambda: OpenGLWorker(name, model, camera)
+        return lambda: RayCaster(model, camera, frames, "cuda", varied_looks)
+    raise NotImplementedError(f"{name!r} is among the renderers, but no worker here draws it: add a branch for it.")

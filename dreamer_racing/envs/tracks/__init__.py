@@ -3,11 +3,12 @@
 from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS, load_track
 from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, make_track
 from dreamer_racing.envs.tracks.validation import validate_track
-from dreamer_racing.envs.tracks.variants import decoys_for, displace_gates, with_decoys
+from dreamer_racing.envs.tracks.variants import PLAIN_TRACKS, decoys_for, displace_gates, with_decoys
 
 __all__ = [
     "BUILTIN_TRACKS",
     "GROUND_HEIGHT",
+    "PLAIN_TRACKS",
     "Gate",
     "GateShape",
     "Track",

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamer_racing.envs.tracks.loading import load_track
+from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS, load_track
 from dreamer_racing.envs.tracks.track import Gate, Track, TrackError
 from dreamer_racing.envs.tracks.validation import validate_track
 
@@ -15,6 +15,11 @@ if TYPE_CHECKING:
 
 DECOYS = {"paper": {"figure8": "figure8_decoys"}}
 """Sets of decoys: for each the tracks that have it, and the built-in track that shows where its decoys stand."""
+
+PLAIN_TRACKS: tuple[str, ...] = tuple(
+    name for name in BUILTIN_TRACKS if not any(name in places.values() for places in DECOYS.values())
+)
+"""Built-in tracks without those that another one becomes by decoys, for these are the same race."""
 
 ATTEMPTS = 1000
 """Displacements drawn until one can be flown [choice]."""

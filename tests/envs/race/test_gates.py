@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dreamer_racing.envs.race.gates import CrashCause, GateSweep, GateSweeper
-from dreamer_racing.envs.tracks import GROUND_HEIGHT, Gate, Track, load_track, make_track
+from dreamer_racing.envs.tracks import GROUND_HEIGHT, PLAIN_TRACKS, Gate, Track, load_track, make_track
 
 NONE, FRAME, BACKWARDS, GROUND, OUTSIDE, NON_FINITE, INVALID, MISSED = (int(cause) for cause in CrashCause)
 HALF_OPENING, HALF_OUTER = 0.65, 1.025  # m: 1.5 / 2 less the margin of 0.1, and 2.05 / 2
@@ -365,7 +365,7 @@ def _out_of_gate_axes(gate: Gate, point):
 # Hypothesis loves zeros: moved a little, they seldom put a sample on a plane, which has tests of its own above.
 near = st.floats(-1.4, 1.4).map(lambda number: number + 0.0137)
 local_paths = st.lists(st.tuples(near, near, near), min_size=2, max_size=7)  # in a gate's axes
-tracks = st.sampled_from([load_track(name) for name in ("circle", "kidney", "figure8", "split_s")] + [PLAIN])
+tracks = st.sampled_from([load_track(name) for name in PLAIN_TRACKS] + [PLAIN])
 
 
 @st.composite

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.worlds import RaceWorlds
+from tests.renderers import IN_PROCESS, renderer_or_skip
 
 N = 6
 QUIET = LooksRandomisation(noise=0.0)
@@ -27,8 +28,9 @@ def images(looks: str | LooksRandomisation | None, renderer: str = "warp", **arg
     return drawn
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_worlds_look_different_and_only_if_asked(renderer: str) -> None:
+    renderer_or_skip(renderer)
     nominal, varied = images(None, renderer), images(QUIET, renderer)
     assert (nominal[1:] == nominal[0]).all()  # all start at the same place
     for one in range(N):
@@ -37,8 +39,11 @@ def test_worlds_look_different_and_only_if_asked(renderer: str) -> None:
     assert (images(NOTHING, renderer) - nominal).abs().mean() < 0.2
 
 
-def test_renderers_agree_about_looks() -> None:
-    made = [worlds(QUIET, "egl"), worlds(QUIET, "warp"), worlds(QUIET, backend="mujoco_warp")]
+@pytest.mark.parametrize("renderer", [name for name in IN_PROCESS if name != "egl"])
+def test_renderers_agree_about_looks(renderer: str) -> None:
+    for name in ("egl", renderer):
+        renderer_or_skip(name)
+    made = [worlds(QUIET, "egl"), worlds(QUIET, renderer), worlds(QUIET, backend="mujoco_warp")]
     for each in made[1:]:
         each.simulator.load_state_dict(made[0].simulator.state_dict())
     first, *others = (each.render().float() for each in made)

@@ -23,23 +23,10 @@ from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import load_track
+from tests.renderers import IN_PROCESS, renderer_or_skip
 
 EASY = PRESETS["easy"]
 KIDNEY = load_track("kidney")
-
-
-def renderer_or_skip(name: str) -> str:
-    """The name, if the OpenGL library behind it loads here."""
-    libraries = opengl.GL_LIBRARIES.get(name, ())
-    for library in libraries:
-        try:
-            ctypes.CDLL(library)
-            return name
-        except OSError:
-            continue
-    if libraries:
-        pytest.skip(f"{name}: none of {', '.join(libraries)} on this machine")
-    return name
 
 
 def poses(num_envs: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -184,7 +171,7 @@ def images(renderer: str, start: tuple[Tensor, ...], **arguments) -> Tensor:
     return drawn
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_images_are_upright(renderer: str) -> None:
     drawn = images(renderer, level(0.0, 90.0, 180.0))
     assert (drawn.shape, drawn.dtype) == ((3, 64, 64, 3), torch.uint8)
@@ -194,7 +181,7 @@ def test_images_are_upright(renderer: str) -> None:
     assert (brightness[:, -12:].amin((1, 2)) < 60).all()
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_image_sizes_show_the_same(renderer: str) -> None:
     """Every third pixel of a side three times as long looks along the same ray."""
     start = poses(6, seed=3)
@@ -229,7 +216,7 @@ def test_osmesa_draws_what_warp_draws(tmp_path: Path) -> None:
         assert (drawn.float() - expected.float()).abs().mean() < 3.0
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_images_are_not_mirrored(renderer: str) -> None:
     # level, in front of the first gate but to its right: the gate is in the image's left half
     gate = KIDNEY.gates[0]
@@ -267,15 +254,16 @@ def test_image_shows_what_rays_hit() -> None:
     assert np.mean(agree) > 0.9  # pixels on an edge may go either way
 
 
-def test_renderers_agree() -> None:
+@pytest.mark.parametrize("renderer", [name for name in IN_PROCESS if name != "egl"])
+def test_renderers_agree(renderer: str) -> None:
     start = poses(6, seed=3)
-    opengl, cast = (images(renderer, start).float() for renderer in ("egl", "warp"))
-    difference = (opengl - cast).abs().mean((1, 2, 3))
+    opengl, other = (images(name, start).float() for name in ("egl", renderer))
+    difference = (opengl - other).abs().mean((1, 2, 3))
     assert difference.max() < 6.0, difference
-    assert (opengl[0] - cast[1]).abs().mean() > 20.0  # as far apart as images of different places are
+    assert (opengl[0] - other[1]).abs().mean() > 20.0  # as far apart as images of different places are
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_drone_does_not_see_itself(renderer: str, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera(tilt=-60.0)  # down at its own arms
     start = level(0.0, 120.0)
@@ -298,7 +286,7 @@ def test_nothing_hangs_in_mid_air() -> None:
     assert kinds == {int(mujoco.mjtObj.mjOBJ_GEOM)}
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -> None:
     made = simulator(5, renderer_or_skip(renderer), num_threads=num_threads)
@@ -312,7 +300,7 @@ def test_masked_images_are_rows_of_all_images(renderer: str, num_threads: int) -
     made.close()
 
 
-@pytest.mark.parametrize("renderer", ["egl", "warp"])
+@pytest.mark.parametrize("renderer", IN_PROCESS)
 def test_camera_size(renderer: str) -> None:
     assert images(renderer, level(0.0), camera=Camera(width=40, height=24)).shape == (1, 24, 40, 3)
 
@@ -358,8 +346,21 @@ def test_opengl_that_does_not_start_is_a_reason_too(monkeypatch: pytest.MonkeyPa
 
 
 def test_unknown_renderer_is_refused() -> None:
-    with pytest.raises(ValueError, match="Unknown renderer 'vulkan': use auto, egl, osmesa, warp, warp_cuda, or None"):
+    known = ", ".join(("auto", *rendering.RENDERERS, rendering.HYBRID))
+    with pytest.raises(ValueError, match=f"Unknown renderer 'vulkan': use {known}, or None"):
         simulator(1, "vulkan")
+
+
+def test_a_renderer_without_a_worker_is_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "RENDERERS", (*rendering.RENDERERS, "vulkan"))
+    with pytest.raises(NotImplementedError, match="'vulkan' is among the renderers, but no worker"):
+        simulator(1, "vulkan")
+
+
+@pytest.mark.parametrize("name", [*rendering.RENDERERS, rendering.HYBRID])
+def test_every_renderer_is_in_the_table_and_has_a_worker(name: str) -> None:
+    assert f"`{name}`" in (rendering.__doc__ or "")
+    renderer_or_skip(name)
 
 
 def test_without_a_renderer_there_are_no_images() -> None:

@@ -1,0 +1,213 @@
+"""The page on which people look on: what it shows, whom it lets in, and that it disturbs nobody."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dreamer_racing.hil.chain import Outputs
+from dreamer_racing.hil.safety import State, Verdict
+from dreamer_racing.hil.vehicle import Command, Pose, at_rest, hover
+from dreamer_racing.hil.view import LiveView, read_frame
+
+IMAGE = np.zeros((64, 64, 3), np.uint8)
+IMAGE[:32], IMAGE[32:] = (255, 0, 0), (0, 0, 255)  # red above blue
+
+
+def outputs(image: np.ndarray | None = IMAGE, state: State = State.FLYING, words: tuple[str, ...] = ()) -> Outputs:
+    command = Command(True, hover()) if state is State.FLYING else at_rest()
+    pose = Pose(1.0, np.array([1.0, 2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.0, 4.0]), np.zeros(3))
+    return Outputs(Verdict(state, command, (), words), hover(), pose, image, 2, 8, 0.0015, 0.0025)
+
+
+NO_POSE = outputs(None, State.DISARMED, ("there is no pose", "<b> & more"))._replace(pose=None, setpoint=None)
+
+
+@pytest.fixture
+def view():
+    made = LiveView(port=0)
+    yield made
+    made.close()
+
+
+def get(view: LiveView, path: str) -> bytes:
+    with urllib.request.urlopen(view.address + path, timeout=10.0) as answer:
+        return answer.read()
+
+
+def test_state_and_numbers_are_told_in_text(view):
+    assert json.loads(get(view, "state")) == {"text": "no tick yet"}
+    view.show(outputs())
+    state = json.loads(get(view, "state"))
+    assert (state["state"], state["armed"], state["target_gate"], state["passes"]) == ("flying", True, 3, 8)
+    assert state["speed"] == 5.0 and state["position"] == [1.0, 2.0, 3.0]
+    lines = state["text"].splitlines()
+    assert lines[1:5] == [
+        "state     flying, armed",
+        "gate      3 comes next, 8 passed",
+        "speed     5.0 m/s",
+        "position  1.00, 2.00, 3.00 m",
+    ]
+    assert lines[5] == "took      1.5 ms to draw, 2.5 ms to choose"
+
+
+def test_without_pose_and_camera_it_says_why(view):
+    view.show(NO_POSE)
+    text = json.loads(get(view, "state"))["text"]
+    assert "speed     no pose" in text and "position  unknown m" in text and "the flyer has no camera" in text
+    assert text.endswith("there is no pose\n<b> & more")
+    page = get(view, "").decode()
+    assert "&lt;b&gt; &amp; more" in page and "<b>" not in page
+    assert Image.open(io.BytesIO(get(view, "image.jpg"))).getpixel((5, 5)) == pytest.approx((128, 128, 128), abs=3)
+
+
+def test_the_image_is_enlarged_and_the_right_way_up(view):
+    view.show(outputs())
+    image = Image.open(io.BytesIO(get(view, "image.jpg")))
+    assert image.size == (512, 512)
+    red, blue = image.getpixel((256, 200)), image.getpixel((256, 300))
+    assert red == pytest.approx((255, 0, 0), abs=8) and blue == pytest.approx((0, 0, 255), abs=8)
+
+
+def test_an_image_need_neither_be_square_nor_in_one_piece(view):
+    wide = np.zeros((20, 30, 4), np.uint8)[::-1, :, :3]
+    wide[:, :10] = (0, 255, 0)
+    view.show(outputs(wide))
+    image = Image.open(io.BytesIO(get(view, "image.jpg")))
+    assert image.size == (17 * 30, 17 * 20)
+    assert image.getpixel((50, 100)) == pytest.approx((0, 255, 0), abs=8)
+
+
+def test_the_stream_has_each_new_image(view):
+    view.show(outputs())
+    with urllib.request.urlopen(view.address + "stream", timeout=10.0) as stream:
+        assert stream.headers["Content-Type"].startswith("multipart/x-mixed-replace")
+        for value in (200, 50):
+            view.show(outputs(np.full((64, 64, 3), value, np.uint8)))
+            found = None
+            while found is None or abs(found - value) > 3:  # an image from before may come first
+                assert stream.readline() == b"--frame\r\n"
+                assert stream.readline() == b"Content-Type: image/jpeg\r\n"
+                size = int(stream.readline().split(b":")[1])
+                assert stream.readline() == b"\r\n"
+                found = Image.open(io.BytesIO(stream.read(size))).getpixel((9, 9))[0]
+                assert stream.readline() == b"\r\n"
+
+
+def test_it_says_when_ticks_stop(view):
+    view.show(outputs())
+    time.sleep(1.2)
+    assert json.loads(get(view, "state"))["text"].startswith("NO TICK FOR 1 s")
+
+
+def test_other_addresses_are_not_there(view):
+    for path in ("image.jpg", "etc/passwd", "../view.py"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            get(view, path)
+
+
+def test_it_listens_on_loopback_only(view):
+    port = int(view.address.rstrip("/").rpartition(":")[2])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; says by which address one would go out
+        except OSError:
+            pytest.skip("this machine has no other interface")
+        own = probe.getsockname()[0]
+    if own.startswith("127."):
+        pytest.skip("this machine has no other interface")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((own, port), timeout=2.0).close()
+
+
+def test_a_port_in_use_is_said(view):
+    port = int(view.address.rstrip("/").rpartition(":")[2])
+    with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{port}: .* Is another program, or flight, using"):
+        LiveView(port=port)
+
+
+def test_whoever_else_may_see_it_is_said(caplog):
+    LiveView(port=0, host="0.0.0.0").close()
+    assert "everyone who reaches that address sees the flight" in caplog.text
+
+
+def test_it_closes_at_once_with_a_browser_at_it(view):
+    view.show(outputs())
+    with urllib.request.urlopen(view.address + "stream", timeout=10.0):
+        start = time.monotonic()
+        view.close()
+        assert time.monotonic() - start < 5.0
+    assert view._server.returncode == 0
+    with pytest.raises(urllib.error.URLError):
+        get(view, "state")
+    view.close()
+    view.show(outputs())  # a late tick harms nobody
+    LiveView(port=int(view.address.rstrip("/").rpartition(":")[2])).close()  # the port is free
+
+
+def test_a_flight_goes_on_when_its_page_dies(view):
+    view._server.kill()
+    view._server.wait()
+    for _ in range(100):
+        view.show(outputs())
+
+
+def test_an_image_without_room_is_left_out(view):
+    view.show(outputs(np.zeros((2000, 2000, 3), np.uint8)))
+    assert view.too_large == 1
+    assert json.loads(get(view, "state"))["shape"] == [2000, 2000, 3]
+    assert len(get(view, "image.jpg")) > 100
+
+
+def test_a_frame_that_is_being_written_is_not_read(view):
+    view.show(outputs())
+    assert read_frame(view._memory).numbers["tick"] == 1
+    view._memory[:4] = (3).to_bytes(4, "little")
+    assert read_frame(view._memory, tries=2) is None
+    view._memory[:4] = (2).to_bytes(4, "little")
+    view._memory[20:21] = b"\xff"  # within the numbers
+    assert read_frame(view._memory, tries=2) is None
+
+
+KILLED = """
+import os, signal
+from dreamer_racing.hil.view import LiveView
+view = LiveView(port=0)
+print(view._server.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_it_ends_with_a_flight_that_is_killed():
+    run = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True, timeout=60)
+    assert run.returncode == -signal.SIGKILL, run.stderr
+    server = int(run.stdout)
+    for _ in range(100):
+        try:
+            os.kill(server, 0)
+        except ProcessLookupError:
+            return
+        stat = Path(f"/proc/{server}/stat")
+        if stat.exists() and stat.read_text().split(") ")[1].startswith("Z"):  # ended, and nobody has asked
+            return
+        time.sleep(0.1)
+    os.kill(server, signal.SIGKILL)
+    pytest.fail("the page lived on for 10 s")
+
+
+def test_what_flies_with_it_needs_no_torch():
+    code = "import sys, dreamer_racing.hil.view, dreamer_racing.hil.loop; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -1,0 +1,192 @@
+"""`recipes/hil.py` as a user starts it: refusals, flights against a plant in another process, and what kills either."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Self
+
+import pytest
+
+from dreamer_racing.hil.chain import describe_inputs, describe_outputs
+from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+from tests.running_recipes import ROOT, recipe_module
+
+hil = recipe_module("hil")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Process:
+    """A recipe that runs, and what it has said so far."""
+
+    def __init__(self, name: str, *overrides: str) -> None:
+        command = [sys.executable, str(ROOT / "recipes" / f"{name}.py"), *overrides]
+        self.running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0)
+        self.said = ""
+
+    def listen(self, seconds: float) -> None:
+        stdout = self.running.stdout
+        assert stdout is not None
+        if select.select([stdout], [], [], seconds)[0]:
+            self.said += os.read(stdout.fileno(), 65536).decode()
+
+    def wait_for(self, text: str, other: Process | None = None) -> None:
+        """Wait until it has said that; fail if it takes too long, or the other one ends meanwhile."""
+        deadline = time.monotonic() + 90
+        while text not in self.said:
+            assert time.monotonic() < deadline and self.running.poll() is None, self.said
+            assert other is None or other.running.poll() is None, other.end()
+            self.listen(0.2)
+
+    def end(self) -> str:
+        """Wait for its end; return all that it said."""
+        deadline = time.monotonic() + 60
+        while self.running.poll() is None and time.monotonic() < deadline:
+            self.listen(0.2)
+        while self.running.stdout is not None and (rest := self.running.stdout.read()):
+            self.said += rest.decode()
+        return self.said
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.running.kill()
+        self.running.wait()
+        self.running.stdout.close()
+
+
+@contextmanager
+def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
+    """Start a plant and a loop that flies it by the pilot, and wait until it flies; limits allow for slow machines."""
+    command_port, pose_port = free_port(), free_port()
+    slow = ("hold_after=0.4", "cut_after=0.9", "tick_max=1.0", "overruns_max=1000", "speed_max=40")
+    with Process("plant", "track=circle", f"command_port={command_port}", f"pose_port={pose_port}") as plant:
+        plant.wait_for("listens on")
+        own = ("actor=pilot", "track=circle", "arm=true", f"run_dir={folder}", *(f"limits.{limit}" for limit in slow))
+        with Process("hil", *own, f"link_port={command_port}", f"pose_port={pose_port}") as loop:
+            plant.wait_for("the stand let go", loop)
+            yield plant, loop
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "give one of actor=, replay= and report=, not none"),
+        ({"actor": "pilot", "report": "x"}, "not actor and report"),
+        ({"actor": "pilot", "operator": "cat"}, "operator=cat: there are auto, keyboard, udp, timed"),
+        (
+            {"actor": "pilot", "link": "crsf", "operator": "timed"},
+            "operator=timed enables by itself, and link=crsf may be",
+        ),
+        ({"actor": "pilot", "against": "x"}, "against=x is for report="),
+        ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        hil.check(hil.HilConfig(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"actor": "pilot"}, "track= is missing: actor=pilot has none of its own"),
+        ({"actor": "pilot", "track": "moon"}, "moon"),
+        ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', and track=circle"),
+        ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
+        ({"actor": "nobody"}, "There is no file nobody"),
+        ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
+        ({"actor": "kidney", "link": "pigeon"}, "pigeon"),
+        ({"actor": "kidney", "pose": "stars"}, "stars.*udp, mavlink, ros2"),
+        ({"actor": "kidney", "limits": hil.LimitsConfig(hold_after=0.2)}, "hold_after=0.2: must be below cut_after"),
+    ],
+)
+def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, tmp_path):
+    config = hil.HilConfig(run_dir=str(tmp_path), **changes)
+    hil.check(config)
+    with pytest.raises((ValueError, OSError), match=message):
+        hil.fly(config)
+
+
+def test_a_port_in_use_is_said_and_nothing_else_happens(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
+            hil.fly(hil.HilConfig(actor="circle", pose_port=port, run_dir=str(tmp_path / "run")))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
+    drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
+    config = hil.HilConfig(actor="kidney", link="betaflight_sitl", **drone)
+    link = hil.link_config(config, hil.make_flyer(config)[1])
+    assert link.rates is not None and link.thrust is not None
+    assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
+
+
+def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
+    config = hil.HilConfig(actor="circle", record=True)
+    flyer, _ = hil.make_flyer(config)
+    chain = hil.make_chain(config, flyer, hil.load_track("circle"))
+    with (
+        FlightRecorder(tmp_path / "right" / FILE, {"config": hil.as_json(config)}) as right,
+        FlightRecorder(tmp_path / "wrong" / FILE, {"config": hil.as_json(config)}) as wrong,
+    ):
+        for index in range(5):
+            inputs = hil.read_inputs(
+                {
+                    "time": 10.0 + 0.04 * index,
+                    "received": [[10.0 + 0.04 * index, index, 0.04 * index, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]],
+                    "operator": [False, False],
+                    "overrun": False,
+                }
+            )
+            out = describe_outputs(chain.tick(inputs))
+            message = {"in": describe_inputs(inputs), "out": out}
+            right.tick(inputs.time, message)
+            wrong.tick(inputs.time, message | {"out": out | ({"target_gate": 3} if index == 3 else {})})
+    chain.close()
+    assert hil.replay(hil.HilConfig(replay=str(tmp_path / "right"))) == 0
+    assert "replayed: 5 ticks, every one as it was written" in capsys.readouterr().out
+    assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
+    assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
+
+
+def test_the_loop_cuts_when_the_plant_is_killed(tmp_path):
+    with flight(tmp_path) as (plant, loop):
+        plant.running.kill()
+        said = loop.end()
+    assert loop.running.returncode == 0, said  # laps= was not asked for
+    assert "ended: cut: the newest pose is" in said
+    flown = Flight(tmp_path)
+    assert flown.whole and flown.ticks[-1]["out"]["state"] == "cut"
+    assert json.loads((tmp_path / "statistics.json").read_text())["loop"]["ticks"] == len(flown.ticks)
+
+
+def test_the_plant_cuts_when_the_loop_is_killed_and_the_flight_is_on_disk(tmp_path):
+    with flight(tmp_path) as (plant, loop):
+        time.sleep(0.5)
+        loop.running.kill()
+        loop.running.wait()
+        plant.wait_for("nothing heard for 0.25 s: motors cut")
+        plant.running.send_signal(signal.SIGTERM)
+        plant.end()
+    assert plant.running.returncode == 0
+    flown = Flight(tmp_path)
+    assert not flown.whole and flown.ticks[-1]["out"]["command"][0] is True
