@@ -1,8 +1,8 @@
 r"""Fly a vehicle, real or simulated in a process of its own: poses in, images drawn from them, commands out.
 
-    python recipes/plant.py track=kidney preset=easy                      # in one terminal: a vehicle
-    python recipes/hil.py actor=kidney arm=true laps=3                    # in another: an agent flies it
-    python recipes/hil.py actor=pilot track=figure8 arm=true laps=3       # or the scripted pilot
+    python recipes/plant.py track=circle preset=easy                      # in one terminal: a vehicle
+    python recipes/hil.py actor=circle arm=true laps=3                    # in another: an agent flies it
+    python recipes/hil.py actor=pilot track=circle arm=true laps=3        # or the scripted pilot
     python recipes/hil.py actor=kidney arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
         mass=0.62 full_thrust=17 reference_voltage=15.2 voltage=15.8      # or a real vehicle, by a radio's receiver
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
@@ -39,6 +39,7 @@ from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import ThrustMap
+from dreamer_racing.hil.view import LiveView
 from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
 
 AGENTS = Path(__file__).parents[1] / "agents"
@@ -100,9 +101,10 @@ class HilConfig:
     reference_voltage: float | None = setting(None, POSITIVE)  # V
     voltage: float | None = setting(None, POSITIVE)  # V, the battery's now
 
-    limits: LimitsConfig = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all: docs/hil.md
+    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
     renderer: str = "auto"  # auto | egl | osmesa
     record: bool = True  # write the flight to a file
+    view: int | None = setting(None, Range(1, 65535))  # port of a page on this machine that shows what the actor sees
 
 
 ConfigStore.instance().store(name="hil_schema", node=HilConfig)
@@ -163,8 +165,13 @@ def fly(config: HilConfig) -> int:
         if config.record:
             about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
             recorder = opened.enter_context(FlightRecorder(folder / FILE, about))
+        watch = None
+        if config.view is not None:
+            view = opened.enter_context(closing(LiveView(config.view)))
+            print(f"view: {view.address}")
+            watch = view.show
         print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
-        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder)
+        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watch)
         ended = loop.run(config.duration)
     passes = chain.progress.passes
     summary = {
