@@ -46,6 +46,7 @@ class SimToRealConfig:
     flights: int = setting(5, COUNT)  # of each value, with different noise
     sweeps: list[str] | None = None  # of what is changed; null: all
     processes: int | None = setting(None, COUNT)  # that fly at a time; null: one for each core
+    beside: str | None = None  # sim_to_real.json of another study, to be drawn in the same picture
     run_dir: str | None = None  # null: runs/sim_to_real_<track>_<time>
 
 
@@ -61,6 +62,7 @@ def main(config: DictConfig) -> None:
         track, make_flyer = check(settings)
         folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track)
         folder.mkdir(parents=True, exist_ok=True)
+        others = [json.loads(Path(settings.beside).read_text(encoding="utf-8"))] if settings.beside else []
     sweeps = settings.sweeps or list(SWEEPS)
     processes = settings.processes or available_cpus()
     flown = []
@@ -71,7 +73,7 @@ def main(config: DictConfig) -> None:
     made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": settings.actor, "track": track}
     result = {"provenance": {**made, "preset": settings.preset, "flights": settings.flights}, "flights": flown}
     (folder / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    plot_study([result], folder / RESULT.replace("json", "png"))
+    plot_study([result, *others], folder / RESULT.replace("json", "png"))
     print(f"written to {folder}")
 
 

@@ -38,7 +38,7 @@ def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
     sweeps = [name for name in LABELS if any(flight["sweep"] == name for r in results for flight in r["flights"])]
     if not sweeps:
         raise ValueError("These studies hold no flight: there is nothing to draw.")
-    figure = Figure(figsize=(2.6 * len(sweeps) + 0.6, 5.0), layout="constrained")
+    figure = Figure(figsize=(max(7.0, 2.6 * len(sweeps) + 0.6), 5.0), layout="constrained")
     panels: np.ndarray = figure.subplots(2, len(sweeps), sharex="col", sharey="row", squeeze=False)
     for result, color in zip(results, COLORS, strict=False):
         made = result["provenance"]
