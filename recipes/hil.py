@@ -14,6 +14,7 @@ Read docs/hil.md before anything with propellers. Nothing here needs torch, but 
 import json
 import math
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, fields, make_dataclass
 from itertools import pairwise
@@ -29,7 +30,7 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.betaflight import rate_map
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.chain import ChainConfig, FlightChain, Outputs, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.loop import FlightLoop
@@ -67,7 +68,8 @@ class HilConfig:
     track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
     arm: bool = False  # whether the vehicle may be armed at all
     laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
-    duration: float | None = setting(None, POSITIVE)  # s, after which it is disarmed; null: as long as it takes
+    duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
+    patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
     rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
     preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
     run_dir: str | None = None  # null: runs/hil_<track>_<time>
@@ -83,7 +85,8 @@ class HilConfig:
     pose_topic: str | None = None  # pose=ros2
     pose_message: str | None = None  # which kind of message; null: ODOMETRY, or PoseStamped
     smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities where poses come without
-    stamping: Stamping = Stamping.receive  # a pose's time: receive (arrival less latency) | sender (its stamp)
+    # a pose's time: receive (arrival less latency) | sender (its stamp); null: receive over UDP, else sender
+    stamping: Stamping | None = None
     latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
 
     operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
@@ -143,6 +146,11 @@ def check(config: HilConfig) -> None:
         raise ValueError(
             f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
         )
+    by_itself = config.operator in ("auto", "timed") and config.link in SIMULATED
+    if by_itself and not config.link_host.startswith("127."):
+        raise ValueError(
+            f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
+        )
     if config.against and not config.report:
         raise ValueError(f"against={config.against} is for report=.")
 
@@ -165,14 +173,17 @@ def fly(config: HilConfig) -> int:
         if config.record:
             about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
             recorder = opened.enter_context(FlightRecorder(folder / FILE, about))
-        watch = None
+        watchers: list[Callable[[Outputs], None]] = []
+        if isinstance(operator, TimedOperator):
+            watchers.append(lambda outputs: operator.note(outputs.verdict.command.armed))
         if config.view is not None:
             view = opened.enter_context(closing(LiveView(config.view)))
             print(f"view: {view.address}")
-            watch = view.show
+            watchers.append(view.show)
         print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
-        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watch)
-        ended = loop.run(config.duration)
+        print(f"poses: {config.pose}, stamped by {stamping_of(config).value}")
+        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
+        ended = loop.run(config.duration, config.patience)
     passes = chain.progress.passes
     summary = {
         "ended": ended,
@@ -180,6 +191,7 @@ def fly(config: HilConfig) -> int:
         "laps": lap_times(chain),
         "loop": loop.statistics.summary(),
         "poses": {"rejected": poses.rejected, "out_of_order": chain.clock.out_of_order},
+        "commands_dropped": link.dropped,
     }
     if config.record:
         (folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -219,9 +231,17 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     """Make the chain of a flyer."""
     given = {name: value for name, value in vars(config.limits).items() if value is not None}
     limits = SafetyLimits.of_track(track, **given)
-    settings = ChainConfig(limits, config.stamping, config.latency, config.laps, config.arm)
+    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm)
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
+
+
+def stamping_of(config: HilConfig) -> Stamping:
+    """Return how poses are stamped: what is read when the loop comes to it looks younger than it is."""
+    if config.stamping is not None:
+        return config.stamping
+    kernel = config.pose == "udp" or (config.pose == "mavlink" and config.pose_device is None)
+    return Stamping.receive if kernel else Stamping.sender
 
 
 def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
@@ -294,6 +314,7 @@ def replay(config: HilConfig) -> int:
     track = load_track(settings.track or contract["source"]["track"])
     settings.renderer = config.renderer
     chain = make_chain(settings, flyer, track)
+    chain.warm_up()
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
         if differing := [name for name, value in again.items() if not same(value, tick["out"][name])]:

@@ -6,6 +6,7 @@ played through it again: the same file gives the same commands, bit for bit.
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any, NamedTuple
 
@@ -63,6 +64,7 @@ class Outputs(NamedTuple):
         verdict: State, command and reasons.
         setpoint: What the flyer wanted; None without a pose.
         pose: For which it was chosen: the newest one, extrapolated to the tick.
+        measured: When that was measured, s; not a number without a pose.
         image: What the flyer saw; None if it has no camera.
         target_gate: Index of the gate that comes next.
         passes: Gates passed in this flight.
@@ -73,6 +75,7 @@ class Outputs(NamedTuple):
     verdict: Verdict
     setpoint: Setpoint | None
     pose: Pose | None
+    measured: float
     image: np.ndarray | None
     target_gate: int
     passes: int
@@ -137,8 +140,9 @@ class FlightChain:
             )
         )
         self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
-        progress = self.progress
-        return Outputs(verdict, setpoint, pose, image, progress.target, len(progress.passes), render_s, act_s)
+        measured = math.nan if self._newest is None else self._newest.time
+        target, passes = self.progress.target, len(self.progress.passes)
+        return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s)
 
     def _moves(self) -> bool:
         """Whether the newest pose is one of a vehicle that has left the start."""

@@ -49,7 +49,7 @@ class ActorFlyer:
     """
 
     def __init__(self, path: Path) -> None:
-        self._actor = OnnxActor(path / "actor.onnx" if path.is_dir() else path)
+        self._actor = OnnxActor(path / "actor.onnx" if path.is_dir() else path, seed=0)  # replays draw the same noise
         self.contract: dict[str, Any] = self._actor.contract
         self.camera: Camera | None = camera_of(self.contract)
         self.rate = float(self.contract["control"]["rate_hz"])

@@ -6,7 +6,7 @@ import gc
 import logging
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
@@ -18,6 +18,7 @@ from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inpu
 from dreamer_racing.hil.operator import OperatorSource
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.recording import FlightRecorder
+from dreamer_racing.hil.safety import Reason
 from dreamer_racing.hil.vehicle import Link, at_rest
 
 logger = logging.getLogger(__name__)
@@ -27,6 +28,10 @@ FAREWELL = 1.0
 
 FAREWELL_RATE = 50.0
 """Hz of those frames [choice]."""
+
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+"""Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
 
 
 class Clock(Protocol):
@@ -67,6 +72,7 @@ class LoopStatistics:
         act: Of the flyer.
         busy: Of the whole tick.
         overruns: Ticks that took longer than their period.
+        unrecorded: Whether writing or showing the flight failed on the way.
     """
 
     jitter: list[float] = field(default_factory=list)
@@ -76,12 +82,13 @@ class LoopStatistics:
     act: list[float] = field(default_factory=list)
     busy: list[float] = field(default_factory=list)
     overruns: int = 0
+    unrecorded: bool = False
 
     def summary(self) -> dict[str, Any]:
         """Return p50, p99 and the largest of each in ms, and the counts."""
         stages = ("jitter", "pose_age", "latency", "render", "act", "busy")
         table = {name: percentiles(getattr(self, name)) for name in stages}
-        return {**table, "ticks": len(self.busy), "overruns": self.overruns}
+        return {**table, "ticks": len(self.busy), "overruns": self.overruns, "unrecorded": self.unrecorded}
 
 
 def percentiles(seconds: list[float]) -> dict[str, float] | None:
@@ -102,7 +109,7 @@ class FlightLoop:
         link: To the vehicle.
         rate: Hz.
         recorder: Writes the flight; None: it is not written.
-        watch: Called after each tick with its outputs; for people to look at.
+        watchers: Called after each tick with its outputs; for people to look at.
         clock: Tells the time.
 
     Attributes:
@@ -118,23 +125,28 @@ class FlightLoop:
         link: Link,
         rate: float,
         recorder: FlightRecorder | None = None,
-        watch: Callable[[Outputs], None] | None = None,
+        watchers: Sequence[Callable[[Outputs], None]] = (),
         clock: Clock | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
         self.last: Outputs | None = None
         self._chain, self._poses, self._operator, self._link = chain, poses, operator, link
         self._period = 1.0 / rate
-        self._recorder, self._watch = recorder, watch
+        self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
         self._stop: str | None = None
+        self._reasons: tuple[Reason, ...] = ()
 
     def stop(self, reason: str) -> None:
         """End the flight after the tick that is under way."""
         self._stop = self._stop or reason
 
-    def run(self, duration: float | None = None) -> str:
-        """Fly until the flight is over, or for so many seconds; disarm in any case.
+    def run(self, duration: float | None = None, patience: float | None = None) -> str:
+        """Fly until the flight is over; disarm in any case.
+
+        Args:
+            duration: s after arming at which it is over; None: as long as it takes.
+            patience: s for which it waits to be armed; None: as long as it takes.
 
         Returns:
             Why it ended.
@@ -142,25 +154,35 @@ class FlightLoop:
         with self._answering_signals(), _without_garbage_collection():
             try:
                 self._chain.warm_up()
-                return self._run(duration)
+                return self._run(duration, patience)
             finally:
                 self._say_farewell()
 
-    def _run(self, duration: float | None) -> str:
+    def _run(self, duration: float | None, patience: float | None) -> str:
         began = deadline = self._clock.now()
-        overrun, flew = False, False
+        overrun, flew, words = False, False, ""
         while self._stop is None:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
             outputs = self._tick(start, deadline, overrun)
-            flew = flew or outputs.verdict.command.armed
+            words = self._say_why_not(outputs, words)
+            if outputs.verdict.command.armed and not flew:
+                flew, began = True, start
             deadline, overrun = self._next(deadline)
             if flew and not outputs.verdict.command.armed:
-                words = "; ".join(outputs.verdict.words) or "disarmed"
-                return f"{outputs.verdict.state.value}: {words}"
-            if duration is not None and start - began >= duration:
-                return f"{duration:g} s are over" + ("" if flew else f"; not armed: {'; '.join(outputs.verdict.words)}")
-        return self._stop
+                return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
+            longest = duration if flew else patience
+            if longest is not None and start - began >= longest:
+                return f"{longest:g} s are over" + ("" if flew else f"; not armed: {words}")
+        return self._stop + ("" if flew else f"; not armed: {words}")
+
+    def _say_why_not(self, outputs: Outputs, said: str) -> str:
+        """Log what speaks against arming, when it changes; return it. In flight nothing is written."""
+        words = "; ".join(outputs.verdict.words)
+        if not outputs.verdict.command.armed and outputs.verdict.reasons != self._reasons:
+            logger.info("not armed: %s", words)
+        self._reasons = outputs.verdict.reasons
+        return words
 
     def _tick(self, start: float, deadline: float, overrun: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
@@ -169,14 +191,23 @@ class FlightLoop:
         sent = self._link.send(outputs.verdict.command)
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
-        if self._recorder is not None:
-            took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
-            message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
-            self._recorder.tick(start, message)
-        if self._watch is not None:
-            self._watch(outputs)
+        took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
+        self._show(inputs, outputs, took, sent)
         self.last = outputs
         return outputs
+
+    def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
+        """Write it down and show it; a full disk, or a page that fails, must not end a flight."""
+        try:
+            if self._recorder is not None:
+                message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
+                self._recorder.tick(inputs.time, message)
+            for watch in self._watchers:
+                watch(outputs)
+        except Exception:
+            logger.exception("the flight goes on, and is neither recorded nor shown any longer")
+            self.statistics.unrecorded = True
+            self._recorder, self._watchers = None, ()
 
     def _next(self, deadline: float) -> tuple[float, bool]:
         """Return the next deadline, on the same grid however late it is, and whether one was missed."""
@@ -193,18 +224,20 @@ class FlightLoop:
         if outputs.pose is not None:
             noted.render.append(outputs.render_s)
             noted.act.append(outputs.act_s)
+            noted.pose_age.append(done - outputs.measured)
         if inputs.received:
             noted.latency.append(done - inputs.received[-1].time)
-            noted.pose_age.append(inputs.time - inputs.received[-1].time)
 
     def _say_farewell(self) -> None:
         """Send disarm frames for a while: the vehicle must hear one, and radios lose some."""
-        deadline = self._clock.now()
+        deadline, failed = self._clock.now(), False
         for _ in range(round(FAREWELL * FAREWELL_RATE)):
             try:
                 self._link.send(at_rest())
-            except OSError as error:
-                logger.error("the link does not take the disarm frame: %s", error)
+            except Exception as error:  # whatever it is, the next one may get through
+                if not failed:
+                    logger.error("the link does not take the disarm frame: %s", error)
+                failed = True
             deadline += 1.0 / FAREWELL_RATE
             self._clock.sleep_until(deadline)
 
@@ -215,7 +248,7 @@ class FlightLoop:
         def stop(number: int, frame: FrameType | None) -> None:
             self.stop(f"{signal.Signals(number).name}")
 
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, stop) for number in ENDING}
         try:
             yield
         finally:

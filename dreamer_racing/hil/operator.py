@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import sys
 import time
@@ -70,8 +71,11 @@ class UdpOperator:
         clock: s; for tests.
 
     Attributes:
-        rejected: Datagrams that were no such packets, or older than one before.
+        rejected: Datagrams that were no such packets, or older than one before; a switch that begins to count anew must
+            be waited for with a new flight.
     """
+
+    _MOST = 256  # datagrams taken in at a time: a flood must not stop the loop
 
     def __init__(self, port: int, host: str = "127.0.0.1", clock: Callable[[], float] = time.monotonic) -> None:
         self.rejected = 0
@@ -84,7 +88,7 @@ class UdpOperator:
 
     def poll(self) -> Operator:
         """Return what is wanted now, without waiting."""
-        while True:
+        for _ in range(self._MOST):
             try:
                 data = self._socket.recv(PACKET_SIZE + 1)
             except (BlockingIOError, ConnectionRefusedError):
@@ -133,13 +137,13 @@ class KeyboardOperator:
 
     def poll(self) -> Operator:
         """Return what is wanted now, without waiting."""
-        while self._select([self._terminal], [], [], 0.0)[0]:
-            key = self._terminal.read(1)
-            self._will = (
-                self._will._replace(enable=not self._will.enable) if key == "e" else Operator(self._will.enable, True)
-            )
-            if not key:
-                break
+        if self._select([self._terminal], [], [], 0.0)[0]:
+            try:
+                keys = os.read(self._terminal.fileno(), 1024)  # past Python's buffer, in which select sees nothing
+            except OSError:
+                keys = b""  # the terminal is gone
+            enable = self._will.enable ^ bool(keys.count(b"e") % 2)
+            self._will = Operator(enable, self._will.kill or not keys or bool(keys.strip(b"e")))
         return self._will
 
     def close(self) -> None:
@@ -150,23 +154,28 @@ class KeyboardOperator:
 
 
 class TimedOperator:
-    """Enables by itself after a while: for a vehicle that is simulated, never for a real one.
+    """Enables by itself, again and again until the vehicle is armed: for one that is simulated, never for a real one.
 
     Args:
-        delay: s from the first time it is asked until it enables.
+        delay: s for which it releases, and then enables, in turn.
         clock: s; for tests.
     """
 
     def __init__(self, delay: float = 0.5, clock: Callable[[], float] = time.monotonic) -> None:
         self._delay, self._clock = delay, clock
         self._from: float | None = None
+        self._armed = False
+
+    def note(self, armed: bool) -> None:
+        """Take note of whether the vehicle is armed; from then on the enable stays."""
+        self._armed = self._armed or armed
 
     def poll(self) -> Operator:
         """Return what is wanted now."""
         now = self._clock()
         if self._from is None:
-            self._from = now + self._delay
-        return Operator(now >= self._from, False)
+            self._from = now
+        return Operator(self._armed or (now - self._from) % (2 * self._delay) >= self._delay, False)
 
     def close(self) -> None:
         """Do nothing."""

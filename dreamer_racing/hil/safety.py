@@ -208,7 +208,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._moved_at = math.inf
+            self._moved_at = self._now + self.limits.lift_off_time - self.limits.still_time
 
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
@@ -238,7 +238,7 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._now
-        self._moved_at = math.inf  # when it was last seen to move in this flight; infinite: not yet
+        self._moved_at = math.inf  # when it was last seen to move in this flight; as if, until it must have
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
@@ -327,9 +327,7 @@ class Safety:
         if seen.speed > limits.start_speed:
             self._moved_at = self._now
         elif self.armed and self._now - self._moved_at > limits.still_time:
-            findings[Reason.STRANDED] = (
-                f"it has not moved for {self._now - self._moved_at:.3g} s: is it lying somewhere?"
-            )
+            findings[Reason.STRANDED] = "it does not move: is it held fast, or lying somewhere?"
         return findings
 
     def _check_setpoint(self, tick: Tick) -> Findings:

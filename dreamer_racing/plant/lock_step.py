@@ -71,7 +71,9 @@ class LockStep:
 
     def fly(self, chain: FlightChain, rate: float, duration: float, recorder: FlightRecorder | None = None) -> str:
         """Fly until the flight is over, or for so many s; return why it ended."""
-        return FlightLoop(chain, self.poses, self.operator, self, rate, recorder, clock=self).run(duration)
+        return FlightLoop(chain, self.poses, self.operator, self, rate, recorder, clock=self).run(
+            duration, patience=duration
+        )
 
     def _deliver(self, data: bytes) -> None:
         packet = decode_pose(data)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import pytest
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
-from dreamer_racing.hil.loop import FAREWELL
+from dreamer_racing.hil.loop import ENDING, FAREWELL
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
@@ -135,7 +134,7 @@ def test_the_operators_kill_wins_at_once(armed):
     assert not any(command.armed for moment, command in plant.sent if moment > 1.53)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ENDING)
 def test_a_signal_ends_the_flight_with_a_second_of_disarm_frames(number):
     plant, sent = Watched(CIRCLE), []
 
@@ -163,6 +162,23 @@ def test_whatever_breaks_the_vehicle_is_disarmed():
         plant.fly(chain_of(Broken(), plant), 50.0, 30.0)
     assert any(command.armed for _, command in plant.sent)
     assert [command.armed for _, command in plant.sent[-50:]] == [False] * 50
+
+
+def test_a_disk_that_is_full_does_not_end_a_flight():
+    class Full:
+        def tick(self, time, message):
+            if time > BEGAN + 1.0:
+                raise OSError(28, "No space left on device")
+
+    plant = Watched(CIRCLE)
+    assert plant.fly(chain_of(Hover(), plant), 50.0, 2.0, Full()) == "2 s are over"
+    assert max(moment for moment, command in plant.sent if command.armed) > 2.4
+
+
+def test_what_is_held_fast_does_not_spin_for_ever():
+    plant = Watched(CIRCLE)
+    assert fly_hovering(plant).startswith("cut: it does not move")
+    assert 3.0 < max(moment for moment, command in plant.sent if command.armed) < 4.0
 
 
 def test_the_actor_forgets_until_the_vehicle_moves():

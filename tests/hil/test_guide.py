@@ -52,4 +52,4 @@ def test_every_choice_is_there(name):
 
 def test_numbers_in_the_text():
     assert f"{BELOW_FLOOR:g} m lower" in ROWS["fence_low"][0]
-    assert f"lapses after {DEAD_MAN:g} s without" in TEXT and f"LiveView(port={PORT})" in TEXT
+    assert f"lapses after {DEAD_MAN:g} s without" in TEXT and f"`view={PORT}`" in TEXT

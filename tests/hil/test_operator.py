@@ -94,11 +94,26 @@ def test_keys():
         assert operator.poll() == Operator(True, False)
         os.write(ours, b"e")
         assert operator.poll() == Operator(False, False)
-        os.write(ours, b" ")
-        assert operator.poll().kill
+        os.write(ours, b"e ")  # between two ticks
+        assert operator.poll() == Operator(True, True)
         operator.close()
         operator.close()
     os.close(ours)
+
+
+def test_a_terminal_that_is_gone_kills():
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs, "r", buffering=1) as terminal:
+        operator = KeyboardOperator(terminal)
+        os.close(ours)
+        assert operator.poll().kill
+
+
+def test_a_flood_does_not_hold_the_loop(switch):
+    for sequence in range(2000):
+        switch.say(encode_operator(sequence, Operator(False, False)))
+    switch.poll()
+    assert switch._sequence < 300
 
 
 def test_without_a_terminal_there_are_no_keys(tmp_path):
@@ -108,7 +123,11 @@ def test_without_a_terminal_there_are_no_keys(tmp_path):
 
 
 def test_a_timed_operator_enables_by_itself(clock):
-    operator = TimedOperator(0.5, clock)
-    assert operator.poll() == Operator(False, False)
-    clock.now = 0.5
+    operator, given = TimedOperator(0.5, clock), []
+    for clock.now in (7.0, 7.4, 7.5, 7.9, 8.1, 8.6, 9.2):  # again and again, until it is armed
+        operator.note(armed=False)
+        given.append(operator.poll().enable)
+    assert given == [False, False, True, True, False, True, False]
+    operator.note(armed=True)
+    operator.note(armed=False)
     assert operator.poll() == Operator(True, False)

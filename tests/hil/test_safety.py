@@ -235,7 +235,7 @@ def test_tilt_cuts_when_it_lasts(axis, degrees, reasons):
 
 def test_what_has_flown_and_lies_still_is_cut():
     flight = Flight(still_time=0.5).flying()
-    assert flight.ticks(40).state is State.FLYING  # it has not left the start yet
+    assert flight.ticks(40).state is State.FLYING  # it has not left the start yet, and has 3 s for that
     flight.tick(pose={"velocity": (0.0, 0.3, 0.0)})
     assert flight.ticks(16).state is State.FLYING  # as long as allowed
     verdict = flight.tick()

@@ -30,7 +30,7 @@ IMAGE[:32], IMAGE[32:] = (255, 0, 0), (0, 0, 255)  # red above blue
 def outputs(image: np.ndarray | None = IMAGE, state: State = State.FLYING, words: tuple[str, ...] = ()) -> Outputs:
     command = Command(True, hover()) if state is State.FLYING else at_rest()
     pose = Pose(1.0, np.array([1.0, 2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.0, 4.0]), np.zeros(3))
-    return Outputs(Verdict(state, command, (), words), hover(), pose, image, 2, 8, 0.0015, 0.0025)
+    return Outputs(Verdict(state, command, (), words), hover(), pose, 0.0, image, 2, 8, 0.0015, 0.0025)
 
 
 NO_POSE = outputs(None, State.DISARMED, ("there is no pose", "<b> & more"))._replace(pose=None, setpoint=None)

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.inlet import bind
 from dreamer_racing.hil.links.udp import CommandPacket, UdpLink, encode_command
-from dreamer_racing.hil.pose import PosePacket, UdpPose, bind, decode_pose
+from dreamer_racing.hil.pose import PosePacket, UdpPose, decode_pose
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
 from dreamer_racing.plant import process
 from dreamer_racing.plant.commands import CommandReceiver

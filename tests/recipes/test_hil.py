@@ -93,6 +93,7 @@ def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
             {"actor": "pilot", "link": "crsf", "operator": "timed"},
             "operator=timed enables by itself, and link=crsf may be",
         ),
+        ({"actor": "pilot", "link_host": "10.0.0.5"}, "link_host=10.0.0.5 is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
     ],

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.inlet import bind
 from dreamer_racing.hil.links.udp import UdpLink
-from dreamer_racing.hil.pose import UdpPose, bind
+from dreamer_racing.hil.pose import UdpPose
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest
 from tests.plant.test_betaflight_sitl import Firmware
 from tests.running_recipes import ROOT, recipe

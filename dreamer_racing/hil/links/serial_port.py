@@ -71,8 +71,16 @@ class SerialTransport:
         except OSError as error:
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
         if written < len(data):
-            self._port.reset_output_buffer()
+            self._throw_away()
         return written == len(data)
+
+    def _throw_away(self) -> None:
+        import termios
+
+        try:
+            self._port.reset_output_buffer()
+        except termios.error as error:  # which is no OSError
+            raise OSError(f"device={self._device}: it is gone: {error}.") from error
 
     def close(self) -> None:
         """Close the port."""
