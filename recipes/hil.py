@@ -160,6 +160,7 @@ OPERATORS = ("keyboard", "udp", "timed")
 
 def fly(config: HilConfig) -> int:
     """Fly one flight; return the exit status: 0 if it was flown to its end."""
+    config.stamping = stamping_of(config)
     flyer, contract = make_flyer(config)
     track = load_track(config.track or contract["source"]["track"])
     chain = make_chain(config, flyer, track)
@@ -181,7 +182,7 @@ def fly(config: HilConfig) -> int:
             print(f"view: {view.address}")
             watchers.append(view.show)
         print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
-        print(f"poses: {config.pose}, stamped by {stamping_of(config).value}")
+        print(f"poses: {config.pose}, stamped by {config.stamping.value}")
         loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
         ended = loop.run(config.duration, config.patience)
     passes = chain.progress.passes
