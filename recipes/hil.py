@@ -16,10 +16,10 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field, make_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_type_hints
 
 import hydra
 from composing.command_line import CONFIG_DIR, new_run_dir, plain_errors, start_logging
@@ -53,8 +53,8 @@ STATISTICS = "statistics.json"
 LimitsConfig = make_dataclass(
     "LimitsConfig",
     [
-        (limit.name, list[float] | None if limit.type == "Vector" else float | None, field(default=None))
-        for limit in fields(SafetyLimits)
+        (name, float | None if kind in (float, int) else list[float] | None, field(default=None))
+        for name, kind in get_type_hints(SafetyLimits).items()
     ],
 )
 """`SafetyLimits` by their names; null: the default, or what the track says."""
@@ -175,8 +175,6 @@ def fly(config: HilConfig) -> int:
             about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
             recorder = opened.enter_context(FlightRecorder(folder / FILE, about))
         watchers: list[Callable[[Outputs], None]] = []
-        if isinstance(operator, TimedOperator):
-            watchers.append(lambda outputs: operator.note(outputs.verdict.command.armed))
         if config.view is not None:
             view = opened.enter_context(closing(LiveView(config.view)))
             print(f"view: {view.address}")
@@ -314,7 +312,12 @@ def replay(config: HilConfig) -> int:
     flyer, contract = make_flyer(settings)
     track = load_track(settings.track or contract["source"]["track"])
     settings.renderer = config.renderer
-    chain = make_chain(settings, flyer, track)
+    with closing(make_chain(settings, flyer, track)) as chain:
+        return play(flight, chain)
+
+
+def play(flight: Flight, chain: FlightChain) -> int:
+    """Put every tick of a flight through a chain; return 0 if all come out as they were written, 1 otherwise."""
     chain.warm_up()
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
@@ -322,7 +325,6 @@ def replay(config: HilConfig) -> int:
             name = differing[0]
             print(f"tick {index}: {name} was {tick['out'][name]}, and is {again[name]} now", file=sys.stderr)
             return 1
-    chain.close()
     print(f"replayed: {len(flight.ticks)} ticks, every one as it was written{'' if flight.whole else ' (cut off)'}")
     return 0
 

@@ -15,6 +15,7 @@ from dreamer_racing.figures.drawing import dress, save
 
 LABELS = {
     "delay": ("command delay (ms)", 1e3),
+    "latency": ("pose latency, not told (ms)", 1e3),
     "mass": ("mass, relative", 1.0),
     "thrust": ("thrust, relative", 1.0),
     "position_noise": ("position noise (mm)", 1e3),

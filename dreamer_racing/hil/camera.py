@@ -25,6 +25,7 @@ class NoseCamera:
 
     Attributes:
         backend: The one that draws.
+        camera: As given.
 
     Raises:
         RendererUnavailableError: None works here; the message says why and what would help.
@@ -44,6 +45,7 @@ class NoseCamera:
             break
         else:
             raise RendererUnavailableError(" ".join(reasons))
+        self.camera = camera
         tilt = math.radians(camera.tilt)
         self._mount = np.array(camera.position)
         self._up = np.array((-math.sin(tilt), 0.0, math.cos(tilt)))

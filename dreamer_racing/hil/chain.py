@@ -103,6 +103,8 @@ class FlightChain:
         self.clock = PoseClock(config.stamping, config.latency)
         self.safety = Safety(config.limits)
         self._flyer, self._camera, self._config = flyer, camera, config
+        drawn = None if camera is None else camera.camera
+        self._mismatch = None if flyer.camera in (None, drawn) else f"it sees by {flyer.camera}, drawn is {drawn}"
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
@@ -135,6 +137,7 @@ class FlightChain:
                 setpoint=setpoint,
                 operator=inputs.operator,
                 arm_requested=self._config.arm,
+                contract_mismatch=self._mismatch,
                 loop_overrun=inputs.overrun,
                 finish=finish,
             )

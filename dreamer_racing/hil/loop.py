@@ -29,7 +29,6 @@ FAREWELL = 1.0
 FAREWELL_RATE = 50.0
 """Hz of those frames [choice]."""
 
-
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
 
@@ -114,7 +113,6 @@ class FlightLoop:
 
     Attributes:
         statistics: What ticks took.
-        last: The last tick's outputs.
     """
 
     def __init__(
@@ -129,7 +127,6 @@ class FlightLoop:
         clock: Clock | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
-        self.last: Outputs | None = None
         self._chain, self._poses, self._operator, self._link = chain, poses, operator, link
         self._period = 1.0 / rate
         self._recorder, self._watchers = recorder, watchers
@@ -160,23 +157,24 @@ class FlightLoop:
 
     def _run(self, duration: float | None, patience: float | None) -> str:
         began = deadline = self._clock.now()
-        overrun, flew, words = False, False, ""
+        overrun, flew, armed, words = False, False, False, ""
         while self._stop is None:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
-            outputs = self._tick(start, deadline, overrun)
-            words = self._say_why_not(outputs, words)
-            if outputs.verdict.command.armed and not flew:
+            outputs = self._tick(start, deadline, overrun, armed)
+            words = self._say_why_not(outputs)
+            armed = outputs.verdict.command.armed
+            if armed and not flew:
                 flew, began = True, start
             deadline, overrun = self._next(deadline)
-            if flew and not outputs.verdict.command.armed:
+            if flew and not armed:
                 return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
             longest = duration if flew else patience
             if longest is not None and start - began >= longest:
                 return f"{longest:g} s are over" + ("" if flew else f"; not armed: {words}")
         return self._stop + ("" if flew else f"; not armed: {words}")
 
-    def _say_why_not(self, outputs: Outputs, said: str) -> str:
+    def _say_why_not(self, outputs: Outputs) -> str:
         """Log what speaks against arming, when it changes; return it. In flight nothing is written."""
         words = "; ".join(outputs.verdict.words)
         if not outputs.verdict.command.armed and outputs.verdict.reasons != self._reasons:
@@ -184,16 +182,15 @@ class FlightLoop:
         self._reasons = outputs.verdict.reasons
         return words
 
-    def _tick(self, start: float, deadline: float, overrun: bool) -> Outputs:
+    def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
-        inputs = Inputs(start, self._poses.poll(), self._operator.poll(), overrun)
+        inputs = Inputs(start, self._poses.poll(), self._operator.poll(armed), overrun)
         outputs = self._chain.tick(inputs)
         sent = self._link.send(outputs.verdict.command)
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
         self._show(inputs, outputs, took, sent)
-        self.last = outputs
         return outputs
 
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
@@ -243,7 +240,7 @@ class FlightLoop:
 
     @contextmanager
     def _answering_signals(self) -> Iterator[None]:
-        """Let Ctrl-C and SIGTERM end the flight, and a second one not interrupt the farewell."""
+        """Let the signals of `ENDING` end the flight, and a second one not interrupt the farewell."""
 
         def stop(number: int, frame: FrameType | None) -> None:
             self.stop(f"{signal.Signals(number).name}")

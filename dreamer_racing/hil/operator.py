@@ -37,8 +37,8 @@ class Operator(NamedTuple):
 class OperatorSource(Protocol):
     """Where the operator's will comes from."""
 
-    def poll(self) -> Operator:
-        """Return what is wanted now, without waiting."""
+    def poll(self, armed: bool = False) -> Operator:
+        """Return what is wanted now, without waiting; ``armed``: whether the vehicle is, since the tick before."""
         ...
 
     def close(self) -> None:
@@ -86,7 +86,7 @@ class UdpOperator:
         self._heard = -DEAD_MAN
         self._sequence: int | None = None
 
-    def poll(self) -> Operator:
+    def poll(self, armed: bool = False) -> Operator:
         """Return what is wanted now, without waiting."""
         for _ in range(self._MOST):
             try:
@@ -135,7 +135,7 @@ class KeyboardOperator:
         tty.setcbreak(self._terminal)
         self._will = Operator(False, False)
 
-    def poll(self) -> Operator:
+    def poll(self, armed: bool = False) -> Operator:
         """Return what is wanted now, without waiting."""
         if self._select([self._terminal], [], [], 0.0)[0]:
             try:
@@ -166,15 +166,12 @@ class TimedOperator:
         self._from: float | None = None
         self._armed = False
 
-    def note(self, armed: bool) -> None:
-        """Take note of whether the vehicle is armed; from then on the enable stays."""
-        self._armed = self._armed or armed
-
-    def poll(self) -> Operator:
-        """Return what is wanted now."""
+    def poll(self, armed: bool = False) -> Operator:
+        """Return what is wanted now: once the vehicle is armed the enable stays."""
         now = self._clock()
         if self._from is None:
             self._from = now
+        self._armed = self._armed or armed
         return Operator(self._armed or (now - self._from) % (2 * self._delay) >= self._delay, False)
 
     def close(self) -> None:

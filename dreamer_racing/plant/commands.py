@@ -10,7 +10,7 @@ from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.vehicle import at_rest
 from dreamer_racing.plant.vehicle import PlantVehicle
 
-LOGGER = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 TIMEOUT = 0.25
 """s without a valid message after which motors are cut [choice]: twelve commands at 50 Hz."""
@@ -46,7 +46,7 @@ class Failsafe:
             self._cleared = True
         elif not (self._cleared or self._complained):
             self._complained = True
-            LOGGER.warning("plant: armed without having been disarmed: motors stay off until it is disarmed once")
+            logger.warning("plant: armed without having been disarmed: motors stay off until it is disarmed once")
         return armed and self._cleared
 
     def expire(self, time: float) -> bool:
@@ -55,7 +55,7 @@ class Failsafe:
             return False
         self._cleared = self._complained = False
         self.events += 1
-        LOGGER.warning("plant: nothing heard for %.2f s: motors cut until disarmed and armed again", self._timeout)
+        logger.warning("plant: nothing heard for %.2f s: motors cut until disarmed and armed again", self._timeout)
         return True
 
 

@@ -104,7 +104,7 @@ class _Operator:
     def __init__(self, lock_step: LockStep) -> None:
         self._lock_step = lock_step
 
-    def poll(self) -> Operator:
+    def poll(self, armed: bool = False) -> Operator:
         lock_step = self._lock_step
         return Operator(lock_step.elapsed >= lock_step.enable_after, lock_step.killed)
 

@@ -24,7 +24,7 @@ from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import POSITIVE, Range, setting
 from dreamer_racing.training.signals import GracefulExit
 
-LOGGER = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 LATE = 0.005
 """s behind the clock from which it counts as late [choice]: the time between two poses at 200 Hz."""
@@ -250,12 +250,12 @@ def run(vehicle: PlantVehicle, delivery: Delivery, options: ProcessOptions, sock
     try:
         with GracefulExit() as stop:
             host, port = sockets.incoming.getsockname()
-            LOGGER.info("plant: %s, listens on %s:%d, poses to %d", vehicle.track.name, host, port, options.pose_port)
+            logger.info("plant: %s, listens on %s:%d, poses to %d", vehicle.track.name, host, port, options.pose_port)
             if options.lock_step:
                 fly_in_lock_step(plant, sockets.incoming, stop, vehicle.control_dt, duration)
             else:
                 fly_in_real_time(plant, sockets.incoming, stop, options.speed, duration)
     finally:
         sockets.close()
-        LOGGER.info(plant.summary())
+        logger.info(plant.summary())
     return plant

@@ -17,6 +17,7 @@ from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "delay": (0.0, 0.02, 0.04, 0.06, 0.08, 0.1),  # s, of commands
+    "latency": (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1),  # s, of poses, of which the loop is not told
     "mass": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
     "thrust": (0.8, 0.9, 1.0, 1.1, 1.2),  # relative
     "position_noise": (0.0, 0.01, 0.02, 0.05, 0.1),  # m, standard deviation
@@ -38,7 +39,7 @@ class StudyFlight(NamedTuple):
     """What came of a flight.
 
     Args:
-        sweep: Name of what was changed; ``none`` for the vehicle as it is.
+        sweep: Name of what was changed.
         value: To what.
         seed: Of the poses' noise.
         gates: Passed in order, by the plant's own count.

@@ -24,7 +24,7 @@ from dreamer_racing.envs.tracks import GROUND_HEIGHT, Track, load_track
 from dreamer_racing.hil.vehicle import Command, Pose, at_rest
 from dreamer_racing.settings import Range, setting
 
-LOGGER = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 LIFT_OFF = 0.5
 """Share of its weight that a drone must be asked to carry before the stand lets go [choice]."""
@@ -260,7 +260,7 @@ class PlantVehicle:
             self.on_stand = False
             position = torch.from_numpy(self._start[:3]).unsqueeze(0)
             self._race.begin(torch.tensor([True]), position, torch.tensor([0]))
-            LOGGER.info("plant: the stand let go at %.2f s", self.time)
+            logger.info("plant: the stand let go at %.2f s", self.time)
 
     def _judge(self) -> None:
         """Keep the path of a control step, and at its end have it judged."""
@@ -273,9 +273,9 @@ class PlantVehicle:
         self.gates_passed = int(outcome.gates_passed)
         if outcome.lap_time > 0.0:
             self.lap_times.append(float(outcome.lap_time))
-            LOGGER.info("plant: lap %d in %.2f s", len(self.lap_times), self.lap_times[-1])
+            logger.info("plant: lap %d in %.2f s", len(self.lap_times), self.lap_times[-1])
         self.crash = CrashCause(int(outcome.crash))
         if self.crash is not CrashCause.NONE:
             words = self.crash.name.lower().replace("_", " ")
             self.fate = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
-            LOGGER.info("plant: crash: %s", self.fate)
+            logger.info("plant: crash: %s", self.fate)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.hil.loop import ENDING, FAREWELL
@@ -206,6 +208,15 @@ def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid(
     fly_hovering(plant, 1.3)
     moments = [moment for moment, _ in plant.sent if 0.97 < moment <= 1.17]
     assert moments == pytest.approx([0.98, 1.0, 1.075, 1.08, 1.1, 1.12, 1.14, 1.16])
+
+
+def test_images_of_another_camera_are_not_flown_by():
+    flyer, plant = ActorFlyer(AGENTS / "circle"), Watched(CIRCLE)
+    config = ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True)
+    chain = FlightChain(flyer, CIRCLE, config, NoseCamera(CIRCLE, replace(flyer.camera, tilt=0.0)))
+    assert "the actor's contract does not fit" in plant.fly(chain, flyer.rate, 2.0)
+    assert not any(command.armed for _, command in plant.sent)
+    chain.close()
 
 
 def test_a_contract_that_does_not_fit_is_refused_with_what_differs():

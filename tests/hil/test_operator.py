@@ -125,9 +125,7 @@ def test_without_a_terminal_there_are_no_keys(tmp_path):
 def test_a_timed_operator_enables_by_itself(clock):
     operator, given = TimedOperator(0.5, clock), []
     for clock.now in (7.0, 7.4, 7.5, 7.9, 8.1, 8.6, 9.2):  # again and again, until it is armed
-        operator.note(armed=False)
-        given.append(operator.poll().enable)
+        given.append(operator.poll(armed=False).enable)
     assert given == [False, False, True, True, False, True, False]
-    operator.note(armed=True)
-    operator.note(armed=False)
-    assert operator.poll() == Operator(True, False)
+    assert operator.poll(armed=True) == Operator(True, False)
+    assert operator.poll(armed=False) == Operator(True, False)
