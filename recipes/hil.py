@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, cast, get_type_hints
 
 import hydra
-from composing.command_line import CONFIG_DIR, new_run_dir, plain_errors, start_logging
+from composing.command_line import CONFIG_DIR, agent_path, new_run_dir, plain_errors, start_logging
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -43,7 +43,6 @@ from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.view import LiveView
 from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
 
-AGENTS = Path(__file__).parents[1] / "agents"
 PILOT = "pilot"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
@@ -208,7 +207,7 @@ def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
         return PilotFlyer(load_track(config.track), config.preset, rate), pilot_contract(config.track)
-    path = AGENTS / config.actor if (AGENTS / config.actor).is_dir() else Path(config.actor)
+    path = agent_path(config.actor)
     flyer = ActorFlyer(path)
     check_contract(flyer.contract, config.track or flyer.contract["source"]["track"], config.rate)
     return flyer, flyer.contract

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import cast
 
 import hydra
-from composing.command_line import CONFIG_DIR, new_run_dir, plain_errors, start_logging
+from composing.command_line import CONFIG_DIR, agent_path, new_run_dir, plain_errors, start_logging
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,7 +30,6 @@ from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
 from dreamer_racing.settings import COUNT, Range, check_settings, setting
 
-AGENTS = Path(__file__).parents[1] / "agents"
 PILOT = "pilot"
 RESULT = "sim_to_real.json"
 
@@ -92,7 +91,7 @@ def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         return config.track, partial(PilotFlyer, load_track(config.track), config.preset, config.rate)
-    path = AGENTS / config.actor if (AGENTS / config.actor).is_dir() else Path(config.actor)
+    path = agent_path(config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
     return config.track or contract["source"]["track"], partial(ActorFlyer, path)
 

@@ -1,4 +1,4 @@
-"""Where bytes come in, without ever waiting: UDP, or a serial port."""
+"""Where bytes come in, without ever waiting: UDP; a serial port is `links.serial_port.SerialPort`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import sys
 import time
 from collections.abc import Iterator
 from typing import Protocol
-
-from dreamer_racing.hil.links.serial_port import SerialSettings, open_port
 
 RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name
 
@@ -72,39 +70,6 @@ class UdpInlet:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-class SerialInlet:
-    """Reads from a serial port; bytes count as arrived when they are read, up to a tick late.
-
-    Args:
-        device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
-        settings: Of the protocol.
-
-    Raises:
-        ImportError: pyserial is not installed.
-        OSError: The device is missing, of no use, or another's; the message says which.
-        ValueError: The device has no such baud rate.
-    """
-
-    whole = False
-
-    def __init__(self, device: str, settings: SerialSettings) -> None:
-        self._device = device
-        self._port = open_port(device, settings)
-
-    def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the bytes in the buffer, if there are any."""
-        try:
-            data = self._port.read(self._port.in_waiting)
-        except OSError as error:
-            raise OSError(f"device={self._device}: it is gone: {error}.") from error
-        if data:
-            yield time.monotonic(), data
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -12,6 +12,7 @@ from omegaconf.errors import MissingMandatoryValue
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
 CONFIG_DIR = Path(__file__).parents[1] / "config"
+AGENTS = Path(__file__).parents[2] / "agents"
 
 
 @contextmanager
@@ -40,6 +41,11 @@ def start_logging() -> None:
 def new_run_dir(recipe: str, track: str) -> Path:
     """A fresh folder name below `runs/`."""
     return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def agent_path(name: str) -> Path:
+    """The folder of an agent that ships, by its name; else the path that the name is."""
+    return AGENTS / name if (AGENTS / name).is_dir() else Path(name)
 
 
 def override_key(override: str) -> str:

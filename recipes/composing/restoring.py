@@ -8,6 +8,7 @@ from typing import Any, cast
 import torch
 
 from composing.arena import Environment, make_env
+from composing.command_line import AGENTS
 from composing.devices import choose_device
 from composing.learners import clock_times, make_learner, scheduled
 from composing.saved import trained_config
@@ -37,9 +38,6 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, load_state
 from dreamer_racing.training.directory import RunDirectory, ensure_writable, latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
-
-AGENTS = Path(__file__).parents[2] / "agents"
-"""Where the agents that ship lie, each in a folder of its name."""
 
 
 @dataclass

@@ -21,7 +21,7 @@ from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
 from dreamer_racing.hil.links.msp import encode_msp
 from dreamer_racing.hil.links.sbus import encode_sbus
-from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialTransport
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort
 from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
@@ -138,4 +138,4 @@ def _wire(config: LinkConfig) -> Transport:
     settings = PROTOCOLS[config.name]
     if config.baud is not None:
         settings = settings._replace(baud=config.baud)
-    return SerialTransport(_given(config.device, "device", config), settings)
+    return SerialPort(_given(config.device, "device", config), settings)

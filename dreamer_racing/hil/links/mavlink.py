@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 from dreamer_racing.hil.links.link import Transport, TransportLink
+from dreamer_racing.hil.mavlink_messages import import_messages
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import Command
 
@@ -45,7 +46,7 @@ class MavlinkLink(TransportLink):
     def __init__(self, transport: Transport, thrust: ThrustMap, system: int = 1, component: int = 1) -> None:
         super().__init__(transport)
         self.thrust = thrust
-        self._common = _import_messages()
+        self._common = import_messages("The link mavlink")
         self._target = system, component
         self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._armed_for = 0  # commands in a row
@@ -81,16 +82,3 @@ class MavlinkLink(TransportLink):
         data = bytes(message.pack(self._sender))
         self._sender.seq = (self._sender.seq + 1) % 256
         return data
-
-
-def _import_messages() -> Any:
-    """Return the module of MAVLink 2's common messages.
-
-    Raises:
-        ImportError: It is not installed.
-    """
-    try:
-        from pymavlink.dialects.v20 import common
-    except ImportError as error:
-        raise ImportError("The link mavlink needs pymavlink: pip install 'dreamer_racing[hil]'.") from error
-    return common

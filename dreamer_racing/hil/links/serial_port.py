@@ -1,9 +1,11 @@
-"""Serial ports: the settings of each protocol, and a transport that never waits."""
+"""Serial ports: the settings of each protocol, and a port that never waits, to write to and to read from."""
 
 from __future__ import annotations
 
 import errno
 import os
+import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 
@@ -37,8 +39,8 @@ _REMEDIES = {
 }
 
 
-class SerialTransport:
-    """Writes to a serial port.
+class SerialPort:
+    """A `Transport` for commands, and an `Inlet` of what comes in, which counts as arrived when read, up to a tick late.
 
     Args:
         device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
@@ -49,6 +51,8 @@ class SerialTransport:
         OSError: The device is missing, of no use, or another's; the message says which.
         ValueError: The device has no such baud rate.
     """
+
+    whole = False
 
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
@@ -74,6 +78,19 @@ class SerialTransport:
             self._throw_away()
         return written == len(data)
 
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield the bytes in the buffer, if there are any, with the time now, s (``time.monotonic``).
+
+        Raises:
+            OSError: The device is gone.
+        """
+        try:
+            data = self._port.read(self._port.in_waiting)
+        except OSError as error:
+            raise OSError(f"device={self._device}: it is gone: {error}.") from error
+        if data:
+            yield time.monotonic(), data
+
     def _throw_away(self) -> None:
         import termios
 
@@ -88,7 +105,7 @@ class SerialTransport:
 
 
 def open_port(device: str, settings: SerialSettings) -> Any:
-    """Return an open port of pyserial; raises as `SerialTransport` does."""
+    """Return an open port of pyserial; raises as `SerialPort` does."""
     try:
         import serial
     except ImportError as error:

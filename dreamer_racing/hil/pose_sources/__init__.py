@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from dreamer_racing.hil.inlet import Inlet, SerialInlet, UdpInlet
-from dreamer_racing.hil.links.serial_port import PROTOCOLS
+from dreamer_racing.hil.inlet import Inlet, UdpInlet
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort
 from dreamer_racing.hil.pose import PoseSource, UdpPose
 from dreamer_racing.hil.pose_sources import mavlink, ros2
 from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
@@ -112,4 +112,4 @@ def _inlet(config: PoseConfig) -> Inlet:
     if config.device is None:
         return UdpInlet(_given(config.port, "port or device", config), config.host)
     settings = PROTOCOLS["mavlink"]
-    return SerialInlet(config.device, settings if config.baud is None else settings._replace(baud=config.baud))
+    return SerialPort(config.device, settings if config.baud is None else settings._replace(baud=config.baud))

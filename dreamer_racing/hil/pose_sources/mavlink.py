@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from dreamer_racing.hil.inlet import Inlet
+from dreamer_racing.hil.mavlink_messages import import_messages
 from dreamer_racing.hil.pose import PosePacket, make_packet
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose, plausible
 from dreamer_racing.hil.stamping import turn
@@ -55,7 +56,7 @@ class MavlinkPose(MessagePose):
 
     def __init__(self, inlet: Inlet, message: str = "ODOMETRY", smoothing: float = SMOOTHING) -> None:
         super().__init__(smoothing)
-        self._common = _import_messages()
+        self._common = import_messages("The pose source mavlink")
         self._inlet, self._wanted = inlet, message
         self._read = MESSAGES[message]
         self._parser = self._make_parser()
@@ -161,16 +162,3 @@ def _half_turn_of_attitude(attitude: Sequence[float]) -> np.ndarray:
     """Return an attitude (4,) wxyz, FRD → NED, as FLU → z up."""
     w, x, y, z = attitude
     return np.array((w, x, -y, -z))
-
-
-def _import_messages() -> Any:
-    """Return the module of MAVLink 2's common messages.
-
-    Raises:
-        ImportError: It is not installed.
-    """
-    try:
-        from pymavlink.dialects.v20 import common
-    except ImportError as error:
-        raise ImportError("The pose source mavlink needs pymavlink: pip install 'dreamer_racing[hil]'.") from error
-    return common

@@ -18,7 +18,7 @@ from dreamer_racing.hil.links import LinkConfig, make_link  # noqa: E402
 from dreamer_racing.hil.links.crsf import decode_crsf  # noqa: E402
 from dreamer_racing.hil.links.msp import decode_msp  # noqa: E402
 from dreamer_racing.hil.links.sbus import decode_sbus  # noqa: E402
-from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialSettings, SerialTransport  # noqa: E402
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings  # noqa: E402
 from dreamer_racing.hil.sticks import RateMap, ThrustMap  # noqa: E402
 from dreamer_racing.hil.vehicle import at_rest  # noqa: E402
 
@@ -74,7 +74,7 @@ def test_mavlink_over_a_serial_port(wire):
 def test_settings_of_protocols(monkeypatch, name, baud, parity, stop_bits):
     opened = {}
     monkeypatch.setattr(serial, "Serial", lambda device, baudrate, **others: opened.update(others, baud=baudrate))
-    SerialTransport("/dev/radio", PROTOCOLS[name])
+    SerialPort("/dev/radio", PROTOCOLS[name])
     assert (opened["baud"], opened["parity"], opened["stopbits"]) == (baud, parity, stop_bits)
     assert opened["write_timeout"] == 0 and opened["exclusive"]
 
@@ -119,7 +119,7 @@ def test_a_device_that_is_pulled_out():
     far, near = os.openpty()
     tty.setraw(near)
     path = os.ttyname(near)
-    transport = SerialTransport(path, MSP)
+    transport = SerialPort(path, MSP)
     os.close(near)
     os.close(far)
     with pytest.raises(OSError, match=f"device={path}: it is gone: Input/output error"):
@@ -129,7 +129,7 @@ def test_a_device_that_is_pulled_out():
 
 def test_no_such_device():
     with pytest.raises(OSError, match="device=/dev/no_radio: there is no such device. Is it plugged in"):
-        SerialTransport("/dev/no_radio", MSP)
+        SerialPort("/dev/no_radio", MSP)
 
 
 def test_a_device_of_another_user(monkeypatch):
@@ -140,28 +140,28 @@ def test_a_device_of_another_user(monkeypatch):
 
     monkeypatch.setattr(serial, "Serial", refuse)
     with pytest.raises(OSError, match="device=/dev/ttyUSB0: you may not use it: sudo usermod -aG dialout"):
-        SerialTransport("/dev/ttyUSB0", MSP)
+        SerialPort("/dev/ttyUSB0", MSP)
 
 
 def test_a_device_in_use(wire):
-    first = SerialTransport(wire[1], MSP)
+    first = SerialPort(wire[1], MSP)
     with pytest.raises(OSError, match=f"device={wire[1]}: another program uses it"):
-        SerialTransport(wire[1], MSP)
+        SerialPort(wire[1], MSP)
     first.close()
 
 
 def test_no_serial_port():
     with pytest.raises(OSError, match="device=/dev/null: Could not configure port"):
-        SerialTransport("/dev/null", MSP)
+        SerialPort("/dev/null", MSP)
 
 
 @pytest.mark.parametrize("baud", [0, -1, 2**40])
 def test_no_such_rate(wire, baud):
     with pytest.raises(ValueError, match=f"baud={baud}: "):
-        SerialTransport(wire[1], SerialSettings(baud, "N", 1))
+        SerialPort(wire[1], SerialSettings(baud, "N", 1))
 
 
 def test_without_pyserial(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(ImportError, match=r"pip install 'dreamer_racing\[hil\]'"):
-        SerialTransport("/dev/ttyUSB0", MSP)
+        SerialPort("/dev/ttyUSB0", MSP)

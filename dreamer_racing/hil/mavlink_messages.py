@@ -1,0 +1,21 @@
+"""MAVLink's messages, for the link and for the source of poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def import_messages(who: str) -> Any:
+    """Return the module of MAVLink 2's common messages.
+
+    Args:
+        who: Needs it, for the message.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    try:
+        from pymavlink.dialects.v20 import common
+    except ImportError as error:
+        raise ImportError(f"{who} needs pymavlink: pip install 'dreamer_racing[hil]'.") from error
+    return common
