@@ -40,7 +40,7 @@ _REMEDIES = {
 
 
 class SerialPort:
-    """A `Transport` for commands, and an `Inlet` of what comes in, which counts as arrived when read, up to a tick late.
+    """A `Transport` for commands, and an `Inlet` of what comes in, arrived when it is read, up to a tick late.
 
     Args:
         device: Its path; those in /dev/serial/by-id/ stay the same when plugged in again.
