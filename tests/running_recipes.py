@@ -15,6 +15,20 @@ from omegaconf import OmegaConf
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
 
+SMALL = [
+    "track=circle", "model=debug", "env.num_envs=4", "prefill=400", "total_env_steps=800", "replay.capacity=4000",
+    "evaluation.every=400", "evaluation.episodes=2", "evaluation.video_steps=60", "checkpoint.every=400",
+    "logger.every=200",
+]  # fmt: skip
+"""A short run that evaluates and saves on the way."""
+TINY = [
+    "track=circle", "model=debug", "model.batch_size=2", "env.num_envs=4", "env.episode_steps=40", "prefill=100",
+    "total_env_steps=200", "replay.capacity=1000", "replay.held_out=1", "evaluation.every=0", "evaluation.episodes=1",
+    "evaluation.video_steps=20", "checkpoint.every=0", "logger=csv", "logger.every=100", "device=cpu",
+]  # fmt: skip
+"""The shortest run there is."""
+AT_THE_END = "evaluation.every=1000000"
+
 
 def recipe(
     name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
@@ -45,3 +59,11 @@ def compose(recipe_name: str, *overrides: str) -> OmegaConf:
     recipe_module("composing.schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         return hydra.compose(recipe_name, overrides=list(overrides))
+
+
+def build(*overrides: str) -> None:
+    """Resolve and build a run as `recipes/dreamer_v3.py` does, in this process."""
+    dreamer, command_line = recipe_module("dreamer_v3"), recipe_module("composing.command_line")
+    with command_line.plain_errors():
+        config = dreamer.resolve(compose("dreamer_v3", "model=debug", "env.from_pixels=false", *overrides))
+        dreamer.build(OmegaConf.to_object(config), list(overrides)).close()

@@ -1,0 +1,175 @@
+"""Configurations: every one composes, and what is left open is chosen as said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torchrl.envs.transforms import Transform
+
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.pass_share import PassShare
+from dreamer_racing.training.schedule import Clock
+from tests.running_recipes import CONFIG, build, compose, recipe_module
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
+def test_every_group_composes(path: Path) -> None:
+    group = path.parent.name
+    append = "+" if group == "decoys" else ""  # not among the defaults
+    config = compose({"network": "ppo"}.get(group, "dreamer_v3"), f"{append}{group}={path.stem}")
+    assert OmegaConf.select(config, group) is not None
+
+
+def test_every_model_config_names_a_known_size() -> None:
+    from dreamer_racing.modules import SIZES
+
+    named = {path.stem: OmegaConf.load(path)["size"] for path in (CONFIG / "model").glob("*.yaml")}
+    assert named.pop("auto") == "auto"
+    assert named.keys() == set(SIZES) and all(name == size for name, size in named.items())
+
+
+@pytest.mark.parametrize("name", recipe_module("composing.schema").RECIPES)
+def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> None:
+    schema, recipe = recipe_module("composing.schema"), recipe_module(name)
+    config = OmegaConf.to_object(recipe.resolve(compose(name, "budget=smoke", "device=cpu", "env.from_pixels=false")))
+    assert type(config) is schema.RECIPES[name] and callable(recipe.build)
+    if isinstance(config, schema.ReplayRunConfig):
+        ratio = config.replay_ratio
+        assert OmegaConf.select(OmegaConf.structured(config), ratio.setting) == ratio.ratio
+        assert ratio.updates(config.total_env_steps) > 0
+    interface = Interface(pixels=False, vector_dim=21)
+    learner = recipe_module("composing.learners").make_learner(config, interface, "cpu")
+    assert (learner.updates, learner.device) == (0, torch.device("cpu"))
+    for policy in (learner.policy(), learner.evaluation_policy()):
+        assert policy.deterministic is False and isinstance(policy.make_primer(), Transform)
+    learner.check_finite()
+    learner.load_state_dict(learner.state_dict())
+
+
+def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
+    config = recipe_module("composing.schema").RunConfig()
+    with pytest.raises(NotImplementedError, match=r"make_learner\(\) knows no learner of a RunConfig"):
+        recipe_module("composing.learners").make_learner(config, Interface(), "cpu")
+
+
+def test_decoys_are_a_config_group() -> None:
+    arena, dreamer = recipe_module("composing.arena"), recipe_module("dreamer_v3")
+    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=figure8", "+decoys=paper")))
+    assert arena.worlds_of(config)["track"] == load_track("figure8_decoys")
+    config.track = "circle"
+    with pytest.raises(ValueError, match=r"decoys=paper is for track=figure8; track 'circle'"):
+        arena.worlds_of(config)
+    assert OmegaConf.to_object(compose("evaluate", "checkpoint=x", "+decoys=none")).decoys == "none"
+
+
+def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
+    build(f"run_dir={tmp_path}", "env.num_envs=4", "prefill=64", "total_env_steps=80", "replay.capacity=1000")
+    assert OmegaConf.load(tmp_path / "config.yaml").model.batch_length == 16
+
+
+def test_a_single_world_holds_nothing_out(capsys: pytest.CaptureFixture[str]) -> None:
+    dreamer = recipe_module("dreamer_v3")
+    for num_envs, held_out in ((1, 0), (2, 1)):
+        config = dreamer.resolve(compose("dreamer_v3", "model=debug", f"env.num_envs={num_envs}"))
+        assert config.replay.held_out == held_out
+        assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 1)
+
+
+@pytest.mark.parametrize("override", ["loss.actor=dynamics", "loss.actor=reinforce", "replay.held_out=0"])
+def test_what_races_goes_with_other_actors(override: str) -> None:
+    config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
+    recipe_module("composing.checks").check_dreamer(OmegaConf.to_object(config))
+
+
+def test_settings_that_race_yield_to_the_command_line() -> None:
+    tuned = compose("dreamer_v3", "tuned=race")
+    assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
+    assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
+    assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("ppo", False, True)
+    changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
+    assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
+
+
+def test_dreamer_as_published_is_one_word_away() -> None:
+    """Every number of losses, model and schedule as in the reference, or as its size says."""
+    faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
+    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.LossConfig))
+    assert OmegaConf.to_container(faithful.env) | {"num_envs": None} == OmegaConf.to_container(
+        OmegaConf.structured(schema.EnvConfig(num_envs=1))
+    ) | {"num_envs": None}
+    assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
+    schedule = OmegaConf.to_container(faithful.schedule)
+    assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.ScheduleConfig))
+    assert schedule.pop("wait_for_model") is None and schedule.pop("wait_every")
+    assert all(ramp["to"] is None for ramp in schedule.values())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["track=kidney"], "race"),
+        (["track=kidney", "env=faithful", "loss=informed", "budget=cpu"], "race"),
+        (["model=debug"], "none"),
+        (["model=size12m"], "none"),
+        (["model=cpu_small"], "race"),
+        (["budget=smoke"], "none"),
+        (["env.from_pixels=false"], "none"),
+        (["env=dmc", "task=walker_walk"], "none"),
+    ],
+)
+def test_what_races_is_chosen_where_it_does(
+    overrides: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert recipe_module("dreamer_v3").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
+    assert ("tuned=race" in capsys.readouterr().out) == (expected == "race")
+
+
+def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
+    saved = OmegaConf.create({"algorithm": "dreamer_v3", "model": {"size": "debug", "decay_updates": 8}, "old": 1})
+    config = recipe_module("composing.saved").with_schema(saved, "dreamer_v3")
+    assert config.model.size == "debug" and "decay_updates" not in config.model
+    assert "settings of another version, left out: old=1, model.decay_updates=8" in capsys.readouterr().out
+
+
+def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
+    overrides = ["env=dmc", "task=cartpole_swingup", "env.image_size=96", "model=debug", "device=cpu", "seed=3"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    evaluated = recipe_module("composing.arena").make_suite(config, 1, 4)
+    assert evaluated.observation_spec["pixels"].shape == (1, 96, 96, 3)
+    evaluated.close()
+
+
+def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
+    overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
+    overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    recipe_module("composing.checks").check_dreamer(config)
+    learners, passes = recipe_module("composing.learners"), PassShare(1)
+    assert learners.scheduled(config, learners.clock_times(config, 100_000, passes))["min_std"] == pytest.approx(0.1)
+    passes.best = 0.6
+    assert learners.scheduled(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(0.075)
+
+
+def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
+    learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
+    assert set(names) == {"discount", "entropy_scale", "min_std", "noise_correlation"}
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
+    overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates")]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    begin, end = (learners.scheduled(config, {Clock.run: share}) for share in (0.0, 1.0))
+    assert begin == {"rates": 1.0} | {name: getattr(config.loss, name) for name in names}
+    assert end == dict.fromkeys(("rates", *names), 0.5)
+    learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
+    learner.adjust(**end)
+    assert float(learner.losses["actor"].noise_correlation) == learner.discount == 0.5
+
+
+def test_nothing_goes_by_gates_where_there_are_none():
+    overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
+    with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
+        recipe_module("composing.checks").check_dreamer(config)

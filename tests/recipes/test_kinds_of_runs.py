@@ -1,0 +1,168 @@
+"""Runs of every kind, as a user starts them: without images, in the Control Suite, ended by a signal ..."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from dreamer_racing.envs.control_suite import ControlSuiteEnv
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.directory import latest_checkpoint
+from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, compose, recipe, recipe_module, rows
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_exits_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "recipes" / "dreamer_v3.py"), *SMALL, "total_env_steps=1000000",
+               "evaluation.every=0", "checkpoint.every=1000000", "run_dir=run"]  # fmt: skip
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, **pipes) as process:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline:
+            if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):
+                break
+            time.sleep(0.2)
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, output
+    assert number.name in output and "of 1,000,000 env_steps" in output
+    assert list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
+
+
+@pytest.mark.slow
+def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
+    try:
+        ControlSuiteEnv("cartpole_swingup", 1).close()
+    except RendererUnavailableError as error:
+        pytest.skip(str(error))
+    settings = [setting for setting in TINY if not setting.startswith(("track=", "env."))]
+    settings += ["env=dmc", "task=cartpole_swingup", "prefill=1000", "total_env_steps=1050", AT_THE_END]
+    done = recipe("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = rows(tmp_path / "run")
+    assert any(row["episode/return"] for row in table), "an episode has 500 records"
+    for column in ("evaluation/return_mean", "loss_image", "held_out/image_error"):
+        assert any(row[column] for row in table), column
+    assert not any(name.startswith("curriculum/") or "gates" in name for name in table[0])
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    for other in ("evaluate", "export"):
+        refused = recipe(other, "checkpoint=run", cwd=tmp_path)
+        assert refused.returncode == 2 and "Traceback" not in refused.stderr, refused.stderr
+        assert "cartpole_swingup" in refused.stderr and "race" in refused.stderr
+    resumed = recipe("dreamer_v3", "resume=run", "task=walker_walk", cwd=tmp_path)
+    assert resumed.returncode == 2 and "Traceback" not in resumed.stderr, resumed.stderr
+
+
+@pytest.mark.slow
+def test_an_overlapped_run(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "collection=overlapped", "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = rows(tmp_path / "run")
+    # The rollout that was under way at the end is kept too.
+    assert [int(row["env_steps"]) for row in table] == [128, 224, 256]
+    assert any(float(row["loss_image"] or "nan") > 0 for row in table)
+    assert latest_checkpoint(tmp_path / "run").name.endswith("256")
+
+
+@pytest.mark.slow
+def test_a_run_without_images(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "env.from_pixels=false", AT_THE_END, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    run_dir = tmp_path / "run"
+    table = rows(run_dir)
+    for column in ("loss_vector", "evaluation/gates_per_episode", "evaluation/success_rate"):
+        assert any(row[column] for row in table), column
+    assert "loss_image" not in table[0]
+    assert list((run_dir / "plots").glob("*.png")) and list((run_dir / "evaluations").glob("*.json"))
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
+    done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
+    assert "environment of other observations" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_run_on_small_images(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "env.image_size=32", AT_THE_END, "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    last = [row for row in rows(tmp_path / "run") if row["loss_image"]][-1]
+    assert float(last["loss_image"]) == pytest.approx(float(last["image_error"]) * 32 * 32 * 3, rel=1e-3)
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", "video_steps=20", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_privileged_run_is_evaluated(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "loss=privileged", "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", "video_steps=20", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "run" / "evaluation" / "evaluation.json").read_text())
+    assert all(len(report[policy]["episodes"]) == 2 for policy in ("deterministic", "stochastic"))
+    assert (tmp_path / "run" / "evaluation" / "videos" / "deterministic.mp4").stat().st_size > 0
+
+
+POISON = """
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+step, steps = DroneRacingEnv._step, []
+
+def poisoned(env, tensordict):
+    steps.append(0)
+    data = step(env, tensordict)
+    return data if len(steps) < 45 else data.set("reward_base", data["reward_base"] + float("inf"))
+
+DroneRacingEnv._step = poisoned
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [100, 0], ids=["checkpoint", "no checkpoint"])
+def test_a_loss_that_is_not_finite_ends_the_run(every: int, tmp_path: Path) -> None:
+    settings = [*TINY, "env.from_pixels=false", f"checkpoint.every={every}", "total_env_steps=2000"]
+    done = recipe("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path, before=POISON)
+    assert done.returncode == 1, done.stderr
+    run_dir, message = tmp_path / "run", done.stderr[done.stderr.index("error:") :].strip()
+    assert "is not finite" in message and "nonfinite_batch.pt" in message and "model.learning_rate" in message
+    assert "Traceback" not in message and "\n" not in message
+    batch = torch.load(run_dir / "nonfinite_batch.pt", weights_only=True)
+    assert batch["reward"].shape == (2, 16, 1) and math.inf in batch["reward"]
+    if not every:
+        assert "there is no checkpoint yet" in message
+        return
+    kept = latest_checkpoint(run_dir)
+    assert kept.name in message
+    for path in kept.rglob("*learner*/**/*.pt"):
+        weights = torch.load(path, weights_only=True)["agent"]
+        assert all(value.isfinite().all() for value in weights.values()), "what was saved is not the last good state"
+    assert int(kept.name.rpartition("-")[2]) >= 100
+
+
+def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_path: Path) -> None:
+    options = ["env.control_rate=25", "env.start_on_line=0.5", "env.miss_radius=2", "evaluation.start_noise=1"]
+    options.append("evaluation.episodes=3")
+    resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *TINY, *options, "env.episode_steps=null"))
+    assert resolved.env.episode_steps == 500
+    config, arena = OmegaConf.to_object(resolved), recipe_module("composing.arena")
+    env = arena.make_env(config)
+    assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
+    assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
+    learner = recipe_module("composing.learners").make_learner(config, Interface.of(env), "cpu")
+    env.close()
+    report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
+    assert report._course.base.worlds.parameters.control_dt == 0.04
+    assert report._course.base.worlds.race._sweep._miss_radius == 0
+    assert report._course.base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"
+    assert len({episode.reward_sum for episode in report.evaluate(deterministic=True).episodes}) == 3
+    report.close()

@@ -1,0 +1,116 @@
+"""What the training recipes refuse, in plain words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from tests.running_recipes import build, compose, recipe, recipe_module
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["total_env_steps=abc"], ["total_env_steps", "abc"]),
+        (["track=monza"], ["monza", "kidney"]),
+        (["run_dir=/dev/null/run"], ["/dev/null/run"]),
+        (["env.preset=hard"], ["hard", "easy", "faithful"]),
+        (["env.renderer=directx"], ["directx", "egl"]),
+        (["device=cuda:7"], ["cuda:7", "cpu"]),
+        (["env.device=gpu"], ["env.device=gpu", "cpu", "cuda"]),
+        (["env.device=cuda:7"], ["cuda:7", "finds no CUDA device", "cpu"]),
+        (["env.device=cuda", "collection=overlapped"], ["overlapped", "env.device=cpu"]),
+        (["env.looks=pretty"], ["pretty", "nominal", "randomised"]),
+        (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
+        (["loss.actor=magic"], ["magic", "reinforce"]),
+        (["resume=/nowhere"], ["/nowhere"]),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_bad_input_gets_a_plain_error(overrides: list[str], words: list[str], tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", "model=debug", *overrides, cwd=tmp_path)
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    assert all(word in done.stderr for word in words), done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 6
+
+
+REFUSED = [
+    (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
+    (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
+    (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4000", "above prefill=4000"]),
+    (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
+    (["model.batch_length=1"], ["model.batch_length=1", "at least 2"]),
+    (["model.learning_rate=-1"], ["model.learning_rate=-1", "above 0"]),
+    (["env.image_size=40"], ["env.image_size=40", "multiple of 16", "32, 64 or 96"]),
+    (["loss.discount=1.5"], ["loss.discount=1.5", "at least 0 and at most 1"]),
+    (["checkpoint.keep=0"], ["checkpoint.keep=0", "at least 1"]),
+    (["loss.world_model=nowhere:Loss"], ["nowhere:Loss", "cannot be imported"]),
+    (["prefill=512", "total_env_steps=527"], ["total_env_steps=527", "64 records"]),  # 15 × 4 are less than 4 × 16
+    (["replay.capacity=100000000000"], ["replay.capacity=100,000,000,000", " GB when full", "left", "memmap"]),
+    (["replay.capacity=100"], ["capacity=100", "batch_length=16", "at least 512"]),
+    (["replay.held_out=32"], ["held_out=32", "num_envs=32"]),
+    (["replay.recent_share=1.5"], ["recent_share=1.5", "at least 0 and at most 1"]),
+    (["env.suite=atari"], ["env.suite=atari", "race", "dmc"]),
+    (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
+    (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
+    (["device=quantum"], ["device=quantum", "cpu"]),
+    (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
+    (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
+    (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
+    (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
+    (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
+    (["schedule.noise_correlation.to=1"], ["schedule.noise_correlation.to=1.0: must be at least 0 and at most 0.99"]),
+    (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
+    (["model.imagine_recent=true"], ["model.imagine_recent=true, and replay.recent_share=0 draws none"]),
+    (
+        ["model.imagine_recent=true", "replay.recent_share=0.5", "model.imagination_starts=null"],
+        ["model.imagination_starts=null begins from all"],
+    ),
+    (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),
+    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends improvements before loss.ppo.kl_target=0.03"]),
+    (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
+    (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for loss.actor=ppo"]),
+    (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
+    (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
+    (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
+    (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
+    (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
+]
+
+
+@pytest.mark.parametrize(("overrides", "words"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
+def test_what_cannot_work_is_refused_before_it_starts(
+    overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exited:
+        build(f"run_dir={tmp_path / 'run'}", *overrides)
+    assert exited.value.code == 2
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("error: ") and "\n" not in message
+    assert all(word in message for word in words), message
+    assert not list((tmp_path / "run").glob("*.yaml")), "a run that was refused left its configuration"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["task=walker_walk"], "task=walker_walk is for the Control Suite: add env=dmc"),
+        (["env=dmc", "track=circle"], "track=circle is for races"),
+        (["env=dmc", "+decoys=paper"], "decoys=paper are for races"),
+    ],
+)
+def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        recipe_module("composing.checks").check_overrides(compose("dreamer_v3", *overrides), overrides)
+
+
+def test_an_unknown_protocol_is_refused() -> None:
+    config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=quick"))
+    with pytest.raises(ValueError, match="protocol=quick: there are nominal, full"):
+        recipe_module("evaluate").check(config)
+    config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=full", "start_noise=1"))
+    with pytest.raises(ValueError, match="start_noise=1.0 is for protocol=nominal"):
+        recipe_module("evaluate").check(config)
