@@ -50,7 +50,8 @@ MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
   70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
-  25 actions a second; the actor is trained by PPO on imagined rollouts; averaged weights fly evaluations and exports
+  25 actions a second; the actor learns by PPO from what it flew, in the model's latents, its critic from imagination
+  too; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 400  # env_steps/s of tuned=race on one core of an Intel Xeon with AMX, docs/experiments.md, entry 14
@@ -71,8 +72,9 @@ class DreamerRun(ReplayRun):
     remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
 
     def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Take note of the gates passed too."""
+        """Take note of the gates passed, and of how they were flown, too."""
         episodes = super().take_in(rollout)
+        self.learner.watch(rollout)
         if len(episodes) and "gates_passed" in episodes:
             share = self.passes.update(episodes)
             self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})

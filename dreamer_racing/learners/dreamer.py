@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule
 from dreamer_racing.learners.cuda_graph import GraphedStep, Step
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.learners.saved_dreamer import check_saved, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
@@ -92,36 +93,6 @@ def trained_parameters(agent: Agent, losses: Mapping[str, LossModule]) -> dict[s
     return {
         name: [p for p in (*network.parameters(), *own[name]) if p.requires_grad] for name, network in networks.items()
     }
-
-
-def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
-    """Refuse the state of a model of another size.
-
-    Args:
-        checkpoint: ``state_dict()["size"]`` of a learner.
-        size: The size of the learner that loads it.
-
-    Raises:
-        ValueError: If they differ in anything but the name; the message says in what, and what to do.
-    """
-    wanted = asdict(size)
-    checkpoint = {"sampled": ModelSize.sampled, **checkpoint}  # older ones do not say
-    differences = [
-        f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
-        for field in fields(size)
-        if field.name != "name" and _plain(checkpoint.get(field.name)) != _plain(wanted[field.name])
-    ]
-    if differences:
-        raise ValueError(
-            f"The checkpoint holds a model of size {checkpoint.get('name')!r}, but this learner was made with size "
-            f"{size.name!r} ({'; '.join(differences)}). Weights cannot be converted between sizes: start with "
-            f"model={checkpoint.get('name')} to use this checkpoint, or train size {size.name!r} from the beginning."
-        )
-
-
-def _plain(value: Any) -> Any:
-    """Return tuples as lists, as files keep them."""
-    return list(value) if isinstance(value, tuple) else value
 
 
 ACTOR_NUMBERS = ("horizon", "discount", "continuation")
@@ -233,6 +204,10 @@ class DreamerLearner:
             metrics |= improved
         self._average()
         return metrics
+
+    def watch(self, rollout: TensorDictBase) -> None:
+        """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy` as it is now."""
+        cast(ActorLoss, self.losses["actor"]).watch(rollout)
 
     def _average(self) -> None:
         """Move the averaged weights; while there are few updates they are the plain mean of all."""
@@ -372,7 +347,7 @@ class DreamerLearner:
             "size": asdict(self.size),
             "image_size": self.agent.interface.image_size,
             "agent": self.agent.state_dict(),
-            "losses": {name: _own_state(loss) for name, loss in self.losses.items()},
+            "losses": {name: own_state(loss) for name, loss in self.losses.items()},
             "optimizer": self.optimizer.state_dict(),
             "updates": self.updates,
             **({} if self.averaged is None else {"averaged": self.averaged.state_dict()}),
@@ -386,8 +361,7 @@ class DreamerLearner:
             ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
                 changed then.
         """
-        check_size(state_dict["size"], self.size)
-        self._check_parts(state_dict)
+        check_saved(state_dict, self.agent, self.losses)
         self.agent.load_state_dict(state_dict["agent"])
         for name, loss in self.losses.items():
             loss.load_state_dict(state_dict["losses"][name], strict=False)
@@ -407,40 +381,6 @@ class DreamerLearner:
     def _groups(self) -> ParameterGroups:
         own = [] if self._actor_optimizer is None else self._actor_optimizer.param_groups
         return [*self.optimizer.param_groups, *own]
-
-    def _check_parts(self, saved: dict[str, Any]) -> None:
-        """Refuse networks or losses of other parameters than these."""
-        # Older checkpoints do not say: their images were of the default size.
-        there, here = saved.get("image_size", Interface.image_size), self.agent.interface.image_size
-        where = (
-            "in an environment of other observations or actions"
-            if there == here
-            else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
-        )
-        older = {"actor.min_std": self.agent.actor.min_std}  # they do not say
-        parts = {"networks": (self.agent.state_dict(), older | saved["agent"])}
-        for name, loss in self.losses.items():
-            # What a loss keeps from update to update it may do without; older versions keep less.
-            kept = {key for key, _ in loss.named_buffers()}
-            own, there = (
-                {key: value for key, value in state.items() if key not in kept}
-                for state in (_own_state(loss), saved["losses"][name])
-            )
-            parts[f"{name} loss"] = (own, there)
-        for part, (wanted, found) in parts.items():
-            lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
-            if lacking or surplus:
-                raise ValueError(
-                    f"The checkpoint's {part} has {', '.join(surplus[:2]) or 'nothing'} beyond this learner's, and "
-                    f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
-                    "environment of other observations. Choose those it was trained with."
-                )
-            for key, value in wanted.items():
-                if value.shape != found[key].shape:
-                    raise ValueError(
-                        f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
-                        f"{list(value.shape)}: it was trained {where}."
-                    )
 
     def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
         """Return the latents ``[N]`` to imagine from, with their ``terminated``."""
@@ -501,9 +441,3 @@ def make_dreamer(
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
     """Return the global norm of the gradients, a scalar."""
     return nn.utils.get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
-
-
-def _own_state(loss: LossModule) -> dict[str, Tensor]:
-    """Return a loss's state without that of the agent's networks, which it holds under their names."""
-    networks = ("world_model.", "actor.", "critic.")
-    return {key: value for key, value in loss.state_dict().items() if not key.startswith(networks)}

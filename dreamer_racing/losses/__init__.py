@@ -13,8 +13,9 @@ from typing import Any, Protocol, TypeVar
 from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
-from dreamer_racing.losses.config import ImaginedPPOConfig, LossConfig
+from dreamer_racing.losses.config import ActorPPOConfig, LossConfig
 from dreamer_racing.losses.critic import CriticLoss, replay_return
+from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
 from dreamer_racing.losses.ppo_actor import PPOActorLoss
 from dreamer_racing.losses.representation import (
@@ -49,6 +50,7 @@ ACTOR_LOSSES: dict[str, LossClass] = {
     "reinforce": ReinforceLoss,
     "dynamics": DynamicsActorLoss,
     "ppo": PPOActorLoss,
+    "flown_ppo": FlownPPOActorLoss,
 }
 CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
 
@@ -105,11 +107,12 @@ __all__ = [
     "KL_MODES",
     "WORLD_MODEL_LOSSES",
     "ActorLoss",
+    "ActorPPOConfig",
     "CriticLoss",
     "DecoderFreeLoss",
     "DynamicsActorLoss",
+    "FlownPPOActorLoss",
     "Imagination",
-    "ImaginedPPOConfig",
     "InformedLoss",
     "LossClass",
     "LossConfig",

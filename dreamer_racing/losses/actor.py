@@ -139,6 +139,9 @@ class ActorLoss(LossModule):
     def prepare(self, starts: int) -> None:
         """Make room for what a loss keeps of an update with so many starts."""
 
+    def watch(self, rollout: TensorDictBase) -> None:
+        """Take note of a collector's rollout ``[N, T]``, flown by the actor as it is now."""
+
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.
 

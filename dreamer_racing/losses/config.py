@@ -8,13 +8,16 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHAR
 
 
 @dataclass
-class ImaginedPPOConfig:
-    """Numbers of ``PPOActorLoss`` [choice, unless a source is named]; docs/experiments.md, entry 14, compares some.
+class ActorPPOConfig:
+    """Numbers of the actors that learn by PPO [choice, unless a source is named].
+
+    docs/experiments.md, entries 14 and 18, compares some.
 
     Attributes:
-        updates: K, learner updates whose rollouts are kept before the actor learns from them.
-        epochs: Times that every imagined step is trained on.
-        minibatch: M, imagined steps of a gradient step.
+        updates: ``actor=ppo``: K, learner updates whose imagined rollouts are kept before the actor learns from them.
+        flown: ``actor=flown_ppo``: steps, summed over environments, that are flown before the actor learns from them.
+        epochs: Times that every step is trained on.
+        minibatch: M, steps of a gradient step.
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
         advantage_clip: Largest normalised advantage.
         kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
@@ -26,6 +29,7 @@ class ImaginedPPOConfig:
     """
 
     updates: int = setting(8, COUNT)
+    flown: int = setting(8_192, COUNT)
     epochs: int = setting(3, COUNT)
     minibatch: int = setting(4096, COUNT)
     clip_epsilon: float = setting(0.2, POSITIVE)
@@ -43,7 +47,7 @@ class LossConfig:
     Attributes:
         world_model: ``reconstruction``, ``informed``, ``privileged``, ``decoder_free``, ``reward_only``, or
             ``module:Class`` of your own, as for the other two.
-        actor: ``reinforce``, ``dynamics`` or ``ppo``.
+        actor: ``reinforce``, ``dynamics``, ``ppo`` or ``flown_ppo``.
         critic: ``two_hot``.
         discount: γ.
         lambda_: λ of the returns.
@@ -63,7 +67,7 @@ class LossConfig:
         slow_critic_scale: Weight of the regularisation towards the slow critic.
         replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.
         replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
-        ppo: Numbers of ``actor=ppo``.
+        ppo: Numbers of ``actor=ppo`` and ``actor=flown_ppo``.
 
     Reference: danijar/dreamerv3, ``configs.yaml``.
     """
@@ -87,4 +91,4 @@ class LossConfig:
     slow_critic_scale: float = setting(1.0, NOT_NEGATIVE)
     replay_value_scale: float = setting(0.3, NOT_NEGATIVE)
     replay_value_gradient: bool = True
-    ppo: ImaginedPPOConfig = field(default_factory=ImaginedPPOConfig)
+    ppo: ActorPPOConfig = field(default_factory=ActorPPOConfig)

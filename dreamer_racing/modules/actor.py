@@ -42,6 +42,19 @@ class ActionDistribution(NamedTuple):
         deviation = (action - self.mean) / self.std
         return -(0.5 * deviation.square() + self.std.log() + _LOG_SQRT_2PI).sum(-1, keepdim=True)
 
+    def log_prob_clipped(self, action: Tensor) -> Tensor:
+        """Return the log-probability of what is left of an action ``(..., A)`` clipped to [−1, 1], nats, ``(..., 1)``.
+
+        Between the bounds it is the density of the normal, at a bound the probability of all that lies beyond it.
+
+        Reference: Fujita & Maeda 2018, "Clipped action policy gradient", Eq. 5.
+        """
+        deviation = (action - self.mean) / self.std
+        inside = -(0.5 * deviation.square() + self.std.log() + _LOG_SQRT_2PI)
+        # Below −1 lies Φ((−1 − mean) / std), above 1 Φ((mean − 1) / std).
+        beyond = torch.special.log_ndtr(torch.where(action < 0, deviation, -deviation))
+        return torch.where(action.abs() < 1.0, inside, beyond).sum(-1, keepdim=True)
+
     def entropy(self) -> Tensor:
         """Return the differential entropy Σ ln(σ√(2πe)), nats, ``(..., 1)``."""
         return (self.std.log() + (0.5 + _LOG_SQRT_2PI)).sum(-1, keepdim=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.actor import ActionDistribution, Actor
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
 
@@ -36,13 +36,14 @@ class DreamerPolicy(TensorDictModuleBase):
     | ``is_init`` | read | bool (N, 1) |
     | ``belief``, ``state``, ``previous_action`` | read | (N, D), (N, S), (N, A) |
     | ``action`` | written | (N, A) in [−1, 1] |
+    | ``loc``, ``scale`` | written | (N, A): mean and standard deviation that the action was drawn from |
     | ``("next", "belief")``, ``("next", "state")``, ``("next", "previous_action")`` | written | as above |
     """
 
     def __init__(self, world_model: WorldModel, actor: Actor, deterministic: bool = False) -> None:
         super().__init__()
         self.in_keys = [*world_model.encoder.keys, "is_init", "belief", "state", "previous_action"]
-        self.out_keys = ["action", ("next", "belief"), ("next", "state"), ("next", "previous_action")]
+        self.out_keys = ["action", "loc", "scale", ("next", "belief"), ("next", "state"), ("next", "previous_action")]
         self.encoder = world_model.encoder
         self.rssm = world_model.rssm
         self.actor = actor
@@ -59,18 +60,22 @@ class DreamerPolicy(TensorDictModuleBase):
         """
         batch = tensordict.batch_size
         flat = {key: tensordict.get(key).reshape(-1, *tensordict.get(key).shape[len(batch) :]) for key in self.in_keys}
-        action, belief, state = self.act(flat)
-        for key, value in zip(self.out_keys, (action, belief, state, action), strict=True):
+        policy, action, belief, state = self._decide(flat)
+        for key, value in zip(self.out_keys, (action, *policy, belief, state, action), strict=True):
             tensordict.set(key, value.reshape(*batch, -1))
         return tensordict
 
-    @torch.no_grad()
     def act(self, seen: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return action (N, A), belief (N, D) and state (N, S), in plain tensors.
 
         Args:
             seen: What is read, by the keys and shapes of the table, with one batch dimension; ``is_init`` may be (N,).
         """
+        return self._decide(seen)[1:]
+
+    @torch.no_grad()
+    def _decide(self, seen: Mapping[str, Tensor]) -> tuple[ActionDistribution, Tensor, Tensor, Tensor]:
+        """Return what ``act`` does, after the distribution of the action."""
         belief, state = self.rssm.observe_step(
             self.encoder(seen),
             seen["previous_action"],
@@ -81,7 +86,7 @@ class DreamerPolicy(TensorDictModuleBase):
         )
         policy = self.actor(join_features(belief, state))
         action = policy.mode() if self.deterministic else policy.sample()
-        return action.clamp(-1.0, 1.0), belief, state
+        return policy, action.clamp(-1.0, 1.0), belief, state
 
     def make_primer(self, device: torch.device | str = "cpu") -> TensorDictPrimer:
         """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size.

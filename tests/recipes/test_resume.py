@@ -89,14 +89,16 @@ def assert_same(first: Any, second: Any, where: str) -> None:
 RACE = [
     "tuned=race", "schedule.learning_rates.to=null", "schedule.discount.to=null", "schedule.min_std.to=null",
     "evaluation.start_noise=0", "model.imagination_starts=8",
-    "evaluation.stochastic=false", "loss.ppo.updates=7", "loss.ppo.kl_target=1e-9",
+    "evaluation.stochastic=false", "loss.ppo.updates=7", "loss.ppo.flown=200", "loss.ppo.kl_target=1e-9",
     "schedule.wait_for_model=1.1", "schedule.wait_every=300", "model.mixed_precision=false",
 ]  # fmt: skip
 """What races on a CPU, without the ramps over a run's length, which here is another before and after."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tuned", [["tuned=none"], RACE], ids=["none", "race"])
+@pytest.mark.parametrize(
+    "tuned", [["tuned=none"], RACE, [*RACE, "loss.actor=ppo"]], ids=["none", "race", "race in imagination"]
+)
 def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: Path) -> None:
     settings = [*SETTINGS, *tuned, "track=circle", "env=faithful"]
     train(tmp_path, 2000, *settings, "run_dir=whole")

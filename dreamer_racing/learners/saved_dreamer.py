@@ -1,0 +1,97 @@
+"""What a saved `DreamerLearner` holds of its losses, and whether it fits the learner that loads it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from typing import Any
+
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from dreamer_racing.modules import Agent, Interface, ModelSize
+
+
+def own_state(loss: LossModule) -> dict[str, Tensor]:
+    """Return a loss's state without that of the agent's networks, which it holds under their names."""
+    networks = ("world_model.", "actor.", "critic.")
+    return {key: value for key, value in loss.state_dict().items() if not key.startswith(networks)}
+
+
+def check_saved(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
+    """Refuse what another learner saved.
+
+    Args:
+        saved: ``state_dict()`` of a learner.
+        agent: The networks that are to load it.
+        losses: Theirs.
+
+    Raises:
+        ValueError: If it is that of a model of another size, of other losses or of another environment.
+    """
+    check_size(saved["size"], agent.size)
+    _check_parts(saved, agent, losses)
+
+
+def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
+    """Refuse the state of a model of another size.
+
+    Args:
+        checkpoint: ``state_dict()["size"]`` of a learner.
+        size: The size of the learner that loads it.
+
+    Raises:
+        ValueError: If they differ in anything but the name; the message says in what, and what to do.
+    """
+    wanted = asdict(size)
+    checkpoint = {"sampled": ModelSize.sampled, **checkpoint}  # older ones do not say
+    differences = [
+        f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
+        for field in fields(size)
+        if field.name != "name" and _plain(checkpoint.get(field.name)) != _plain(wanted[field.name])
+    ]
+    if differences:
+        raise ValueError(
+            f"The checkpoint holds a model of size {checkpoint.get('name')!r}, but this learner was made with size "
+            f"{size.name!r} ({'; '.join(differences)}). Weights cannot be converted between sizes: start with "
+            f"model={checkpoint.get('name')} to use this checkpoint, or train size {size.name!r} from the beginning."
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Return tuples as lists, as files keep them."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _check_parts(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
+    """Refuse networks or losses of other parameters than these."""
+    # Older checkpoints do not say: their images were of the default size.
+    there, here = saved.get("image_size", Interface.image_size), agent.interface.image_size
+    where = (
+        "in an environment of other observations or actions"
+        if there == here
+        else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
+    )
+    older = {"actor.min_std": agent.actor.min_std}  # they do not say
+    parts = {"networks": (agent.state_dict(), older | saved["agent"])}
+    for name, loss in losses.items():
+        # What a loss keeps from update to update it may do without; older versions keep less.
+        kept = {key for key, _ in loss.named_buffers()}
+        own, there = (
+            {key: value for key, value in state.items() if key not in kept}
+            for state in (own_state(loss), saved["losses"][name])
+        )
+        parts[f"{name} loss"] = (own, there)
+    for part, (wanted, found) in parts.items():
+        lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
+        if lacking or surplus:
+            raise ValueError(
+                f"The checkpoint's {part} has {', '.join(surplus[:2]) or 'nothing'} beyond this learner's, and "
+                f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
+                "environment of other observations. Choose those it was trained with."
+            )
+        for key, value in wanted.items():
+            if value.shape != found[key].shape:
+                raise ValueError(
+                    f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
+                    f"{list(value.shape)}: it was trained {where}."
+                )

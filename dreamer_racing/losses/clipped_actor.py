@@ -1,0 +1,214 @@
+"""PPO's improvement of an actor: epochs of minibatches on clipped ratios, with an optimiser of its own.
+
+REINFORCE takes one step along the gradient of one batch of rollouts, and an optimiser that normalises gradients makes
+it a full step however noisy it is. Here rollouts are kept, the actor does not move meanwhile, and then a few epochs of
+minibatches use them up; the clipped ratio bounds how far it moves for that much experience. Where that comes from is a
+subclass's: ``PPOActorLoss`` imagines it, ``FlownPPOActorLoss`` takes what the collector flew.
+
+Shape legend: M records of a minibatch, F features, A action.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from dreamer_racing.losses.actor import ActorLoss
+from dreamer_racing.losses.config import ActorPPOConfig, LossConfig
+from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.agent import Agent
+
+KL_TOLERANCE = 1.5
+"""Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
+PACE_CHANGE, SLOWEST_PACE = 1.25, 0.01
+"""Factor by which the learning rate then changes, and its smallest share [choice]."""
+
+LogProb = Callable[[ActionDistribution, Tensor], Tensor]
+"""Log-probability ``(..., 1)`` of an action ``(..., A)``."""
+
+
+class Minibatch(NamedTuple):
+    """Steps to learn from; each ``(M, ...)``.
+
+    Attributes:
+        features: Seen by the policy, ``(M, F)``.
+        action: Sampled there, ``(M, A)``.
+        old: Mean and standard deviation of the policy that sampled, ``(M, 2·A)``.
+        advantage: Normalised, ``(M, 1)``.
+        weight: What a step counts for, ``(M, 1)``.
+    """
+
+    features: Tensor
+    action: Tensor
+    old: Tensor
+    advantage: Tensor
+    weight: Tensor
+
+
+class ClippedActorLoss(ActorLoss):
+    """Improve the actor on steps that a subclass keeps.
+
+    Epochs of minibatches are made on ``−weight · (min(r·advantage, clip(r, 1 ± ε)·advantage) + entropy_scale · H[π])``,
+    r being the ratio of new to old probability of an action.
+
+    Args:
+        ppo: Numbers of the improvement.
+        args, kwargs: Of ``ActorLoss``.
+
+    Reference: Schulman et al. 2017, "Proximal policy optimization algorithms", Eq. 7.
+    """
+
+    log_prob: LogProb = staticmethod(ActionDistribution.log_prob)
+    """Of an action as it is kept."""
+    optimizer: torch.optim.Optimizer
+    pace: Tensor
+
+    def __init__(self, *args: Any, ppo: ActorPPOConfig | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.ppo = ppo or ActorPPOConfig()
+        self.register_buffer("pace", torch.ones(1))  # share of the learning rate
+        self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
+
+    @classmethod
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
+        return super().from_config(agent, config, horizon, ppo=config.ppo, **own)
+
+    @torch.no_grad()
+    def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Imagine and judge, for the critic and for what is kept; the loss itself is zero."""
+        features, action = self._imagine(belief, state)
+        judged = self._judge(features, terminated)
+        policy = self.actor(features[:-1])
+        if self.training:
+            self._keep(
+                features=features[:-1],
+                action=action,
+                old=torch.cat((policy.mean, policy.std), -1),
+                advantage=judged.lambda_return - judged.value,
+                weight=judged.weight,
+            )
+        return features.new_zeros(()), self._report(features, policy.entropy(), judged)
+
+    def _keep(self, **rollout: Tensor) -> None:
+        """Keep an imagined rollout, the parts of a ``Minibatch`` with ``(H, N)`` in front."""
+
+    def _improve_on(self, records: Minibatch) -> dict[str, Tensor]:
+        """Improve the actor on all records, at the present share of the learning rate.
+
+        Returns:
+            ``ppo/loss``, ``ppo/kl``, ``ppo/clipped`` (share of steps), ``ppo/epochs``, ``ppo/pace`` (share of the
+            learning rate) and ``gradient_norm/actor`` of what was done; scalars. A step whose gradient is not finite is
+            not made.
+        """
+        if self.ppo.kl_target is None:
+            self.pace.fill_(1.0)
+        with self._paced():
+            metrics = self._make_epochs(records._replace(advantage=self._normalised(records)))
+        metrics["ppo/pace"] = self.pace.squeeze().clone()
+        self._set_pace(metrics["ppo/kl"])
+        return metrics
+
+    def _make_epochs(self, records: Minibatch) -> dict[str, Tensor]:
+        """Make epochs of gradient steps, until one comes upon too large a divergence."""
+        number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
+        done: list[dict[str, Tensor]] = []
+        for _ in range(self.ppo.epochs):
+            order = torch.randperm(number, device=records.features.device)
+            for chosen in order.split(size):
+                metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)))
+                done.append(metrics)
+                if not metrics["ppo/kl"] <= self.ppo.kl_stop:  # waits for the device, some times an improvement
+                    return _summary(done, math.ceil(number / size))
+        return _summary(done, math.ceil(number / size))
+
+    @contextmanager
+    def _paced(self) -> Iterator[None]:
+        """Take the present share of the learning rates."""
+        pace, groups = float(self.pace), self.optimizer.param_groups
+        rates = [group["lr"] for group in groups]
+        for group, rate in zip(groups, rates, strict=True):
+            group["lr"] = rate * pace
+        try:
+            yield
+        finally:
+            for group, rate in zip(groups, rates, strict=True):
+                group["lr"] = rate
+
+    def _set_pace(self, kl: Tensor) -> None:
+        """Go slower after a divergence well above the target, and faster, up to the full rate, well below it."""
+        target = self.ppo.kl_target
+        if target is None:
+            return
+        if not kl <= KL_TOLERANCE * target:
+            self.pace.div_(PACE_CHANGE).clamp_(min=SLOWEST_PACE)
+        elif kl < target / KL_TOLERANCE:
+            self.pace.mul_(PACE_CHANGE).clamp_(max=1.0)
+
+    def _normalised(self, records: Minibatch) -> Tensor:
+        """Return the advantages with mean 0 and deviation 1 under their weights."""
+        share = records.weight / records.weight.sum().clamp_min(1e-8)
+        mean = (share * records.advantage).sum()
+        deviation = (share * (records.advantage - mean).square()).sum().sqrt()
+        advantage = (records.advantage - mean) / (deviation + 1e-8)
+        return advantage.clamp(-self.ppo.advantage_clip, self.ppo.advantage_clip)
+
+    def _minibatch(self, batch: Minibatch) -> dict[str, Tensor]:
+        """Make one gradient step; the divergence is that from before it."""
+        policy = self.actor(batch.features)
+        loss, metrics = clipped_objective(policy, batch, self.ppo.clip_epsilon, self.entropy_scale, self.log_prob)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.ppo.gradient_clip)
+        if norm.isfinite():
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
+
+
+def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:
+    """Average over the gradient steps; the divergence is the last."""
+    means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
+    kl = done[-1]["ppo/kl"]
+    return means | {"ppo/kl": kl, "ppo/epochs": torch.full_like(kl, len(done) / minibatches)}
+
+
+def clipped_objective(
+    policy: ActionDistribution,
+    batch: Minibatch,
+    clip_epsilon: float,
+    entropy_scale: float | Tensor,
+    log_prob: LogProb = ActionDistribution.log_prob,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Compute PPO's loss on a minibatch, a scalar, and what to watch: ``ppo/kl`` and ``ppo/clipped``.
+
+    Args:
+        policy: The present one at the minibatch's features.
+        batch: The minibatch.
+        clip_epsilon: ε.
+        entropy_scale: Weight of the entropy.
+        log_prob: Of an action as the minibatch has it.
+
+    Reference: Schulman et al. 2017, Eq. 7.
+    """
+    old = ActionDistribution(*batch.old.chunk(2, -1))
+    ratio = (log_prob(policy, batch.action) - log_prob(old, batch.action)).exp()
+    bounded = ratio.clamp(1.0 - clip_epsilon, 1.0 + clip_epsilon)
+    gain = torch.minimum(ratio * batch.advantage, bounded * batch.advantage)
+    loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
+    with torch.no_grad():
+        reached = batch.weight.sum().clamp_min(1e-8)
+        kl = (batch.weight * normal_divergence(old, policy)).sum() / reached  # of what the objective counts
+        clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
+    return loss, {"ppo/kl": kl, "ppo/clipped": clipped}
+
+
+def normal_divergence(old: ActionDistribution, new: ActionDistribution) -> Tensor:
+    """Return KL(old ‖ new) of independent normals, nats, ``(..., 1)``."""
+    variances = (old.std.square() + (old.mean - new.mean).square()) / (2.0 * new.std.square())
+    return (new.std.log() - old.std.log() + variances - 0.5).sum(-1, keepdim=True)
