@@ -166,7 +166,7 @@ def fly(config: HilConfig) -> int:
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
     with ExitStack() as opened:
         opened.callback(chain.close)
-        link = opened.enter_context(closing(make_link(link_config(config, contract))))
+        link = opened.enter_context(closing(make_link(link_config(config, contract, flyer.rate))))
         poses = opened.enter_context(closing(make_poses(pose_config(config))))
         operator = opened.enter_context(closing(make_operator(config)))
         recorder = None
@@ -242,7 +242,7 @@ def stamping_of(config: HilConfig) -> Stamping:
     return Stamping.receive if kernel else Stamping.sender
 
 
-def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
+def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> LinkConfig:
     """Return what the link needs: sticks as `dreamer_racing.hil.betaflight` has the flight controller set."""
     numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
     missing = [name for name, number in numbers.items() if number is None]
@@ -251,7 +251,15 @@ def link_config(config: HilConfig, contract: dict[str, Any]) -> LinkConfig:
     thrust = None if missing else ThrustMap(**numbers)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
     return LinkConfig(
-        config.link, config.link_host, port, config.device, config.baud, rate_map(contract), thrust, config.arm_channel
+        config.link,
+        config.link_host,
+        port,
+        config.device,
+        config.baud,
+        rate_map(contract),
+        thrust,
+        config.arm_channel,
+        rate,
     )
 
 

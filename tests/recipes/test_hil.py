@@ -136,7 +136,7 @@ def test_a_port_in_use_is_said_and_nothing_else_happens(tmp_path):
 def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
     drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
     config = hil.HilConfig(actor="kidney", link="betaflight_sitl", **drone)
-    link = hil.link_config(config, hil.make_flyer(config)[1])
+    link = hil.link_config(config, hil.make_flyer(config)[1], 50.0)
     assert link.rates is not None and link.thrust is not None
     assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
 

@@ -21,10 +21,11 @@ from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
 from dreamer_racing.hil.links.msp import encode_msp
 from dreamer_racing.hil.links.sbus import encode_sbus
-from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort
+from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
 from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
+from dreamer_racing.hil.vehicle import at_rest
 
 T = TypeVar("T")
 
@@ -42,6 +43,7 @@ class LinkConfig:
         rates: What the flight controller makes of the sticks.
         thrust: What motors and battery make of the throttle.
         arm_channel: Index of the channel that arms, 4 for AUX1.
+        rate: Commands a second, to refuse a serial port that is too slow for them; None: whatever comes.
 
     Raises:
         ValueError: ``arm_channel`` is no switch.
@@ -55,6 +57,7 @@ class LinkConfig:
     rates: RateMap | None = None
     thrust: ThrustMap | None = None
     arm_channel: int = FIRST_SWITCH
+    rate: float | None = None
 
     def __post_init__(self) -> None:
         check_arm_channel(self.arm_channel)
@@ -64,7 +67,8 @@ def make_link(config: LinkConfig) -> TransportLink:
     """Make a link and open what it goes over.
 
     Raises:
-        ValueError: There is no link of that name, or something that it needs is not given, or cannot be.
+        ValueError: There is no link of that name, something that it needs is not given or cannot be, or a serial port
+            is too slow for so many commands.
         OSError: Device or host cannot be used.
         ImportError: A package is missing; the message says how to install it.
 
@@ -73,7 +77,28 @@ def make_link(config: LinkConfig) -> TransportLink:
     """
     if config.name not in LINKS:
         raise ValueError(f"name={config.name}: the links are {', '.join(LINKS)}.")
-    return LINKS[config.name](config)
+    link = LINKS[config.name](config)
+    try:
+        _check_speed(link, config)
+    except ValueError:
+        link.close()
+        raise
+    return link
+
+
+def _check_speed(link: TransportLink, config: LinkConfig) -> None:
+    """Refuse a wire on which commands would queue up and be dropped."""
+    if config.device is None or config.rate is None:
+        return
+    settings = _wire_settings(config)
+    size = len(link.encode(at_rest()))  # the longest there is: what disarms goes out with each
+    most = 1.0 / settings.seconds(size)
+    if config.rate > most:
+        raise ValueError(
+            f"baud={settings.baud}: a command of {size} bytes takes {1e3 * settings.seconds(size):.1f} ms on the wire, "
+            f"so at most {most:.0f} go over it in a second, and the actor gives {config.rate:g}: choose a higher baud= "
+            "on both sides."
+        )
 
 
 def _udp(config: LinkConfig) -> TransportLink:
@@ -135,7 +160,9 @@ def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport
 
 
 def _wire(config: LinkConfig) -> Transport:
+    return SerialPort(_given(config.device, "device", config), _wire_settings(config))
+
+
+def _wire_settings(config: LinkConfig) -> SerialSettings:
     settings = PROTOCOLS[config.name]
-    if config.baud is not None:
-        settings = settings._replace(baud=config.baud)
-    return SerialPort(_given(config.device, "device", config), settings)
+    return settings if config.baud is None else settings._replace(baud=config.baud)

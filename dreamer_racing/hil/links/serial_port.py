@@ -22,6 +22,10 @@ class SerialSettings(NamedTuple):
     parity: str
     stop_bits: int
 
+    def seconds(self, size: int) -> float:
+        """Return how long so many bytes take, s: each has a start bit, 8 bits, perhaps the parity's, and stop bits."""
+        return size * (9 + (self.parity != "N") + self.stop_bits) / self.baud
+
 
 PROTOCOLS = {
     "crsf": SerialSettings(420_000, "N", 1),

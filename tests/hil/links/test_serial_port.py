@@ -9,6 +9,7 @@ import sys
 import termios
 import time
 import tty
+from dataclasses import replace
 
 import pytest
 
@@ -84,6 +85,21 @@ def test_the_rate_can_be_chosen(wire):
     link = make_link(LinkConfig("msp", device=path, baud=230_400, rates=RATES, thrust=THRUST))
     assert termios.tcgetattr(far)[4] == termios.B230400
     link.close()
+
+
+def test_a_wire_too_slow_for_the_commands_is_refused(wire):
+    """MAVLink's two messages, 95 bytes of 10 bits, take 16.5 ms at 57600 baud: 60 a second."""
+    pytest.importorskip("pymavlink.dialects.v20.common")
+    _, path = wire
+    config = LinkConfig("mavlink", device=path, thrust=THRUST)
+    assert PROTOCOLS["mavlink"].seconds(96) == pytest.approx(960 / 57_600)
+    assert PROTOCOLS["sbus"].seconds(25) == pytest.approx(25 * 12 / 100_000)
+    make_link(replace(config, rate=50.0)).close()
+    with pytest.raises(
+        ValueError, match=r"baud=57600: a command of \d+ bytes takes 1\d\.\d ms.* actor gives 100: .*baud="
+    ):
+        make_link(replace(config, rate=100.0))
+    make_link(replace(config, rate=100.0, baud=115_200)).close()
 
 
 def fill(path: str) -> None:
