@@ -220,6 +220,7 @@ class DreamerLearner:
         *,
         rates: float | None = None,
         min_std: float | None = None,
+        max_std: float | None = None,
         **numbers: float,
     ) -> None:
         """Change what a run may have on a schedule, from the next update on; what is not named stays.
@@ -229,6 +230,7 @@ class DreamerLearner:
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
             min_std: Smallest standard deviation of actions, of the networks' own.
+            max_std: Largest.
             numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
 
         Raises:
@@ -241,9 +243,10 @@ class DreamerLearner:
                 group["lr"] = rate * rates
         for name, value in numbers.items():
             self._set_in_losses(name, value)
-        if min_std is not None:
-            self.agent.actor.min_std.fill_(min_std)
-            self.flying_agent.actor.min_std.fill_(min_std)
+        for name, bound in (("min_std", min_std), ("max_std", max_std)):
+            if bound is not None:
+                for agent in (self.agent, self.flying_agent):
+                    agent.actor.get_buffer(name).fill_(bound)
 
     def _set_in_losses(self, name: str, value: float) -> None:
         """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""
@@ -433,7 +436,7 @@ def make_dreamer(
     check_settings(config)
     decodes = find_loss(WORLD_MODEL_LOSSES, losses.world_model).decodes
     with seeded(seed):
-        agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std).to(device)
+        agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std, losses.max_std).to(device)
         modules = make_losses(agent, losses, horizon)
     return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
 

@@ -43,7 +43,7 @@ def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
         ValueError: If they differ in anything but the name; the message says in what, and what to do.
     """
     wanted = asdict(size)
-    checkpoint = {"sampled": ModelSize.sampled, **checkpoint}  # older ones do not say
+    checkpoint = {"sampled": ModelSize.sampled, "state_std": ModelSize.state_std, **checkpoint}  # older ones do not say
     differences = [
         f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
         for field in fields(size)
@@ -71,7 +71,7 @@ def _check_parts(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> 
         if there == here
         else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
     )
-    older = {"actor.min_std": agent.actor.min_std}  # they do not say
+    older = {f"actor.{name}": agent.actor.get_buffer(name) for name in ("min_std", "max_std")}  # they do not say
     parts = {"networks": (agent.state_dict(), older | saved["agent"])}
     for name, loss in losses.items():
         # What a loss keeps from update to update it may do without; older versions keep less.

@@ -14,6 +14,10 @@ from torch import Tensor, nn
 from dreamer_racing.modules.heads import MLP
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+STD_SHIFT = 2.0
+"""What is added to the raw deviation, so that a fresh network's is large. Reference: ``heads.bounded_normal``."""
+FIRST_STD = 0.6
+"""Deviation to begin with where it does not depend on the state, as the PPO baseline's [choice]."""
 
 
 class ActionDistribution(NamedTuple):
@@ -70,7 +74,9 @@ class Actor(nn.Module):
         units: Width of the hidden layers.
         norm: ``"rms"`` or ``"layer"``.
         min_std: Smallest standard deviation; a scalar that may change while the actor is trained.
-        max_std: Largest standard deviation.
+        max_std: Largest standard deviation; likewise.
+        state_std: Whether the deviation depends on the state; if not, it is a learned number for each dimension of the
+            action, ``FIRST_STD`` to begin with.
 
     Reference: danijar/dreamerv3, ``heads.bounded_normal``: std = lo + (hi − lo)·sigmoid(raw + 2).
     """
@@ -84,19 +90,24 @@ class Actor(nn.Module):
         norm: str = "rms",
         min_std: float = 0.1,
         max_std: float = 1.0,
+        state_std: bool = True,
     ) -> None:
         super().__init__()
-        self.mlp = MLP(in_features, 2 * action_dim, layers, units, norm, output_scale=0.01)
+        self.mlp = MLP(in_features, (1 + state_std) * action_dim, layers, units, norm, output_scale=0.01)
+        first = torch.tensor((FIRST_STD - min_std) / max(max_std - min_std, 1e-6)).clamp(0.01, 0.99).logit()
+        self.raw_std = None if state_std else nn.Parameter((first - STD_SHIFT).repeat(action_dim))
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
-        self.max_std = max_std
+        self.max_std = nn.Buffer(torch.tensor(float(max_std)))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Leave the smallest deviation as it is where older weights do not say."""
-        state_dict.setdefault(f"{prefix}min_std", self.min_std)
+        """Leave the bounds of the deviation as they are where older weights do not say."""
+        for name in ("min_std", "max_std"):
+            state_dict.setdefault(prefix + name, self.get_buffer(name))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
-        mean, raw_std = self.mlp(features).float().chunk(2, -1)
-        std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + 2.0) + self.min_std
+        output = self.mlp(features).float()
+        mean, raw_std = output.chunk(2, -1) if self.raw_std is None else (output, self.raw_std.expand_as(output))
+        std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + STD_SHIFT) + self.min_std
         return ActionDistribution(torch.tanh(mean), std)

@@ -19,6 +19,7 @@ class Agent(nn.Module):
         interface: What the agent sees and does.
         decode: Whether the world model has decoders of what is seen.
         min_std: Smallest standard deviation of actions.
+        max_std: Largest.
 
     Attributes:
         size: As given.
@@ -28,11 +29,13 @@ class Agent(nn.Module):
         critic: Judges; holds its slow copy.
     """
 
-    def __init__(self, size: ModelSize, interface: Interface, decode: bool = True, min_std: float = 0.1) -> None:
+    def __init__(
+        self, size: ModelSize, interface: Interface, decode: bool = True, min_std: float = 0.1, max_std: float = 1.0
+    ) -> None:
         super().__init__()
         head = (size.actor_critic_layers, size.units, size.norm)
         self.size = size
         self.interface = interface
         self.world_model = WorldModel(size, interface, decode)
-        self.actor = Actor(size.features, interface.action_dim, *head, min_std=min_std)
+        self.actor = Actor(size.features, interface.action_dim, *head, min_std, max_std, size.state_std)
         self.critic = Critic(size.features, *head, size.bins)

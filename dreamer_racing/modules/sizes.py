@@ -33,6 +33,8 @@ class ModelSize:
         bins: Bins of the two-hot reward and value distributions.
         sampled: Whether z is a sample of its categoricals, as in DreamerV3, or their probabilities (an extension: the
             latents are then deterministic, and so is imagination but for the actor's noise).
+        state_std: Whether the standard deviation of actions depends on the state, as in DreamerV3, or is a learned
+            number for each dimension of the action, as usual with PPO.
     """
 
     name: str
@@ -56,6 +58,7 @@ class ModelSize:
     cnn_patch: int = 1
     bins: int = 255
     sampled: bool = True
+    state_std: bool = True
 
     @property
     def state(self) -> int:

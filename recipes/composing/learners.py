@@ -28,13 +28,13 @@ def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, flo
 
 def size_of(config: DreamerConfig) -> ModelSize:
     """The networks' size, and what their states are."""
-    return replace(get_size(config.model.size), sampled=config.model.sampled)
+    return replace(get_size(config.model.size), sampled=config.model.sampled, state_std=config.model.state_std)
 
 
 def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
     """Make the networks of a resolved configuration, with initial weights from torch's generator."""
     decodes = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).decodes
-    return Agent(size_of(config), interface, decodes, config.loss.min_std).to(config.device)
+    return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:

@@ -48,6 +48,7 @@ class ModelConfig(LearnerConfig):
 
     size: str = MISSING
     sampled: bool = True  # states are samples of their categoricals, as in DreamerV3; false: the probabilities
+    state_std: bool = True  # the actions' deviation depends on the state, as in DreamerV3; false: one number each
     batch_size: int = setting(MISSING, COUNT)  # windows in a batch
     batch_length: int = setting(MISSING, Range(2))  # records in a window
     replay_ratio: float = setting(MISSING, POSITIVE)  # records trained on per environment step
@@ -136,6 +137,7 @@ class ScheduleConfig:
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
+    max_std: Ramp = field(default_factory=Ramp)  # loss.max_std
     noise_correlation: Ramp = field(default_factory=Ramp)  # loss.noise_correlation
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     # loss.actor=ppo or flown_ppo: the actor waits while the held-out error is above so many times that in training

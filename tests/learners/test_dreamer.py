@@ -53,7 +53,7 @@ def test_update_returns_scalar_tensors_and_moves_every_network():
     assert expected < metrics.keys()
     assert {f"gradient_norm/{name}" for name in ("world_model", "actor", "critic")} < metrics.keys()
     for name, value in learner.agent.state_dict().items():
-        still = name.endswith(("initial_belief", "min_std"))
+        still = name.endswith(("initial_belief", "min_std", "max_std"))
         assert torch.equal(value, before[name]) == still, name
 
 

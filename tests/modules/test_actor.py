@@ -1,9 +1,10 @@
 import math
 
+import pytest
 import torch
 from torch.distributions import Independent, Normal
 
-from dreamer_racing.modules.actor import ActionDistribution, Actor
+from dreamer_racing.modules.actor import FIRST_STD, ActionDistribution, Actor
 
 
 def test_entropy_of_a_normal_in_closed_form():
@@ -37,6 +38,24 @@ def test_new_actor_explores_around_zero():
     assert policy.mean.abs().max() < 0.1
     expected = 0.1 + 0.9 / (1 + math.exp(-2))
     torch.testing.assert_close(policy.std, torch.full_like(policy.std, expected), atol=0.02, rtol=0)
+
+
+def test_a_deviation_of_its_own_is_the_same_in_all_states_and_learned():
+    actor = Actor(6, 4, layers=1, units=8, min_std=0.05, state_std=False)
+    policy = actor(torch.randn(64, 6))
+    torch.testing.assert_close(policy.std, torch.full_like(policy.std, FIRST_STD))
+    policy.entropy().mean().backward()
+    assert (actor.raw_std.grad > 0).all()
+    assert all(parameter.grad is None for parameter in actor.mlp.parameters())
+    with torch.no_grad():
+        actor.raw_std[0] = -100.0
+    assert actor(torch.randn(1, 6)).std[0, 0].item() == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("min_std", [0.6, 0.9, 1.0])
+def test_a_deviation_of_its_own_begins_within_its_bounds(min_std):
+    policy = Actor(6, 4, layers=1, units=8, min_std=min_std, state_std=False)(torch.randn(3, 6))
+    assert policy.std.isfinite().all() and policy.std.min() >= min_std and policy.std.max() <= 1.0
 
 
 def test_samples_have_the_mean_and_std():

@@ -79,7 +79,9 @@ def test_a_single_world_holds_nothing_out(capsys: pytest.CaptureFixture[str]) ->
         assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 1)
 
 
-@pytest.mark.parametrize("override", ["loss.actor=dynamics", "loss.actor=reinforce", "replay.held_out=0"])
+@pytest.mark.parametrize(
+    "override", ["loss.actor=dynamics", "loss.actor=reinforce", "loss.actor=ppo", "replay.held_out=0"]
+)
 def test_what_races_goes_with_other_actors(override: str) -> None:
     config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
     recipe_module("composing.checks").check_dreamer(OmegaConf.to_object(config))
@@ -89,7 +91,8 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     tuned = compose("dreamer_v3", "tuned=race")
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
-    assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("ppo", False, True)
+    assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("flown_ppo", False, True)
+    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, Clock.passes)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
@@ -156,7 +159,7 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
-    assert set(names) == {"discount", "entropy_scale", "min_std", "noise_correlation"}
+    assert set(names) == {"discount", "entropy_scale", "max_std", "min_std", "noise_correlation"}
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates")]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
