@@ -2,12 +2,13 @@
 
     python benchmarks/frozen_model.py runs/kidney --mode imagined flown --json frozen_model.json
 
-The averaged world model of the checkpoint is not trained. A fresh actor with one deviation for all states and a fresh
-critic make PPO's improvements on 16,384 steps each, advantages by λ-returns of 16 imagined or of 256 flown steps, and
-64 worlds: the same algorithm on the same features. What differs is whose rewards and whose next latents they are.
-Imagination begins at the posterior latents of the newest records of the replay. Every so many improvements the
-deterministic policy flies 60 noisy starts: `gates` is their mean, beside `reward`, what a step paid where the actor
-learned, imagined or flown. The checkpoint must hold a replay, so no best/.
+The world model of the checkpoint, its trained weights, stands still. A fresh actor with one deviation for all states
+and a fresh critic make PPO's improvements on 16,384 steps each, advantages by λ-returns of 16 imagined or of 256
+flown steps, and 64 worlds: the same algorithm on the same features. What differs is whose rewards and whose next
+latents they are, and that flown actions are kept as clipped. Imagination begins at the posterior latents of the
+newest records of the replay. Every so many improvements the deterministic policy flies 60 noisy starts: `gates` is
+their mean, beside `reward`, what a step paid where the actor learned, imagined or flown. The checkpoint must hold a
+replay, so no best/.
 """
 
 import argparse
@@ -84,8 +85,6 @@ def measure(checkpoint: Path, mode: str, improvements: int, every: int) -> Itera
     assert isinstance(config, DreamerConfig), "a run of recipes/dreamer_v3.py"
     config.device, config.replay.device = "cpu", "auto"
     learner, counters = restore(config, checkpoint)
-    learner.agent.load_state_dict(learner.flying_agent.state_dict())
-    learner.averaged = None
     torch.manual_seed(0)
     size, interface = learner.size, learner.agent.interface
     actor: Any = FreshActor(size.features, interface.action_dim)

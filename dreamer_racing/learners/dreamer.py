@@ -206,7 +206,7 @@ class DreamerLearner:
         return metrics
 
     def watch(self, rollout: TensorDictBase) -> None:
-        """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy` as it is now."""
+        """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights."""
         cast(ActorLoss, self.losses["actor"]).watch(rollout)
 
     def _average(self) -> None:

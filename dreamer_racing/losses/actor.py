@@ -140,7 +140,7 @@ class ActorLoss(LossModule):
         """Make room for what a loss keeps of an update with so many starts."""
 
     def watch(self, rollout: TensorDictBase) -> None:
-        """Take note of a collector's rollout ``[N, T]``, flown by the actor as it is now."""
+        """Take note of a rollout ``[N, T]`` that the actor flew, perhaps with older weights."""
 
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Do what a loss with an optimiser of its own does after the learner's update number ``updates``.

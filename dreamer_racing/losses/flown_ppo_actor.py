@@ -37,8 +37,7 @@ class FlownPPOActorLoss(ClippedActorLoss):
 
     Actions are kept as they were flown, clipped to [−1, 1], and weighed by ``ActionDistribution.log_prob_clipped``.
     The steps are buffers of the module, so a checkpoint holds them. They begin anew with another number of
-    environments, of steps, or of ``ppo.flown``; and if they are full before the actor may improve, as before the first
-    update.
+    environments, of steps, or of ``ppo.flown``; once they are full, the newest are kept until the next update.
 
     Args:
         args, kwargs: Of ``ClippedActorLoss``.
@@ -83,8 +82,10 @@ class FlownPPOActorLoss(ClippedActorLoss):
         }
         self._make_room(steps)
         first = int(self.flown)
-        if first == len(self.reward):
-            first = 0
+        if first == len(self.reward):  # full, and no update has come: the oldest rollout makes room
+            first -= len(rollout)
+            for name in FLOWN:
+                self.get_buffer(name)[:first] = self.get_buffer(name)[len(rollout) :].clone()
         for name, value in steps.items():
             self.get_buffer(name)[first : first + len(value)] = value
         self.flown.fill_(first + len(rollout))

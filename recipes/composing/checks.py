@@ -217,6 +217,7 @@ def check_schedule(config: DreamerConfig) -> None:
             )
         if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
+    check_deviations(config)
     if config.schedule.wait_for_model is not None:
         check_wait(config)
     check_kl(config.loss.ppo)
@@ -225,6 +226,22 @@ def check_schedule(config: DreamerConfig) -> None:
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
     if to is not None and not config.env.start_on_line:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
+
+
+def check_deviations(config: DreamerConfig) -> None:
+    """Refuse a smallest deviation of actions above the largest, also where a ramp leads.
+
+    Raises:
+        ValueError: the message names both settings.
+    """
+    least, most = (
+        {f"loss.{name}": getattr(config.loss, name)}
+        | ({} if (to := getattr(config.schedule, name).to) is None else {f"schedule.{name}.to": to})
+        for name in ("min_std", "max_std")
+    )
+    low, high = max(least, key=least.__getitem__), min(most, key=most.__getitem__)
+    if least[low] >= most[high]:
+        raise ValueError(f"{low}={least[low]} must be below {high}={most[high]}: the bounds of the actions' deviation.")
 
 
 def check_kl(ppo: ActorPPOConfig) -> None:

@@ -100,15 +100,17 @@ def test_the_actor_stands_still_until_enough_was_flown():
     assert all(parameter.grad is None for parameter in others)
 
 
-def test_what_is_full_before_the_actor_may_move_begins_anew():
+def test_what_is_full_before_the_actor_may_move_keeps_the_newest():
     learner = make_learner()
     rollouts = [make_rollout(learner) for _ in range(3)]
     for rollout in rollouts:
         learner.watch(rollout)
     loss = actor_loss(learner)
-    assert loss.flown.item() == T
-    assert torch.equal(loss.reward[:T], rollouts[2]["next", "reward"].transpose(0, 1))
-    assert loss.improve(1) == {}
+    assert loss.flown.item() == 2 * T
+    for place, rollout in ((slice(0, T), rollouts[1]), (slice(T, 2 * T), rollouts[2])):
+        assert torch.equal(loss.reward[place], rollout["next", "reward"].transpose(0, 1))
+        assert torch.equal(loss.action[place], rollout["action"].transpose(0, 1))
+    assert loss.improve(1)
 
 
 def test_what_pays_becomes_likelier():

@@ -72,6 +72,8 @@ REFUSED = [
     (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),
     (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends improvements before loss.ppo.kl_target=0.03"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
+    (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
+    (["loss.min_std=0.3", "schedule.max_std.to=0.15"], ["loss.min_std=0.3 must be below schedule.max_std.to=0.15"]),
     (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for loss.actor=ppo"]),
     (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
