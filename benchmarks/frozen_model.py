@@ -5,10 +5,10 @@
 The world model of the checkpoint, its trained weights, stands still. A fresh actor with one deviation for all states
 and a fresh critic make PPO's improvements on 16,384 steps each, advantages by λ-returns of 16 imagined or of 256
 flown steps, and 64 worlds: the same algorithm on the same features. What differs is whose rewards and whose next
-latents they are, and that flown actions are kept as clipped. Imagination begins at the posterior latents of the
-newest records of the replay. Every so many improvements the deterministic policy flies 60 noisy starts: `gates` is
-their mean, beside `reward`, what a step paid where the actor learned, imagined or flown. The checkpoint must hold a
-replay, so no best/.
+latents they are, and that flown actions are kept as clipped and weighed as such. Imagination begins at the posterior
+latents of the newest records of the replay. Every so many improvements the deterministic policy flies 60 noisy starts:
+`gates` is their mean, beside `reward`, what a step paid where the actor learned, imagined or flown. The checkpoint
+must hold a replay, so no best/.
 """
 
 import argparse
@@ -32,34 +32,21 @@ from composing.schema import DreamerConfig
 
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.losses.clipped_actor import LogProb, Minibatch, clipped_objective, normalised
 from dreamer_racing.losses.imagination import imagine, lambda_return
-from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.actor import ActionDistribution, Actor
 from dreamer_racing.modules.heads import MLP
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 STEPS, HORIZON, WORLDS, EPISODES = 16_384, 16, 64, 60
-RECENT, DISCOUNT, LAMBDA, STD, RATE = 20_000, 0.98, 0.95, 0.6, 5e-4
+RECENT, DISCOUNT, LAMBDA, RATE = 20_000, 0.98, 0.95, 5e-4
 EPOCHS, MINIBATCHES, CLIP, REWARD_SCALE = 5, 8, 0.2, 0.1
 COLUMNS = ["mode", "improvements", "gates", "success", "reward", "kl", "std"]
 
 Experience = dict[str, Tensor]
-"""``features`` (T, N, F), ``action`` (T, N, A), ``reward``, ``continuation``, ``done``, ``weight`` (T, N, 1), and
-``following`` (N, F): the features after the last step."""
-
-
-class FreshActor(nn.Module):
-    """A normal whose deviation does not depend on what is seen, as the baseline's."""
-
-    def __init__(self, features: int, actions: int) -> None:
-        super().__init__()
-        self.mlp = MLP(features, actions, 2, 256, "rms", output_scale=0.01)
-        self.log_std = nn.Parameter(torch.full((actions,), math.log(STD)))
-
-    def forward(self, features: Tensor) -> ActionDistribution:
-        """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
-        mean = self.mlp(features).float()
-        return ActionDistribution(mean, self.log_std.exp().expand_as(mean))
+"""``features`` (T, N, F), ``action`` (T, N, A), ``old`` (T, N, 2·A), ``reward``, ``continuation``, ``done``, ``weight``
+(T, N, 1), and ``following`` (N, F): the features after the last step."""
 
 
 def main() -> None:
@@ -87,22 +74,26 @@ def measure(checkpoint: Path, mode: str, improvements: int, every: int) -> Itera
     learner, counters = restore(config, checkpoint)
     torch.manual_seed(0)
     size, interface = learner.size, learner.agent.interface
-    actor: Any = FreshActor(size.features, interface.action_dim)
+    actor = Actor(size.features, interface.action_dim, 2, 256, min_std=0.01, state_std=False)
     critic = MLP(size.features, 1, 2, 256, "rms")
     learner.agent.actor = actor
     optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=RATE, eps=1e-5)
     course = Course(learner.evaluation_policy(), {**worlds_of(config), "start_noise": 1.0}, EPISODES)
     gather = (imagining if mode == "imagined" else flying)(config, checkpoint, learner)
+    log_prob = ActionDistribution.log_prob if mode == "imagined" else ActionDistribution.log_prob_clipped
     for number in range(improvements + 1):
         experience = gather()
-        kl = improve(actor, critic, optimizer, experience) if number < improvements else math.nan
+        with torch.no_grad():
+            old = actor(experience["features"])
+        experience["old"] = torch.cat((old.mean, old.std), -1)
+        kl = improve(actor, critic, optimizer, experience, log_prob) if number < improvements else math.nan
         if number % every == 0:
             flown = course.evaluate(EPISODES)
             yield {
                 "benchmark": "frozen_model", "track": config.track, **counters, "mode": mode,
                 "improvements": number + (number < improvements), "gates": flown.gates_per_episode,
                 "success": flown.success_rate, "reward": experience["reward"].mean().item(), "kl": kl,
-                "std": actor.log_std.exp().mean().item(),
+                "std": experience["old"].chunk(2, -1)[1].mean().item(),
             }  # fmt: skip
     course.close()
 
@@ -161,8 +152,10 @@ def flying(config: DreamerConfig, checkpoint: Path, learner: DreamerLearner) -> 
     return gather
 
 
-def improve(actor: Any, critic: MLP, optimizer: torch.optim.Optimizer, experience: Experience) -> float:
-    """Make PPO's epochs; return the divergence from the policy before, nats."""
+def improve(
+    actor: Actor, critic: MLP, optimizer: torch.optim.Optimizer, experience: Experience, log_prob: LogProb
+) -> float:
+    """Make PPO's epochs; return the divergence before the last step, nats."""
     features, done = experience["features"], experience["done"]
     with torch.no_grad():
         value = critic(features).float()
@@ -171,28 +164,21 @@ def improve(actor: Any, critic: MLP, optimizer: torch.optim.Optimizer, experienc
         target = lambda_return(
             REWARD_SCALE * experience["reward"], following, DISCOUNT * experience["continuation"], LAMBDA * (1 - done)
         )
-        old = actor(features)
-        parts = [features, experience["action"], old.log_prob(experience["action"]), target - value, target]
-    seen, action, likely, advantage, goal, weight = (part.flatten(0, 1) for part in (*parts, experience["weight"]))
-    share = weight / weight.sum()
-    mean = (share * advantage).sum()
-    deviation = (share * (advantage - mean).square()).sum().sqrt()
-    advantage = ((advantage - mean) / (deviation + 1e-8)).clamp(-5, 5)
+    advantage = normalised(target - value, experience["weight"])
+    parts = (features, experience["action"], experience["old"], advantage, experience["weight"], target)
+    steps = [part.flatten(0, 1) for part in parts]
     for _ in range(EPOCHS):
-        for rows in torch.randperm(len(seen)).chunk(MINIBATCHES):
-            ratio = (actor(seen[rows]).log_prob(action[rows]) - likely[rows]).exp()
-            gain = torch.minimum(ratio * advantage[rows], ratio.clamp(1 - CLIP, 1 + CLIP) * advantage[rows])
-            error = (critic(seen[rows]).float() - goal[rows]).square()
-            loss = (weight[rows] * (0.5 * error - gain)).mean()
+        for rows in torch.randperm(len(steps[0])).chunk(MINIBATCHES):
+            *chosen, goal = (part[rows] for part in steps)
+            batch = Minibatch(*chosen)
+            loss, metrics = clipped_objective(actor(batch.features), batch, CLIP, 0.0, log_prob)
+            loss = loss + 0.5 * (batch.weight * (critic(batch.features).float() - goal).square()).mean()
             optimizer.zero_grad()
             loss.backward()
             for network in (actor, critic):
                 nn.utils.clip_grad_norm_(network.parameters(), 0.5)
             optimizer.step()
-    with torch.no_grad():
-        new = actor(features)
-        ratio = ((old.std / new.std).square() + ((old.mean - new.mean) / new.std).square() - 1) / 2
-        return (ratio + (new.std / old.std).log()).sum(-1).mean().item()
+    return metrics["ppo/kl"].item()
 
 
 if __name__ == "__main__":

@@ -86,8 +86,8 @@ def rows(config: type, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
             if kind is schema.Ramp and field.name in said:
                 clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in Clock)
                 yield (
-                    f"{name}.to, .begin, .end, .until, .by, .until_by",
-                    "`null`, `0`, `1`, `null`, `run`, `null`",
+                    f"{name}.{', .'.join(parts.name for parts in dataclasses.fields(kind))}",
+                    ", ".join(default_of(part) for part in dataclasses.fields(kind)),
                     clocks,
                     said[field.name],
                 )

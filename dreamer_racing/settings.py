@@ -30,6 +30,7 @@ class Range(NamedTuple):
 POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)
 SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
 COUNT = Range(1)
+SEED = Range(0, 2**32 - 1)
 
 
 def setting(default: Any, allowed: Range) -> Any:

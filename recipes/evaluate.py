@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from composing.arena import make_report, worlds_of
 from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
 from composing.schema import EvaluateConfig, register
 from omegaconf import DictConfig, OmegaConf
@@ -28,6 +28,7 @@ from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import onboard_beside_map, write_video
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
+from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import RunDirectory
 
 PROTOCOLS = ("nominal", "full")
@@ -36,7 +37,7 @@ RESULT = "evaluation.json"
 register()
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="evaluate")
+@recipe("evaluate")
 def main(config: DictConfig) -> None:
     """Restore the policy, fly it, report."""
     start_logging()
@@ -63,15 +64,14 @@ def main(config: DictConfig) -> None:
 
 
 def check(config: EvaluateConfig) -> None:
-    """Refuse what is no protocol or would be ignored, and episodes of which there are none.
+    """Refuse what is no protocol or would be ignored, and numbers out of their range.
 
     Raises:
         ValueError: the message names the field and what is allowed.
     """
+    check_settings(config)
     if config.protocol not in PROTOCOLS:
         raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
-    if config.episodes < 1 or config.num_envs < 1:
-        raise ValueError(f"episodes={config.episodes}, num_envs={config.num_envs}: both must be at least 1.")
     if config.protocol == "full" and config.start_noise:
         raise ValueError(
             f"start_noise={config.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."

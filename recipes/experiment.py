@@ -22,9 +22,11 @@ import hydra
 import yaml
 from composing.checks import check_variant
 from composing.command_line import merge_overrides, override_key
+from composing.entry import in_plain_words, recipe
 from composing.report import FAILURES
 from composing.schema import ExperimentConfig, RunConfig, register
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -42,7 +44,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(RECIPES), os.enviro
 register()
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="experiment")
+@recipe("experiment")
 def main(config: DictConfig) -> None:
     """Run one of the experiment's runs, or what is left of it; what fails is noted, so that the others are made."""
     settings = cast(ExperimentConfig, config)
@@ -51,7 +53,9 @@ def main(config: DictConfig) -> None:
     note.unlink(missing_ok=True)
     try:
         bring_to_its_end(settings, run_dir, list(HydraConfig.get().overrides.task))
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, HydraException) as error:
+        if isinstance(error, HydraException):
+            error = ValueError(in_plain_words(error, settings.algorithm, settings.overrides))
         print(f"{run_dir}: failed: {error}", file=sys.stderr, flush=True)
         if HydraConfig.get().mode == RunMode.RUN:
             raise SystemExit(1) from None

@@ -18,10 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 import torch
 from composing.arena import worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
+from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
@@ -51,6 +51,7 @@ from dreamer_racing.export.shipped_agent import (
     load_agent,
 )
 from dreamer_racing.modules import Interface
+from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import RunDirectory
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
@@ -59,7 +60,7 @@ OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that sa
 register()
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="export")
+@recipe("export")
 def main(config: DictConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
     start_logging()
@@ -76,6 +77,7 @@ def main(config: DictConfig) -> None:
 
 def export(config: ExportConfig) -> None:
     """Do all of it, and print what came of it."""
+    check_settings(config)
     if config.latent not in LATENTS:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = find_trained(config.checkpoint)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import torch
 from composing.arena import worlds_of
-from composing.command_line import CONFIG_DIR, plain_errors, start_logging
+from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
 from composing.restoring import restore
 from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
@@ -77,7 +77,7 @@ def hover(track: Track, parameters: QuadrotorParameters) -> Policy:
 PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Policy]] = {"scripted": scripted, "hover": hover}
 
 
-@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="fly")
+@recipe("fly")
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
     start_logging()

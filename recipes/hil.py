@@ -21,8 +21,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast, get_type_hints
 
-import hydra
-from composing.command_line import CONFIG_DIR, agent_path, new_run_dir, plain_errors, start_logging
+from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
+from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -112,7 +112,7 @@ class HilConfig:
 ConfigStore.instance().store(name="hil_schema", node=HilConfig)
 
 
-@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="hil")
+@recipe("hil")
 def main(config: DictConfig) -> None:
     """Fly, or look at a flight."""
     start_logging()

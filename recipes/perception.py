@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
 from composing.schema import PerceptionConfig, RunConfig, register
 from omegaconf import DictConfig, OmegaConf
@@ -28,6 +28,7 @@ from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
 from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
 from dreamer_racing.figures.protocol import plot_sight
+from dreamer_racing.settings import check_settings
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"
@@ -37,13 +38,14 @@ START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with
 register()
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="perception")
+@recipe("perception")
 def main(config: DictConfig) -> None:
     """Restore the policy, fly it with and without decoys and lesions, report."""
     start_logging()
     started = time.monotonic()
     with plain_errors():
         settings = cast(PerceptionConfig, OmegaConf.to_object(config))
+        check_settings(settings)
         restored = restore(settings)
         if not restored.trained.env.from_pixels:
             raise ValueError(f"{restored.checkpoint} sees numbers, not images: there is nothing to measure.")

@@ -14,8 +14,8 @@ channels go to the firmware.
 from dataclasses import dataclass
 from typing import cast
 
-import hydra
-from composing.command_line import CONFIG_DIR, plain_errors, start_logging
+from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -36,7 +36,7 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
 ConfigStore.instance().store(name="plant_schema", node=PlantConfig)
 
 
-@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="plant")
+@recipe("plant")
 def main(config: DictConfig) -> None:
     """Fly until stopped."""
     start_logging()

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple, cast
 
-import hydra
 from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
 from composing.schema import PlotConfig, register
 from omegaconf import DictConfig, OmegaConf
 
@@ -35,6 +35,7 @@ from dreamer_racing.figures.runs import (
     first_readable,
     read_runs,
 )
+from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
 
 register()
@@ -52,7 +53,7 @@ class Drawn(NamedTuple):
     """What was left out, a line each."""
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="plot")
+@recipe("plot")
 def main(config: DictConfig) -> None:
     """Make the figures asked for, say what was left out."""
     start_logging()
@@ -90,6 +91,7 @@ def check_plot(config: PlotConfig) -> None:
     Raises:
         ValueError: the value of a setting is not one of those there are.
     """
+    check_settings(config)
     for name, value, allowed in (
         ("figure", config.figure, (*FIGURES, "all")),
         ("flight", config.flight, FLIGHTS),

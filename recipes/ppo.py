@@ -10,10 +10,10 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from dataclasses import dataclass
 from typing import ClassVar
 
-import hydra
 from composing.arena import make_env
 from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
 from composing.checks import check
+from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.schema import PPORunConfig, register
@@ -47,7 +47,7 @@ class PPORun(Run):
         self.counters["updates"] = self.learner.updates
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="ppo")
+@recipe("ppo")
 def main(config: DictConfig) -> None:
     """Compose the configuration, build the run, train."""
     launch(config, resolve, build)

@@ -10,7 +10,6 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from dataclasses import dataclass
 from typing import ClassVar
 
-import hydra
 from composing.arena import make_env
 from composing.building import (
     assemble,
@@ -22,6 +21,7 @@ from composing.building import (
     seed_generators,
 )
 from composing.checks import check, check_replay
+from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.schema import SACRunConfig, register
@@ -47,7 +47,7 @@ class SACRun(ReplayRun):
     remedy: ClassVar[str] = "sac.learning_rate"
 
 
-@hydra.main(version_base="1.3", config_path="config", config_name="sac")
+@recipe("sac")
 def main(config: DictConfig) -> None:
     """Compose the configuration, build the run, train."""
     launch(config, resolve, build)

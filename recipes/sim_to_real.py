@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
-import hydra
-from composing.command_line import CONFIG_DIR, agent_path, new_run_dir, plain_errors, start_logging
+from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
+from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -52,7 +52,7 @@ class SimToRealConfig:
 ConfigStore.instance().store(name="sim_to_real_schema", node=SimToRealConfig)
 
 
-@hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name="sim_to_real")
+@recipe("sim_to_real")
 def main(config: DictConfig) -> None:
     """Fly all of it, print a table, write files."""
     start_logging()

@@ -89,7 +89,7 @@ def test_few_plain_modules_stand_at_the_top():
 def test_recipes_are_what_a_person_starts():
     for path in (ROOT / "recipes").glob("*.py"):
         text = path.read_text(encoding="utf-8")
-        assert '\nif __name__ == "__main__":\n    main()\n' in text and "@hydra.main(" in text, path
+        assert '\nif __name__ == "__main__":\n    main()\n' in text and "@recipe(" in text, path
 
 
 def is_setter(node: ast.AST) -> bool:

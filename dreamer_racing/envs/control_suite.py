@@ -103,6 +103,7 @@ class ControlSuiteEnv(EnvBase):
         self.worlds: list[SuiteWorld] = []
         self._set_seed(seed)
         self._make_specs()
+        self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close
 
     def _make_specs(self) -> None:
         n, world = self.batch_size, self.worlds[0]

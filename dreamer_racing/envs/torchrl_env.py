@@ -60,6 +60,7 @@ class DroneRacingEnv(EnvBase):
         self.track = self.worlds.track
         self.body_rate_weight = self.worlds.race.weights.body_rate
         self._make_specs()
+        self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close
 
     def _make_specs(self) -> None:
         n = self.batch_size

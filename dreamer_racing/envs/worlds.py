@@ -16,7 +16,6 @@ from dreamer_racing.envs.drone.parameters import (
     load_preset,
     without_randomisation,
 )
-from dreamer_racing.envs.race.crash_memory import CrashMemory, check_share
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
@@ -47,7 +46,6 @@ class RaceOptions(TypedDict, total=False):
     backend: str
     start_beyond_gate: float
     start_on_line: float
-    start_before_crash: float
     start_noise: float
     miss_radius: float
     control_rate: float | None
@@ -81,8 +79,6 @@ class RaceWorlds:
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
-        start_before_crash: share of training episodes that begin where an earlier one was 0.4-2 s before its crash; see
-            `CrashMemory`.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
         miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
             and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
@@ -119,7 +115,6 @@ class RaceWorlds:
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
         start_on_line: float = 0.0,
-        start_before_crash: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
         control_rate: float | None = None,
@@ -150,9 +145,8 @@ class RaceWorlds:
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
-        self._vector = RaceVector(self.track, self.device, self.dtype)
+        self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line)
-        self._crashes = self._make_crash_memory(start_before_crash)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
@@ -190,13 +184,6 @@ class RaceWorlds:
             line=line,
         )
 
-    def _make_crash_memory(self, share: float) -> CrashMemory | None:
-        """Make what lets training episodes begin before crashes, if any are to."""
-        check_share(share)
-        if not share or self.evaluation:
-            return None
-        return CrashMemory(self.num_envs, share, self.parameters.control_dt, self.device, self.dtype)
-
     @property
     def start_on_line(self) -> float:
         """Share of training episodes that begin on the racing line; settable where there was one from the start."""
@@ -218,8 +205,6 @@ class RaceWorlds:
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         start = self._starts.sample(self.num_envs, self.evaluation)
-        if self._crashes is not None:
-            start = self._crashes.begin(mask, start, self._generator)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
         self._images = None
@@ -255,8 +240,6 @@ class RaceWorlds:
         invalid = ~action.isfinite().all(dim=1)
         path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
-        if self._crashes is not None:
-            self._crashes.note(self.simulator.state, self.race.target_gate, outcome.terminated)
         return outcome
 
     def _capture(self, action: Tensor) -> GraphedFunction:
@@ -285,6 +268,19 @@ class RaceWorlds:
         looks = self.simulator.looks
         return images if looks is None else looks.add_noise(images)
 
+    def picture(self, position: Tensor, attitude: Tensor) -> Tensor:
+        """Images uint8 (M, height, width, 3) of drones elsewhere: at positions (M, 3), m, with attitudes (M, 4), wxyz.
+
+        They show the halls of worlds 0, 1, …; the drones that fly stay where they are.
+        """
+        before, state = self.simulator.state_dict(), self.simulator.state
+        parts = []
+        for place, turned in zip(position.split(self.num_envs), attitude.split(self.num_envs), strict=True):
+            state.position[: len(place)], state.attitude[: len(place)] = place, turned
+            parts.append(self.simulator.render()[: len(place)].clone())
+        self.simulator.load_state_dict(before)
+        return torch.cat(parts)
+
     def privileged(self) -> dict[str, Tensor]:
         """Copies of what the pixel agent must not see; see the key table in `docs/architecture.md`."""
         state = self.simulator.state
@@ -295,7 +291,7 @@ class RaceWorlds:
 
     def vector(self) -> Tensor:
         """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
-        return self._vector(self.simulator.state, self.race.target_gate)
+        return self.race_vector(self.simulator.state, self.race.target_gate)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that coming steps and episodes depend on, for `torch.save`."""
@@ -303,7 +299,6 @@ class RaceWorlds:
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
-            **({} if self._crashes is None else {"crashes": self._crashes.state_dict()}),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -326,8 +321,6 @@ class RaceWorlds:
             )
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
-        if self._crashes is not None and "crashes" in state_dict:  # else it begins empty
-            self._crashes.load_state_dict(state_dict["crashes"])
         self._images = None
         self._generator.set_state(generator)
 

@@ -175,7 +175,9 @@ def plot_dreams(
         height, width = strip.shape[0] / 3, strip.shape[1] / len(frames)
         times = [f"{(frame - dream.context + 1) * dream.frame_dt:+.2f} s" for frame in frames]
         axes.set_xticks([(index + 0.5) * width for index in range(len(frames))], times)
-        axes.set_yticks([(index + 0.5) * height for index in range(3)], ["real", "reconstructed", "imagined"])
+        by_model = "{0},\nseen from the\ndecoded pose" if dream.from_pose else "{0}"
+        rows = ["real", by_model.format("reconstructed"), by_model.format("imagined")]
+        axes.set_yticks([(index + 0.5) * height for index in range(3)], rows)
         axes.tick_params(
             length=0, labelsize=8, labelcolor=INK, top=True, labeltop=True, bottom=False, labelbottom=False
         )

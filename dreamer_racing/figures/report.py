@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act, with_memory
-from dreamer_racing.evaluation.dreams import record_dream
+from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
 from dreamer_racing.evaluation.trajectory import write_trajectory
 from dreamer_racing.figures.drawing import plot_top_down
@@ -95,9 +94,10 @@ class EvaluationReport:
             return
         frames = trajectory.pixels[: self.video_steps]
         if isinstance(self._learner, DreamerLearner):
-            frames = dream_beside_flight(self._learner, trajectory, self.video_steps)
-            if (dream := record_dream(self._learner, trajectory)) is not None:
-                dream.save(into.evaluations / f"{name}_dream.npz")
+            painter = find_painter(self._learner, self._course.base.worlds)
+            frames = dream_beside_flight(self._learner, trajectory, painter, self.video_steps)
+            if (recorded := record_dream(self._learner, trajectory, painter)) is not None:
+                recorded.save(into.evaluations / f"{name}_dream.npz")
         write_video(into.videos / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
 
     def close(self) -> None:
@@ -180,13 +180,15 @@ class ReturnReport:
         self._env.close(raise_if_closed=False)
 
 
-@torch.no_grad()
-def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_steps: int) -> Tensor:
+def dream_beside_flight(
+    learner: DreamerLearner, trajectory: Trajectory, painter: Painter | None, max_steps: int
+) -> Tensor:
     """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
 
     Args:
         learner: whose world model dreams.
         trajectory: a recorded episode with images.
+        painter: what shows its latents; None: the on-board view alone.
         max_steps: K at most.
 
     Returns:
@@ -194,16 +196,12 @@ def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, max_ste
     """
     assert trajectory.pixels is not None
     pixels = trajectory.pixels[:max_steps]
-    if learner.agent.world_model.decoder is None:
+    if painter is None:
         return pixels
-    action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))[:max_steps]  # (K, A) the action that led here
-    is_init = torch.zeros(len(pixels), 1, dtype=torch.bool)
-    is_init[0] = True
     shown = []
     for start in range(0, len(pixels), SEEN_STEPS + DREAMT_STEPS):
-        part = slice(start, start + SEEN_STEPS + DREAMT_STEPS)
-        window = {"pixels": pixels[part], "previous_action": action[part], "is_init": is_init[part]}
-        batch = TensorDict({key: value.unsqueeze(0) for key, value in window.items()}, [1, len(pixels[part])])
-        dream = learner.open_loop(batch, min(SEEN_STEPS, batch.shape[1]))[0].cpu()
-        shown.append(torch.as_tensor(side_by_side(pixels[part], dream, SEEN_STEPS)))
+        part = slice(start, min(start + SEEN_STEPS + DREAMT_STEPS, len(pixels)))
+        seen = min(SEEN_STEPS, part.stop - start)
+        dreamt = dream(learner, trajectory, painter, [part], seen)[0]
+        shown.append(torch.as_tensor(side_by_side(pixels[part], dreamt, seen)))
     return torch.cat(shown)

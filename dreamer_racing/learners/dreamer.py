@@ -330,14 +330,11 @@ class DreamerLearner:
         """What is evaluated and exported: the averaged networks where they are kept, else those that are trained."""
         return self.agent if self.averaged is None else self.averaged
 
-    def open_loop(self, batch: TensorDictBase, context: int) -> Tensor:
-        """Reconstruct the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
+    def open_loop(self, batch: TensorDictBase, context: int) -> tuple[Tensor, Tensor]:
+        """Observe the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
 
         Returns:
-            Images uint8 ``(B, T, height, width, 3)``.
-
-        Raises:
-            ValueError: If the world model has no image decoder.
+            Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
         """
         batch = batch.to(self.device)
         return self.agent.world_model.open_loop(

@@ -10,6 +10,9 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.modules import Agent, Interface, ModelSize
 
+VARIANTS = ("sampled", "state_std")
+"""What of a `ModelSize` the command line chooses beside the size, as ``model.sampled=false``."""
+
 
 def own_state(loss: LossModule) -> dict[str, Tensor]:
     """Return a loss's state without that of the agent's networks, which it holds under their names."""
@@ -43,17 +46,17 @@ def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
         ValueError: If they differ in anything but the name; the message says in what, and what to do.
     """
     wanted = asdict(size)
-    checkpoint = {"sampled": ModelSize.sampled, "state_std": ModelSize.state_std, **checkpoint}  # older ones do not say
-    differences = [
-        f"{field.name} {checkpoint.get(field.name)} there, {wanted[field.name]} here"
-        for field in fields(size)
-        if field.name != "name" and _plain(checkpoint.get(field.name)) != _plain(wanted[field.name])
-    ]
-    if differences:
+    checkpoint = {**{name: getattr(ModelSize, name) for name in VARIANTS}, **checkpoint}  # older ones do not say
+    names = [field.name for field in fields(size) if field.name != "name"]
+    other = [name for name in names if _plain(checkpoint.get(name)) != _plain(wanted[name])]
+    if other:
+        differences = "; ".join(f"{name} {checkpoint.get(name)} there, {wanted[name]} here" for name in other)
+        variants = [f"model.{name}={str(checkpoint[name]).lower()}" for name in other if name in VARIANTS]
+        start = " ".join([f"model={checkpoint.get('name')}", *variants])
         raise ValueError(
             f"The checkpoint holds a model of size {checkpoint.get('name')!r}, but this learner was made with size "
-            f"{size.name!r} ({'; '.join(differences)}). Weights cannot be converted between sizes: start with "
-            f"model={checkpoint.get('name')} to use this checkpoint, or train size {size.name!r} from the beginning."
+            f"{size.name!r} ({differences}). Weights cannot be converted between sizes: start with {start} to use this "
+            f"checkpoint, or train size {size.name!r} from the beginning."
         )
 
 

@@ -60,7 +60,6 @@ class ActorLoss(LossModule):
         entropy_scale: Weight of the entropy.
         return_decay: Decay of the moving percentiles.
         continuation: Whether predicted ends of episodes cut returns; if not, imagination goes on for ever.
-        noise_correlation: ρ of the imagined actions' noise, see ``imagine``.
 
     Reads ``belief``, ``state`` and ``terminated`` of the starts, batch ``[N]`` (or any, which is flattened). Writes the
     scalars ``loss_actor``, ``entropy``, ``return_mean``, ``return_scale``, ``imagined_reward``, ``continuation`` (mean
@@ -95,7 +94,6 @@ class ActorLoss(LossModule):
         entropy_scale: float = 3e-4,
         return_decay: float = 0.99,
         continuation: bool = True,
-        noise_correlation: float = 0.0,
     ) -> None:
         super().__init__()
         self.world_model = world_model
@@ -106,7 +104,6 @@ class ActorLoss(LossModule):
         self.lambda_ = lambda_
         self.entropy_scale = scheduled(entropy_scale)
         self.continuation = continuation
-        self.noise_correlation = scheduled(noise_correlation)
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
@@ -122,7 +119,6 @@ class ActorLoss(LossModule):
             entropy_scale=config.entropy_scale,
             return_decay=config.return_decay,
             continuation=config.continuation,
-            noise_correlation=config.noise_correlation,
             **own,
         )
 
@@ -157,7 +153,7 @@ class ActorLoss(LossModule):
     def _imagine(self, belief: Tensor, state: Tensor) -> Imagination:
         """Let the actor act in the world model from starts ``(N, ...)``."""
         rssm = self.world_model.rssm
-        return imagine(rssm, self.actor, belief, state, self.horizon, self.noise_correlation)
+        return imagine(rssm, self.actor, belief, state, self.horizon)
 
     def _judge(self, features: Tensor, terminated: Tensor) -> Judgement:
         """Compute returns and weights of a rollout, with the gradient of its features.

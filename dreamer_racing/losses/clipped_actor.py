@@ -109,7 +109,9 @@ class ClippedActorLoss(ActorLoss):
         if self.ppo.kl_target is None:
             self.pace.fill_(1.0)
         with self._paced():
-            metrics = self._make_epochs(records._replace(advantage=self._normalised(records)))
+            clip = self.ppo.advantage_clip
+            advantage = normalised(records.advantage, records.weight).clamp(-clip, clip)
+            metrics = self._make_epochs(records._replace(advantage=advantage))
         metrics["ppo/pace"] = self.pace.squeeze().clone()
         self._set_pace(metrics["ppo/kl"])
         return metrics
@@ -150,14 +152,6 @@ class ClippedActorLoss(ActorLoss):
         elif kl < target / KL_TOLERANCE:
             self.pace.mul_(PACE_CHANGE).clamp_(max=1.0)
 
-    def _normalised(self, records: Minibatch) -> Tensor:
-        """Return the advantages with mean 0 and deviation 1 under their weights."""
-        share = records.weight / records.weight.sum().clamp_min(1e-8)
-        mean = (share * records.advantage).sum()
-        deviation = (share * (records.advantage - mean).square()).sum().sqrt()
-        advantage = (records.advantage - mean) / (deviation + 1e-8)
-        return advantage.clamp(-self.ppo.advantage_clip, self.ppo.advantage_clip)
-
     def _minibatch(self, batch: Minibatch) -> dict[str, Tensor]:
         """Make one gradient step; the divergence is that from before it."""
         policy = self.actor(batch.features)
@@ -176,6 +170,14 @@ def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tenso
     means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
     kl = done[-1]["ppo/kl"]
     return means | {"ppo/kl": kl, "ppo/epochs": torch.full_like(kl, len(done) / minibatches)}
+
+
+def normalised(advantage: Tensor, weight: Tensor) -> Tensor:
+    """Return advantages ``(..., 1)`` with mean 0 and deviation 1 under their weights ``(..., 1)``."""
+    share = weight / weight.sum().clamp_min(1e-8)
+    mean = (share * advantage).sum()
+    deviation = (share * (advantage - mean).square()).sum().sqrt()
+    return (advantage - mean) / (deviation + 1e-8)
 
 
 def clipped_objective(

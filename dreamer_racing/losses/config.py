@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, Range, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
 
 
 @dataclass
@@ -56,8 +56,6 @@ class LossConfig:
         min_std: Smallest standard deviation of actions. The reference has 0.1; more keeps the actor exploring where a
             first way of doing something has made it sure of itself.
         max_std: Largest standard deviation of actions. The reference has 1.
-        noise_correlation: ρ of the noise of imagined actions from one step to the next: more strays further for the
-            same deviation. The reference has 0.
         dynamics_scale: Weight of the dynamics loss.
         representation_scale: Weight of the representation loss.
         free_nats: KL below which there is no gradient, nats.
@@ -82,7 +80,6 @@ class LossConfig:
     return_decay: float = setting(0.99, SHARE)
     min_std: float = setting(0.1, POSITIVE_SHARE)
     max_std: float = setting(1.0, POSITIVE_SHARE)
-    noise_correlation: float = setting(0.0, Range(0, 0.99))
     dynamics_scale: float = setting(1.0, NOT_NEGATIVE)
     representation_scale: float = setting(0.1, NOT_NEGATIVE)
     free_nats: float = setting(1.0, NOT_NEGATIVE)

@@ -62,7 +62,8 @@ class FlownPPOActorLoss(ClippedActorLoss):
         super().__init__(*args, **kwargs)
         for name in FLOWN:
             self.register_buffer(name, torch.empty(0))
-        self.register_buffer("flown", torch.zeros(1, dtype=torch.int64))  # steps kept of each environment
+        self.register_buffer("flown", torch.zeros(1, dtype=torch.int64))  # steps kept of each environment, to be saved
+        self._flown = 0  # the same, to be read without waiting for the device
 
     @torch.no_grad()
     def watch(self, rollout: TensorDictBase) -> None:
@@ -81,14 +82,14 @@ class FlownPPOActorLoss(ClippedActorLoss):
             **{name: after[name] for name in ("reward", "done", "terminated")},
         }
         self._make_room(steps)
-        first = int(self.flown)
+        first = self._flown
         if first == len(self.reward):  # full, and no update has come: the oldest rollout makes room
             first -= len(rollout)
             for name in FLOWN:
                 self.get_buffer(name)[:first] = self.get_buffer(name)[len(rollout) :].clone()
         for name, value in steps.items():
             self.get_buffer(name)[first : first + len(value)] = value
-        self.flown.fill_(first + len(rollout))
+        self._count(first + len(rollout))
 
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Train the actor if enough was flown.
@@ -99,9 +100,9 @@ class FlownPPOActorLoss(ClippedActorLoss):
         Returns:
             Nothing, or what ``_improve_on`` does.
         """
-        if not self.flown or int(self.flown) < len(self.reward):
+        if not self._flown or self._flown < len(self.reward):
             return {}
-        self.flown.zero_()
+        self._count(0)
         # The policy flew in float32: at small deviations the rounding of bfloat16 would be a divergence of its own.
         with torch.autocast(self.reward.device.type, enabled=False):
             advantage = self._advantage()
@@ -124,7 +125,12 @@ class FlownPPOActorLoss(ClippedActorLoss):
             return
         for name, value in steps.items():
             self.register_buffer(name, value.new_zeros(room, *value.shape[1:]))
-        self.flown.zero_()
+        self._count(0)
+
+    def _count(self, flown: int) -> None:
+        """Take note of how many steps of each environment are kept."""
+        self._flown = flown
+        self.flown.fill_(flown)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Take the shape of what is loaded, unless it is of another kind of loss."""
@@ -135,3 +141,4 @@ class FlownPPOActorLoss(ClippedActorLoss):
             for name in FLOWN:
                 state_dict.pop(prefix + name, None)
         super()._load_from_state_dict(state_dict, prefix, *args)
+        self._flown = int(self.flown)

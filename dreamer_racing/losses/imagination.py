@@ -27,9 +27,7 @@ class Imagination(NamedTuple):
     action: Tensor
 
 
-def imagine(
-    rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int, noise_correlation: float | Tensor = 0.0
-) -> Imagination:
+def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
     """Let the policy act in the world model.
 
     Call it under ``torch.no_grad()`` where nothing shall flow back through the rollout, as with REINFORCE.
@@ -40,40 +38,17 @@ def imagine(
         belief: Starts, ``(N, D)``.
         state: Starts, ``(N, S)``.
         horizon: H, number of actions.
-        noise_correlation: ρ of the actions' noise from one step to the next. With ρ a rollout strays
-            sqrt((1 + ρ) / (1 − ρ)) times as far for the same deviation, as a drone does that holds another course. By
-            itself each action is a sample of the policy; given the state that earlier noise led to it is not, so
-            gradients that take it for one are biased, and the returns are of what strays, not of what is flown.
-            Reference: Eberhard et al. 2023, "Pink noise is all you need"; Hollenstein et al. 2024, "Colored noise in
-            PPO", who find the bias worth it.
 
     Returns:
         The rollout.
     """
     features, actions = [join_features(belief, state)], []
-    noise: Tensor | None = None
     for _ in range(horizon):
-        policy = actor(features[-1])
-        noise = next_noise(noise, policy.mean, noise_correlation)
-        action = policy.sample(noise)
+        action = actor(features[-1]).sample()
         belief, state = rssm.imagine_step(belief, state, action)
         actions.append(action)
         features.append(join_features(belief, state))
     return Imagination(torch.stack(features), torch.stack(actions))
-
-
-def next_noise(noise: Tensor | None, like: Tensor, correlation: float | Tensor) -> Tensor:
-    """Return standard normal noise of the shape of ``like``, correlated with that of the step before, if there is one.
-
-    Args:
-        noise: Of the step before; None at the first.
-        like: For shape, type and device.
-        correlation: ρ, from 0 to below 1, a number or a scalar.
-    """
-    fresh = torch.randn_like(like)
-    if noise is None:
-        return fresh
-    return correlation * noise + (1.0 - correlation**2) ** 0.5 * fresh
 
 
 def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:

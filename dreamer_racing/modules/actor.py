@@ -33,9 +33,9 @@ class ActionDistribution(NamedTuple):
     mean: Tensor
     std: Tensor
 
-    def sample(self, noise: Tensor | None = None) -> Tensor:
-        """Draw an action ``(..., A)``, differentiable in mean and std; standard normal noise may be given."""
-        return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean) if noise is None else noise)
+    def sample(self) -> Tensor:
+        """Draw an action ``(..., A)``, differentiable in mean and std."""
+        return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean))
 
     def mode(self) -> Tensor:
         """Return the likeliest action ``(..., A)``."""

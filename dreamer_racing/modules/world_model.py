@@ -111,8 +111,8 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def open_loop(
         self, observation: Mapping[str, Tensor], previous_action: Tensor, is_init: Tensor, context: int
-    ) -> Tensor:
-        """Reconstruct the images of the first records, then predict the others from their actions alone.
+    ) -> tuple[Tensor, Tensor]:
+        """Observe the first records, then predict the others from their actions alone.
 
         Beyond the context nothing is observed: a reset there is not followed.
 
@@ -123,14 +123,12 @@ class WorldModel(nn.Module):
             context: Number of records that are observed, at least 1.
 
         Returns:
-            Images uint8 ``(B, T, height, width, 3)``.
+            Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
 
         Raises:
-            ValueError: If ``context`` is not between 1 and T, or if there is no image decoder.
+            ValueError: If ``context`` is not between 1 and T.
         """
         time = previous_action.shape[1]
-        if self.decoder is None:
-            raise ValueError("open_loop: this world model has no image decoder, so its predictions cannot be seen.")
         if not 1 <= context <= time:
             raise ValueError(
                 f"open_loop: context must lie between 1 and the {time} records of the batch, got {context}"
@@ -144,5 +142,14 @@ class WorldModel(nn.Module):
             belief, state = self.rssm.imagine_step(beliefs[-1], states[-1], action)
             beliefs.append(belief)
             states.append(state)
-        images = self.decoder(torch.stack(beliefs, 1), torch.stack(states, 1))
-        return images.mul(255.0).round().to(torch.uint8)
+        return torch.stack(beliefs, 1), torch.stack(states, 1)
+
+    def images(self, belief: Tensor, state: Tensor) -> Tensor:
+        """Decode images uint8 ``(B, T, height, width, 3)`` from beliefs ``(B, T, D)`` and states ``(B, T, S)``.
+
+        Raises:
+            ValueError: If there is no image decoder.
+        """
+        if self.decoder is None:
+            raise ValueError("images: this world model has no image decoder, so its predictions cannot be seen.")
+        return self.decoder(belief, state).mul(255.0).round().to(torch.uint8)

@@ -2,15 +2,18 @@
 
 A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the format of `torchrl.checkpoint`. It is
 written beside its final place and renamed into it, so that a folder of that name is always complete; what a killed
-process leaves behind has a name with a leading dot, is never read, and is removed by the next run.
+process leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every
+file lies beside them and is compared before anything is read.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import shutil
+import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,10 +32,13 @@ from dreamer_racing.training.directory import (
     CHECKPOINTS,
     PREFIX,
     RunDirectory,
+    complete_checkpoints,
     ensure_writable,
     is_complete,
-    latest_checkpoint,
 )
+
+CHECKSUMS = "checksums.json"
+"""The file with the CRC-32 of all others of a checkpoint, by path: against damage, at twice the speed of a hash."""
 
 logger = logging.getLogger(__name__)
 
@@ -141,6 +147,7 @@ class RunCheckpoints:
         try:
             self._checkpoint.save(partial, metadata={**(metadata or {}), "env_steps": env_steps})
             _check_loadable(partial)
+            _write_checksums(partial)
             _sync_tree(partial)
             _publish(partial, final)
         except Exception as error:
@@ -162,6 +169,8 @@ class RunCheckpoints:
     ) -> dict[str, Any]:
         """Restores all parts.
 
+        A damaged checkpoint is passed over for the one before it, and this is logged with what is lost.
+
         Args:
             path: run directory, folder of checkpoints, or one checkpoint; this run's latest if None.
             map_location: device that tensors are read to before the parts copy them to their own.
@@ -172,12 +181,11 @@ class RunCheckpoints:
 
         Raises:
             FileNotFoundError: if there is no complete checkpoint.
-            RunCheckpointError: if a part is missing or does not fit.
+            RunCheckpointError: if all are damaged, or a part is missing or does not fit.
         """
-        source = latest_checkpoint(self.directory if path is None else path)
         self._last_saved = None
         parts = {**self.components, "random_state": RandomState()}
-        return load_components(source, parts, map_location, may_lack)
+        return load_components(self.directory if path is None else path, parts, map_location, may_lack)
 
     def _remove_later(self, newest: Path) -> None:
         for path in self._rotation.checkpoints():
@@ -204,17 +212,14 @@ class BestCheckpoint:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
         self.score: float | None = None
-        with contextlib.suppress(FileNotFoundError):
-            self.score = Checkpoint.manifest(latest_checkpoint(self.directory))["metadata"]["score"]
+        with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
+            self.score = Checkpoint.manifest(newest_sound(self.directory))["metadata"]["score"]
 
     def offer(self, score: float, env_steps: int) -> bool:
         """Save the parts if the score beats that of the kept ones; return whether it did."""
         if self.score is not None and score <= self.score:
             return False
-        # A run that was resumed from before the kept one must not remove what it saves now as the older.
-        shutil.rmtree(self._checkpoints.directory, ignore_errors=True)
-        self._checkpoints = RunCheckpoints(self.directory, self._checkpoints.components, keep_last=1)
-        self._checkpoints.save(env_steps, {"score": score})
+        self._checkpoints.save(env_steps, {"score": score})  # which removes the one before it once this one is there
         self.score = score
         return True
 
@@ -238,12 +243,36 @@ def load_components(
 
     Raises:
         FileNotFoundError: if there is no complete checkpoint.
-        RunCheckpointError: if a part is missing or does not fit.
+        RunCheckpointError: if all are damaged, or a part is missing or does not fit.
     """
-    source = latest_checkpoint(path)
+    source = newest_sound(path, components)
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
     there = {name: part for name, part in components.items() if name not in lacking}
     return _restore(_bind(there), source, map_location)
+
+
+def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path:
+    """Finds the newest complete checkpoint whose files are as they were saved; logs which it passes over, and why.
+
+    Args:
+        path: run directory, folder of checkpoints, or one checkpoint.
+        parts: which to look at; None for all.
+
+    Raises:
+        FileNotFoundError: if there is no complete checkpoint.
+        RunCheckpointError: if all are damaged.
+    """
+    passed: list[str] = []
+    for candidate in complete_checkpoints(path):
+        damage = _damage(candidate, parts)
+        if damage is None:
+            if passed:
+                logger.warning("%s. Going on from %s; what came after it is lost.", ". ".join(passed), candidate.name)
+            return candidate
+        passed.append(f"{candidate} is damaged: {damage}")
+    others = [other.name for other in complete_checkpoints(candidate.parent) if other.name not in " ".join(passed)]
+    advice = f"there are others beside it: {', '.join(others)}" if others else "there is no other beside it"
+    raise RunCheckpointError(f"{'. '.join(passed)}. It was not read; {advice}.")
 
 
 def load_state(
@@ -296,13 +325,50 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
     try:
         return checkpoint.load(source, map_location=str(map_location)).manifest["metadata"]
     except CheckpointError as error:
-        raise RunCheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
+        # torch advises to read what is no state without its safeguard
+        reason = "A file of it holds what is no state." if "weights_only" in str(error) else error
+        raise RunCheckpointError(f"The checkpoint {source} could not be restored. {reason}") from error
 
 
 def _check_loadable(path: Path) -> None:
     """Reads the state dicts back (mapped, not copied), to refuse values that only a resume would find unreadable."""
     for file in path.rglob(StateDictCheckpointAdapter.state_torch):
         torch.load(file, map_location="cpu", mmap=True, weights_only=True)
+
+
+def _write_checksums(path: Path) -> None:
+    """Notes the checksum of every file, the manifest's too."""
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    sums = {file.relative_to(path).as_posix(): _checksum(file) for file in files}
+    (path / CHECKSUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
+
+
+def _damage(path: Path, parts: Collection[str] | None) -> str | None:
+    """Says which file of some parts is not as it was saved; None if all are, or if an older version noted no sums."""
+    try:
+        sums = json.loads((path / CHECKSUMS).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return f"{CHECKSUMS} cannot be read"
+    folders = {name: record["path"] for name, record in Checkpoint.manifest(path)["components"].items()}
+    read = tuple(f"{folder}/" for name, folder in folders.items() if parts is None or name in parts)
+    for name, saved in sums.items():
+        if ("/" not in name or name.startswith(read)) and _checksum(path / name) != saved:
+            return f"{name} is not what was saved"
+    return None
+
+
+def _checksum(file: Path) -> int | None:
+    """Returns that of a file's content; None of one that cannot be read."""
+    checksum = 0
+    try:
+        with file.open("rb") as content:
+            while part := content.read(1 << 20):
+                checksum = zlib.crc32(part, checksum)
+    except OSError:
+        return None
+    return checksum
 
 
 def _sync_tree(path: Path) -> None:

@@ -110,10 +110,13 @@ class RunDirectory:
         os.replace(partial, self.finished)
 
     def finished_env_steps(self) -> int:
-        """Return the env_steps that the run was finished at; 0 if it was not."""
+        """Return the env_steps that the run was finished at; 0 if it was not, or if nobody can tell."""
         try:
             return int(json.loads(self.finished.read_text(encoding="utf-8"))["env_steps"])
         except FileNotFoundError:
+            return 0
+        except (ValueError, TypeError, KeyError):
+            logger.warning("%s is damaged: the run is taken for one that goes on.", self.finished)
             return 0
 
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
@@ -128,11 +131,18 @@ class RunDirectory:
             lines = self.starts.read_text(encoding="utf-8").splitlines(keepends=True)
         except FileNotFoundError:
             return []
-        return [json.loads(line) for line in lines if line.endswith("\n")]  # a kill may cut the last one short
+        starts = []
+        for line in lines:
+            try:
+                starts.append(json.loads(line))
+            except ValueError:
+                if line.endswith("\n"):  # a kill may cut the last one short
+                    logger.warning("A line of %s is damaged, and left out.", self.starts)
+        return starts
 
 
-def latest_checkpoint(path: str | Path) -> Path:
-    """Finds the newest complete checkpoint. Folders that a killed process left incomplete are passed over.
+def complete_checkpoints(path: str | Path) -> list[Path]:
+    """Finds the complete checkpoints, newest first. Folders that a killed process left incomplete are passed over.
 
     Args:
         path: run directory, folder of checkpoints, or one checkpoint.
@@ -142,17 +152,26 @@ def latest_checkpoint(path: str | Path) -> Path:
     """
     path = Path(path).absolute()
     if is_complete(path):
-        return path
+        return [path]
     for directory in (path / CHECKPOINTS, path):
+        found = []
         for candidate in sorted(directory.glob(f"{PREFIX}-*"), reverse=True):
             if is_complete(candidate):
-                return candidate
-            logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
-    found = "exists, but holds none" if path.exists() else "does not exist"
+                found.append(candidate)
+            else:
+                logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
+        if found:
+            return found
+    state = "exists, but holds none" if path.exists() else "does not exist"
     raise FileNotFoundError(
-        f"No complete checkpoint at {path}: the path {found}. Give a run directory (with a subfolder "
+        f"No complete checkpoint at {path}: the path {state}. Give a run directory (with a subfolder "
         f"'{CHECKPOINTS}'), a folder of '{PREFIX}-<env_steps>' folders, or one of these."
     )
+
+
+def latest_checkpoint(path: str | Path) -> Path:
+    """Finds the newest complete checkpoint, as ``complete_checkpoints`` does."""
+    return complete_checkpoints(path)[0]
 
 
 def ensure_writable(directory: str | Path) -> Path:

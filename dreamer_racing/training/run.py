@@ -1,10 +1,11 @@
 """A training run: collect, learn, log, evaluate, save, end.
 
 The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`,
-`logger.every`, `evaluation.every`, `evaluation.stochastic` and `checkpoint.every`.
+`logger.every`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
 """
 
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ from tqdm import tqdm
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay
-from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
+from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
@@ -61,6 +62,7 @@ class Run:
     clock: RunClock
     lock: RunLock
     evaluated: int = field(default=-1, init=False)  # updates at the last evaluation
+    unsaved: str = field(default="", init=False)  # since when checkpoints could not be written, for the progress
 
     remedy: ClassVar[str] = "learning rate"  # what to lower once a loss is not finite, e.g. "ppo.learning_rate"
 
@@ -92,8 +94,19 @@ class Run:
         self.learner.check_finite()
         return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
 
+    def try_to_save(self) -> str:
+        """Save on the way, where a full disk is no reason to stop: return a line on what went wrong, or nothing."""
+        try:
+            self.save()
+        except RunCheckpointError as error:
+            self.unsaved = self.unsaved or f"since {self.counters['env_steps']:,}"
+            return f"NOT SAVED: {error} The run goes on, and tries again at the next checkpoint."
+        self.unsaved = ""
+        return ""
+
     def evaluate(self) -> str:
         """Evaluate, without a trace in the random numbers of training; return a line on what came of it."""
+        self.learner.check_finite()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
@@ -102,13 +115,14 @@ class Run:
         self.evaluated = self.counters["updates"]
         # Gates first, return where the gates are the same: a return lies far below a million.
         score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
-        best = self.best.offer(score, self.counters["env_steps"])
+        try:
+            best = " (the best so far)" if self.best.offer(score, self.counters["env_steps"]) else ""
+        except RunCheckpointError as error:
+            best = f" (the best so far, but NOT SAVED: {error})"
         names = {"gates": "gates_per_episode", "success": "success_rate", "return": "return_mean"}
         shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
         numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
-        return (
-            f"evaluation at {self.counters['env_steps']:,} env_steps: {numbers}{' (the best so far)' if best else ''}"
-        )
+        return f"evaluation at {self.counters['env_steps']:,} env_steps: {numbers}{best}"
 
     @property
     def last_good(self) -> str:
@@ -164,13 +178,16 @@ def train(run: Run) -> None:
 
     Raises:
         SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
+        KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
+        RunCheckpointError: at its end the run could not be saved.
     """
     config, counters = run.config, run.counters
     schedule = Schedule(
         counters["env_steps"], log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every
     )
+    minutes = Interval(config.checkpoint.minutes)
     with (
-        GracefulExit() as stop,
+        GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
         tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
     ):
         if run.directory.finished_env_steps() >= config.total_env_steps:
@@ -192,13 +209,13 @@ def train(run: Run) -> None:
                 due = True  # so that its numbers stand where they were measured
             if due:
                 run.measure()
-                show(bar, run.metrics.write(counters["env_steps"]))
-            if schedule.due("save", counters["env_steps"]):
-                run.save()
+                show(bar, run.metrics.write(counters["env_steps"]), run.unsaved)
+            if schedule.due("save", counters["env_steps"]) | minutes.due() and (problem := run.try_to_save()):
+                bar.write(problem)
+        saved = run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
-            bar.write(f"{stop.signal_name} {at}: saving; continue with resume={run.directory.path}")
-        saved = run.save()
+            bar.write(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
         if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
             bar.write(run.evaluate())
         run.metrics.write(counters["env_steps"])
@@ -209,10 +226,11 @@ def train(run: Run) -> None:
         raise SystemExit(128 + signal.Signals[stop.signal_name])
 
 
-def show(bar: tqdm, row: dict[str, float]) -> None:
-    """Put the latest numbers behind the progress bar."""
+def show(bar: tqdm, row: dict[str, float], unsaved: str = "") -> None:
+    """Put the latest numbers behind the progress bar, and since when nothing could be saved."""
     shown = {"return": "episode/return", "gates": "episode/gates_passed", "updates/s": "rate/updates"}
-    bar.set_postfix({label: f"{row[key]:.2f}" for label, key in shown.items() if key in row})
+    numbers = {label: f"{row[key]:.2f}" for label, key in shown.items() if key in row}
+    bar.set_postfix(({"NOT SAVED": unsaved} if unsaved else {}) | numbers)
 
 
 class Schedule:
@@ -228,4 +246,19 @@ class Schedule:
         if not period or env_steps // period <= self._done[name]:
             return False
         self._done[name] = env_steps // period
+        return True
+
+
+class Interval:
+    """Says when something that happens every so many minutes of wall clock is due; never if they are 0."""
+
+    def __init__(self, minutes: float) -> None:
+        self._seconds = 60.0 * minutes
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether the interval has passed; if so it begins anew."""
+        if not self._seconds or time.monotonic() - self._last < self._seconds:
+            return False
+        self._last = time.monotonic()
         return True

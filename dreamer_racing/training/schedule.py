@@ -16,15 +16,13 @@ class Clock(Enum):
 
 @dataclass
 class Ramp:
-    """A setting that moves linearly from its own value to another, between two times of its clock, and back.
+    """A setting that moves linearly from its own value to another, between two times of its clock.
 
     Attributes:
         to: Where it ends; None: it stays at its own value.
         begin: Time at which it leaves its own value.
         end: Time from which on it stays at ``to``.
-        until: Time from which on it has its own value again, at once; None: it stays.
         by: The clock: the share of the run's env_steps that are made, or that of flights that pass the hardest gate.
-        until_by: The clock of ``until``; None: the same.
 
     Example:
         >>> Ramp(to=0.99, begin=0.5, end=1.0).at(0.98, {Clock.run: 0.75})
@@ -34,21 +32,10 @@ class Ramp:
     to: float | None = None
     begin: float = 0.0
     end: float = 1.0
-    until: float | None = None
     by: Clock = Clock.run
-    until_by: Clock | None = None
-
-    @property
-    def clocks(self) -> set[Clock]:
-        """Those that it goes by."""
-        return {self.by, self._until_by}
-
-    @property
-    def _until_by(self) -> Clock:
-        return self.by if self.until_by is None else self.until_by
 
     def check(self, name: str) -> None:
-        """Refuse a ramp that ends before it begins, turns back before it ends, or lies outside the run.
+        """Refuse a ramp that ends before it begins, or lies outside the run.
 
         Args:
             name: Of the setting, for the message.
@@ -60,14 +47,6 @@ class Ramp:
             raise ValueError(
                 f"{name}: begin={self.begin} and end={self.end} are shares, so it takes 0 <= begin <= end <= 1."
             )
-        if self.until is None:
-            if self.until_by is not None:
-                raise ValueError(f"{name}: until_by={self.until_by.value} says by what, and there is no until.")
-            return
-        least = self.end if self._until_by is self.by else 0.0
-        if not least <= self.until <= 1.0:
-            bound = f"at least end={least}" if self._until_by is self.by else "at least 0"
-            raise ValueError(f"{name}: until={self.until} must be {bound} and at most 1, or null.")
 
     def at(self, value: float, times: Mapping[Clock, float]) -> float:
         """Return the setting at a time.
@@ -76,7 +55,7 @@ class Ramp:
             value: Its own value, where it begins.
             times: What the clocks say; beyond 1 counts as 1.
         """
-        if self.to is None or (self.until is not None and times[self._until_by] >= self.until):
+        if self.to is None:
             return value
         progress = times[self.by]
         if progress >= self.end:

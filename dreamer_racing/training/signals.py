@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+import sys
 import threading
 from types import FrameType, TracebackType
 from typing import Any
@@ -14,13 +17,17 @@ class GracefulExit:
     The handlers from before are put back at exit. Outside the main thread, where Python allows no handlers, the flag
     is never set.
 
+    Args:
+        answer: Said at once on stderr at the first signal, after its name; nothing if empty.
+
     Example:
         >>> with GracefulExit() as stop:
         ...     while not stop.requested:
         ...         break
     """
 
-    def __init__(self) -> None:
+    def __init__(self, answer: str = "") -> None:
+        self._answer = answer
         self.signal_name: str | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -43,8 +50,10 @@ class GracefulExit:
         self._previous.clear()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        # No logging here: the signal may have interrupted a write to the same stream.
         name = signal.Signals(number).name
         if self.requested:
-            raise KeyboardInterrupt(f"{name} after {self.signal_name}")
+            raise KeyboardInterrupt(number)
         self.signal_name = name
+        if self._answer:  # past Python's streams: the signal may have interrupted a write to one
+            with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+                os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"\n{name}: {self._answer}\n".encode())

@@ -54,7 +54,6 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             privileged=reads_privileged,
             start_beyond_gate=env.start_beyond_gate,
             start_on_line=env.start_on_line,
-            start_before_crash=env.start_before_crash,
             miss_radius=env.miss_radius,
             device=env.device,
             looks=env.looks,

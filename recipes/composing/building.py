@@ -1,6 +1,7 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
 import random
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -147,10 +148,8 @@ def make_run_replay(
     where = storage_device if settings.storage is Storage.tensor else "files"
     if settings.storage is Storage.tensor:
         check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
-    print(
-        f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}; as much on disk "
-        f"in each of checkpoint.keep={config.checkpoint.keep} checkpoints"
-    )
+    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
+    print(disk_needed(config, round(size * min(1.0, config.total_env_steps / settings.capacity))))
     return make_replay(
         settings.capacity,
         config.env.num_envs,
@@ -168,6 +167,20 @@ def make_run_replay(
         prefetch=2 if config.device != "cpu" and storage_device == "cpu" and latents is None else None,
         **windows,
     )
+
+
+def disk_needed(config: ReplayRunConfig, replay: int) -> str:
+    """Say what checkpoints with a replay of so many bytes take at their peak, and what there is for them."""
+    assert config.run_dir is not None, "resolve_common() names it"
+    directory = RunDirectory(Path(config.run_dir))
+    there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
+    peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
+    line = (
+        f"disk: up to {peak / 1e9:.1f} GB of replay in checkpoint.keep={config.checkpoint.keep} checkpoints and the "
+        f"one that is being written, {free / 1e9:.1f} GB free"
+    )
+    advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; a run goes on without saving"
+    return f"{line}: NOT ENOUGH, {advice}" if peak > free else line
 
 
 def make_sequence_replay(

@@ -36,7 +36,6 @@ RACE_ONLY = {
     "env.control_rate": 50.0,
     "env.start_beyond_gate": 0.0,
     "env.start_on_line": 0.0,
-    "env.start_before_crash": 0.0,
     "env.miss_radius": 0.0,
     "evaluation.start_noise": 0.0,
 }
@@ -211,7 +210,7 @@ def check_schedule(config: DreamerConfig) -> None:
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and Clock.passes in ramp.clocks and not is_race(config):
+        if ramp.to is not None and ramp.by is Clock.passes and not is_race(config):
             raise ValueError(
                 f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
             )

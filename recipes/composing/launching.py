@@ -1,5 +1,6 @@
 """Launching a recipe: from what hydra composed to a run that trains, begun or continued."""
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,13 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from composing.checks import check_overrides
 from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
-from composing.saved import begun_with, changed_settings, saved_config
+from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
     keep_freed_memory,
     out_of_memory_advice,
 )
+from dreamer_racing.training.checkpoint import RunCheckpointError
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.run import train
 
@@ -54,6 +56,11 @@ def launch(
         print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     try:
         train(run)
+    except KeyboardInterrupt as interrupt:
+        print(f"abandoned: {run.last_good}", file=sys.stderr)
+        raise SystemExit(128 + next(iter(interrupt.args), signal.SIGINT)) from interrupt
+    except RunCheckpointError as error:
+        raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except NonFiniteLossError as error:
         torch.save(error.batch.to("cpu").to_dict(), run.directory.nonfinite_batch)
         raise SystemExit(
@@ -70,15 +77,23 @@ def launch(
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """The configuration of the run to continue, with the overrides given now on top.
+    """The configuration of the run to continue, as it was trained, with the overrides given now on top.
 
     Raises:
-        ValueError: it is another algorithm's run, or an override would make another run of it.
+        ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
     """
     run_dir = RunDirectory.of(latest_checkpoint(resume)).path
+    of_run = RunDirectory(run_dir.parent)
+    if run_dir == of_run.best.path and of_run.config.exists():
+        raise ValueError(f"resume={resume} are the networks of a run's best evaluation alone: resume={run_dir.parent}.")
+    for file in (RunDirectory(run_dir).config, RunDirectory(run_dir).overrides):
+        if not file.exists():
+            raise ValueError(f"{run_dir} cannot be continued: it lacks {file.name}, which every run has.")
     known = saved_config(algorithm, run_dir)
     for override in overrides:
         name, value = override_key(override), override.partition("=")[2]
+        if name == "run_dir" and Path(value.strip("'\"")).absolute() != run_dir:
+            raise ValueError(f"{override}: the run goes on in its own directory, {run_dir}. Leave it out.")
         trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
         if name in TRAINED_ON and OmegaConf.from_dotlist([f"value={value}"]).value != trained:
             raise ValueError(
@@ -86,4 +101,6 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
                 "another run. Leave it out, or begin anew."
             )
     merged = merge_overrides([*begun_with(algorithm, run_dir), f"run_dir={run_dir}"], overrides)
-    return hydra.compose(algorithm, merged), merged
+    config = hydra.compose(algorithm, merged)
+    keep_saved(config, known, {override_key(override) for override in overrides})
+    return config, merged

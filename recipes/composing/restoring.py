@@ -35,8 +35,8 @@ from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer, Learner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import load_components, load_state
-from dreamer_racing.training.directory import RunDirectory, ensure_writable, latest_checkpoint
+from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
+from dreamer_racing.training.directory import RunDirectory, ensure_writable
 from dreamer_racing.training.pass_share import PassShare
 
 
@@ -139,7 +139,7 @@ def find_trained(name: str) -> Path:
     if is_agent(name):
         return Path(name).absolute()
     try:
-        return latest_checkpoint(name)
+        return newest_sound(name, ("learner", "counters"))
     except FileNotFoundError as error:
         there = ", ".join(agents_in(AGENTS)) or "none"
         raise FileNotFoundError(f"{error} Agents that ship, to be given by name: {there}.") from error

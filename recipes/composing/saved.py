@@ -1,13 +1,22 @@
 """Configurations of runs, read back: typed as this version knows them, and compared."""
 
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
-from composing.command_line import merge_overrides, override_key
+from composing.command_line import override_key
 from composing.schema import RECIPES, DreamerConfig, RunConfig
+from dreamer_racing.envs.tracks.track import shortened
 from dreamer_racing.training.directory import RunDirectory
+
+OF_THIS_MACHINE = ("device", "env.device", "env.renderer", "model.mixed_precision", "resume", "run_dir")
+"""What a run that is resumed chooses anew, unless it was begun with a choice."""
+
+Config = TypeVar("Config", DictConfig, ListConfig)
 
 
 def trained_config(run_dir: Path) -> RunConfig:
@@ -16,7 +25,7 @@ def trained_config(run_dir: Path) -> RunConfig:
     Raises:
         ValueError: by an unknown algorithm.
     """
-    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
+    saved = read_yaml(RunDirectory(run_dir).config, DictConfig)
     algorithm = saved.get("algorithm", DreamerConfig.algorithm)
     if algorithm not in RECIPES:
         raise ValueError(f"{RunDirectory(run_dir).config}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
@@ -28,7 +37,26 @@ def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
     schema = OmegaConf.structured(RECIPES[algorithm])
     if unknown := drop_unknown(saved, schema):
         print(f"settings of another version, left out: {', '.join(unknown)}")
-    return cast(DictConfig, OmegaConf.merge(schema, saved))
+    try:
+        return cast(DictConfig, OmegaConf.merge(schema, saved))
+    except OmegaConfBaseException as error:
+        reason = str(error).replace("\n", " ")
+        raise ValueError(f"The configuration of a saved run does not fit: {shortened(reason, 300)}") from error
+
+
+def read_yaml(path: Path, kind: type[Config]) -> Config:
+    """Read a file that a run left.
+
+    Raises:
+        ValueError: it is damaged, and not that at all.
+    """
+    try:
+        content = OmegaConf.load(path)
+    except (YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
+        raise ValueError(f"{path} is damaged: {shortened(' '.join(str(error).split()), 200)}") from error
+    if not isinstance(content, kind):
+        raise ValueError(f"{path} is damaged: it holds no {'list' if kind is ListConfig else 'settings'}.")
+    return content
 
 
 def is_known(name: str, schema: DictConfig) -> bool:
@@ -51,12 +79,32 @@ def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> lis
     return dropped
 
 
+def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str], prefix: str = "") -> None:
+    """Set everything in a composed configuration to what was saved, but for `OF_THIS_MACHINE` and what is given now.
+
+    So a run goes on as it was trained, whatever the defaults of a later version.
+
+    Args:
+        config: of the run that goes on, which is changed.
+        saved: of the run as it was.
+        given: names of settings and groups; `tuned` and `budget` are everything.
+        prefix: of the names in this group.
+    """
+    for key, value in saved.items():
+        name = prefix + str(key)
+        parents = {name[:end] for end, letter in enumerate(name) if letter == "."}
+        if not {name, "tuned", "budget", *parents}.isdisjoint(given) or name in OF_THIS_MACHINE:
+            continue
+        if isinstance(value, DictConfig) and isinstance(inner := config[key], DictConfig):
+            keep_saved(inner, value, given, f"{name}.")
+        else:
+            config[key] = value
+
+
 def begun_with(algorithm: str, run_dir: Path) -> list[str]:
     """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
     schema = OmegaConf.structured(RECIPES[algorithm])
-    overrides = [str(override) for override in OmegaConf.load(RunDirectory(run_dir).overrides)]
-    if "tuned" in schema and "tuned" not in OmegaConf.load(RunDirectory(run_dir).config):
-        overrides = merge_overrides(overrides, ["tuned=none"])  # begun before there was a choice
+    overrides = [str(override) for override in read_yaml(RunDirectory(run_dir).overrides, ListConfig)]
     known = [override for override in overrides if is_known(override_key(override), schema)]
     if unknown := [override for override in overrides if override not in known]:
         print(f"overrides of another version, left out: {', '.join(unknown)}")
@@ -69,11 +117,14 @@ def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
     Raises:
         ValueError: it is another algorithm's run.
     """
-    saved = cast(DictConfig, OmegaConf.load(RunDirectory(run_dir).config))
+    saved = read_yaml(RunDirectory(run_dir).config, DictConfig)
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    return with_schema(saved, algorithm)
+    config = with_schema(saved, algorithm)
+    if "tuned" in config and "tuned" not in saved:
+        config.tuned = "none"  # begun before there was a choice
+    return config
 
 
 def changed_settings(config: DictConfig) -> list[str]:

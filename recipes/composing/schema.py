@@ -11,7 +11,7 @@ from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.dreamer import LearnerConfig
 from dreamer_racing.losses import LossConfig
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, setting
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import Ramp
 
@@ -31,7 +31,6 @@ class EnvConfig:
     start_beyond_gate: float = setting(0.0, SHARE)
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
-    start_before_crash: float = setting(0.0, Range(0, 0.9))  # share that begin before the crash of an earlier one
     # m; training episodes end where a gate is missed by less than this; 0: they go on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
     device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
@@ -52,6 +51,8 @@ class ModelConfig(LearnerConfig):
     batch_size: int = setting(MISSING, COUNT)  # windows in a batch
     batch_length: int = setting(MISSING, Range(2))  # records in a window
     replay_ratio: float = setting(MISSING, POSITIVE)  # records trained on per environment step
+    first_ratio: float = setting(1.0, POSITIVE)  # the same, of first_steps after the prefill: to see before it flies
+    first_steps: int = setting(0, NOT_NEGATIVE)  # env_steps
     imagination_horizon: int = setting(MISSING, COUNT)
     # Those of an update that the size decides:
     imagination_starts: int | None = setting(MISSING, COUNT)
@@ -123,6 +124,8 @@ class CheckpointConfig:
     """Checkpoints during training."""
 
     every: int = setting(50_000, NOT_NEGATIVE)  # env_steps
+    # of wall clock between two, for machines that are taken away; 0: by env_steps alone
+    minutes: float = setting(0.0, NOT_NEGATIVE)
     keep: int = setting(2, COUNT)
 
 
@@ -138,7 +141,6 @@ class ScheduleConfig:
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     max_std: Ramp = field(default_factory=Ramp)  # loss.max_std
-    noise_correlation: Ramp = field(default_factory=Ramp)  # loss.noise_correlation
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
     # loss.actor=ppo or flown_ppo: the actor waits while the held-out error is above so many times that in training
     wait_for_model: float | None = None
@@ -167,7 +169,7 @@ class RunConfig:
     budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it
     total_env_steps: int = setting(1_000_000, COUNT)  # control steps summed over environments
     rollout_steps: int = setting(MISSING, COUNT)  # control steps of every environment between updates
-    seed: int = setting(0, Range(0, 2**32 - 1))
+    seed: int = setting(0, SEED)
     device: str = "auto"  # auto | cpu | cuda | cuda:1 ...
     run_dir: str | None = None  # null: runs/<algorithm>_<track>_<time>
     resume: str | None = None  # run directory or checkpoint to continue
@@ -210,7 +212,8 @@ class DreamerConfig(ReplayRunConfig):
         """How much the run trains."""
         model = self.model
         records = model.batch_size * model.batch_length
-        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio")
+        first = (model.first_ratio, model.first_steps)
+        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio", *first)
 
 
 @dataclass
@@ -276,17 +279,18 @@ class EvaluateConfig:
     checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
     weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
     protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
-    start_noise: float = 0.0  # with protocol=nominal: of starts, as a multiple of the noise of training
-    episodes: int = 100  # of each condition
-    num_envs: int = 20
+    # with protocol=nominal: of starts, as a multiple of the noise of training
+    start_noise: float = setting(0.0, NOT_NEGATIVE)
+    episodes: int = setting(100, COUNT)  # of each condition
+    num_envs: int = setting(20, COUNT)
     track: str | None = None  # null: the track it was trained on
     decoys: str | None = None  # +decoys=paper | none; null: as it was trained
     preset: str | None = None  # null: the physics it was trained on
     run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
-    video_steps: int = 500
+    video_steps: int = setting(500, COUNT)
     device: str = "auto"
     renderer: str = "auto"
-    seed: int = 0
+    seed: int = setting(0, SEED)
 
 
 @dataclass
@@ -295,15 +299,15 @@ class PerceptionConfig:
 
     checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
     weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
-    episodes: int = 100  # of each kind of flight
-    num_envs: int = 100  # the first flight in each is looked at
+    episodes: int = setting(100, COUNT)  # of each kind of flight
+    num_envs: int = setting(100, COUNT)  # the first flight in each is looked at
     track: str | None = None  # null: the track it was trained on
     decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
     preset: str | None = None  # null: the physics it was trained on
     run_dir: str | None = None  # null: <run of the checkpoint>/perception
     device: str = "auto"
     renderer: str = "auto"
-    seed: int = 0
+    seed: int = setting(0, SEED)
 
 
 @dataclass
@@ -317,9 +321,9 @@ class ExportConfig:
     evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
     commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
-    steps: int = 200  # of a recorded flight, over which the export must fly as the original does
+    steps: int = setting(200, COUNT)  # of a recorded flight, over which the export must fly as the original does
     renderer: str = "auto"
-    seed: int = 0
+    seed: int = setting(0, SEED)
 
 
 class Aggregate(Enum):
@@ -338,7 +342,8 @@ class PlotConfig:
     output: str = "figures"  # folder
     quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
     aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
-    window: float | None = None  # of the curves' running mean, env_steps; null: 2 % of the longest run
+    # of the curves' running mean, env_steps; null: 2 % of the longest run
+    window: float | None = setting(None, NOT_NEGATIVE)
     flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
     flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
     over: str = "distance"  # axis of the speed profile: distance | time

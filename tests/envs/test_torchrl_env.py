@@ -1,5 +1,9 @@
 """`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/architecture.md` promises."""
 
+import gc
+import resource
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -13,6 +17,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, TrackError, make_track
 
 HOVER = (QuadrotorParameters().hover_action, 0.0, 0.0, 0.0)
+STATM = Path("/proc/self/statm")
 STRAIGHT = make_track("straight", [Gate((0.0, 0.0, 1.35), 0.0), Gate((2.0, 0.0, 1.35), 0.0)], laps=1)
 
 
@@ -293,3 +298,31 @@ def test_bad_arguments_are_explained() -> None:
         blind(track="kidny")
     with pytest.raises(ValueError, match="Unknown renderer 'vulkan'"):
         DroneRacingEnv(num_envs=1, renderer="vulkan")
+
+
+def test_a_closed_environment_has_freed_its_renderer():
+    env = DroneRacingEnv("circle", num_envs=2, seed=0)
+    assert not env.is_closed
+    env.reset()
+    env.close()
+    assert env.is_closed
+    with pytest.raises(RuntimeError, match="or is closed"):
+        env.reset()
+    env.close()
+
+
+def test_environments_made_and_closed_leave_nothing_behind():
+    """A renderer holds 7 MiB."""
+    if not STATM.exists():
+        pytest.skip("how much memory this process has is read from /proc")
+
+    def cycle() -> int:
+        env = DroneRacingEnv("circle", num_envs=2, seed=0)
+        env.reset()
+        env.close()
+        gc.collect()
+        return int(STATM.read_text().split()[1]) * resource.getpagesize()
+
+    before = [cycle() for _ in range(5)][-1]
+    after = [cycle() for _ in range(20)][-1]
+    assert after - before < 15e6

@@ -219,6 +219,12 @@ REFUSALS = {
     "start behind": ("[-2, 0.5, 1]", "[2, 0.5, 1]", ["start.position", "gates[0]", "2.00 m behind"]),
     "start too near": ("[-2, 0.5, 1]", "[-0.6, 0.5, 1]", ["start.position", "gates[0]", "0.60 m before"]),
     "start in another gate": ("[6, 6, 1.35]", "[-2, -0.5, 1.35]", ["start.position", "gates[2]"]),
+    "gate at the end of the world": ("[6, 6, 1.35]", "[6, 1.0e+300, 1.35]", ["gates[2].position", "within 1000 m"]),
+    "opening of nothing": ("opening: 1.4", "opening: 1.0e-9", ["shape.opening", "1e-09", "0.01 m at least"]),
+    "a billion laps": ("laps: 2", "laps: 1000000000", ["laps", "1000000000", "at most 1,000"]),
+    "laps without end": ("laps: 2", f"laps: 0x{'f' * 5000}", ["laps", "thousands of digits", "at most 1,000"]),
+    "a long text": ("name: mine", f"name: [{'x' * 5000}]", ["name", "['xxx", "…", "a text that is not empty"]),
+    "a long key": ("name: mine", f"{'x' * 900}: 1", ["xxx…", "unknown field"]),
     "start is a list": ("start: {position: [-2, 0.5, 1], yaw_degrees: 10}", "start: [1]", ["start", "[1]", "mapping"]),
 }
 
@@ -253,6 +259,9 @@ def test_a_lap_needs_two_gates(write, count, listed):
         ("", "the file is None.*a mapping"),
         ("- 1", r"the file is \[1\].*a mapping"),
         ("{}", "gates is missing"),
+        ("name: &a [x]\nlaps: *a", "line 2.*aliases"),
+        ("a: &a {x: 1}\nb: {<<: *a}", "line 2.*aliases"),
+        (f"# {'x' * 200_000}\ngates: []", "200,0.. bytes, but must have no more than 100,000"),
     ],
 )
 def test_files_that_are_no_track(write, text, message):
@@ -267,6 +276,26 @@ def test_a_file_that_is_no_text(tmp_path):
     path.write_bytes(b"\xff\xfe\x00\xd8")
     with pytest.raises(TrackError, match=r"binary\.yaml: the track file cannot be read"):
         load_track(path)
+
+
+@pytest.mark.parametrize("value", [None, 3, 1.5, ["kidney"], b"kidney"])
+def test_what_is_neither_name_nor_path(value):
+    with pytest.raises(TrackError, match="a track is a name, the path of a .yaml file or a Track, not "):
+        load_track(value)
+
+
+@pytest.mark.parametrize("path", ["x" * 5000 + ".yaml", "a\0b.yaml"])
+def test_paths_that_no_system_has(path):
+    with pytest.raises(TrackError, match="the track file ") as refusal:
+        load_track(path)
+    assert len(str(refusal.value)) < 500
+
+
+def test_more_gates_than_a_track_may_have(write):
+    gates = "".join(f"  - {{position: [{4 * row}, {4 * column}, 1.35], yaw_degrees: 0}}\n"
+                    for row in range(15) for column in range(14))  # fmt: skip
+    with pytest.raises(TrackError, match="gates and decoys are 210 together, but must be 200 at most"):
+        load_track(write(f"gates:\n{gates}"))
 
 
 def test_unknown_names():

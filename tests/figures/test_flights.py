@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -77,19 +78,23 @@ def test_another_table_is_no_flight(tmp_path):
 # --- stored dreams ---
 
 
-def brighter(batch, context: int) -> torch.Tensor:
-    """Pretend to reconstruct by adding 1, and to predict by writing the number of the context."""
+def brighter(batch, context: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pretend that latents are images: seen ones grow by 1, predicted ones are the number of the context."""
     images = batch["pixels"] // 2 + 1
     images[:, context:] = context
-    return images
+    return images, images
 
 
-DREAMER = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(decoder=True)), open_loop=brighter)
+DREAMER = SimpleNamespace(open_loop=brighter)
+
+
+def as_they_are(belief, state, target_gate):
+    return belief
 
 
 def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
     flight = random_flight(steps=100, pixels=True)
-    dream = record_dream(DREAMER, flight, windows=2)
+    dream = record_dream(DREAMER, flight, as_they_are, windows=2)
     assert dream is not None and dream.real.shape == (2, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3)
     assert dream.frame_dt == pytest.approx(0.02 * STRIDE)
     starts = (0, (101 - (STRIDE * (SEEN_FRAMES + PREDICTED_FRAMES - 1) + 1)) // 2)
@@ -104,22 +109,23 @@ def test_a_dream_is_a_flight_reconstructed_and_predicted(tmp_path):
     again = Dream.load(tmp_path / "a_dream.npz")
     for name in ("real", "reconstructed", "imagined"):
         np.testing.assert_array_equal(getattr(again, name), getattr(dream, name))
-    assert (again.context, again.frame_dt) == (dream.context, dream.frame_dt)
+    assert (again.context, again.frame_dt, again.from_pose) == (dream.context, dream.frame_dt, False)
+    replace(dream, from_pose=True).save(tmp_path / "a_dream.npz")
+    assert Dream.load(tmp_path / "a_dream.npz").from_pose
 
 
 def test_short_flights_and_agents_without_decoder_leave_no_dream():
-    assert record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE - 1, pixels=True)) is None
-    shortest = record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE, pixels=True))
+    assert record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE - 1, pixels=True), as_they_are) is None
+    shortest = record_dream(DREAMER, random_flight(steps=SEEN_FRAMES * STRIDE, pixels=True), as_they_are)
     assert shortest is not None and shortest.real.shape[1] == SEEN_FRAMES + 1
-    blind = SimpleNamespace(agent=SimpleNamespace(world_model=SimpleNamespace(decoder=None)))
-    assert record_dream(blind, random_flight(pixels=True)) is None
-    assert record_dream(DREAMER, random_flight()) is None
+    assert record_dream(DREAMER, random_flight(pixels=True), None) is None
+    assert record_dream(DREAMER, random_flight(), as_they_are) is None
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:2000], lambda data: data[:2000] + bytes(99) + data[2099:]])
 def test_half_a_dream_is_refused(tmp_path, damage):
     path = tmp_path / "a_dream.npz"
-    record_dream(DREAMER, random_flight(pixels=True)).save(path)
+    record_dream(DREAMER, random_flight(pixels=True), as_they_are).save(path)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match="holds no dream, or half of one"):
         Dream.load(path)

@@ -220,7 +220,8 @@ def test_every_image_size_updates(image_size):
     metrics = learner.update(batch)
     assert metrics["loss"].isfinite()
     torch.testing.assert_close(metrics["loss_image"], metrics["image_error"] * image_size**2 * 3)
-    assert learner.open_loop(batch, context=2).shape == (3, 6, image_size, image_size, 3)
+    images = learner.agent.world_model.images(*learner.open_loop(batch, context=2))
+    assert images.shape == (3, 6, image_size, image_size, 3)
 
 
 def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
@@ -255,7 +256,8 @@ def test_every_terminal_record_is_a_start_of_no_weight():
 
 def test_open_loop_video():
     learner = learner_of(seed=0, **CONFIG)
-    images = learner.open_loop(make_batch(), context=2)
+    belief, state = learner.open_loop(make_batch(), context=2)
+    images = learner.agent.world_model.images(belief, state)
     assert images.shape == (3, 6, 64, 64, 3)
     assert images.dtype == torch.uint8
 

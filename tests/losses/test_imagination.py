@@ -1,9 +1,7 @@
-import pytest
 import torch
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from dreamer_racing.losses import imagine, lambda_return
-from dreamer_racing.losses.imagination import next_noise
 from dreamer_racing.modules import SIZES
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
@@ -42,24 +40,3 @@ def test_imagination_starts_where_told():
     assert action.shape == (3, 5, 4)
     assert torch.equal(features[0], torch.cat((belief, state), -1))
     assert features.requires_grad
-
-
-def test_noise_is_normal_and_correlated_from_step_to_step():
-    torch.manual_seed(0)
-    like, noise, steps = torch.zeros(20_000, 1), None, []
-    for _ in range(6):
-        noise = next_noise(noise, like, 0.8)
-        steps.append(noise)
-    noises = torch.cat(steps, 1).double()  # (N, steps)
-    torch.testing.assert_close(noises.var(0), torch.ones(6).double(), atol=0.03, rtol=0)
-    correlation = torch.corrcoef(noises.T)
-    assert correlation[0, 1].item() == pytest.approx(0.8, abs=0.02)
-    assert correlation[1, 4].item() == pytest.approx(0.8**3, abs=0.03)
-
-
-def test_noise_without_correlation_is_drawn_as_a_sample_is():
-    like, before = torch.zeros(3, 2), torch.ones(3, 2)
-    torch.manual_seed(0)
-    drawn = next_noise(before, like, 0.0)
-    torch.manual_seed(0)
-    assert torch.equal(drawn, torch.randn(3, 2))

@@ -11,7 +11,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import ActorPPOConfig, PPOActorLoss, imagine
-from dreamer_racing.losses.clipped_actor import Minibatch, clipped_objective, normal_divergence
+from dreamer_racing.losses.clipped_actor import Minibatch, clipped_objective, normal_divergence, normalised
 from dreamer_racing.modules.actor import ActionDistribution
 from tests.dreamers import learner_of
 
@@ -184,13 +184,24 @@ def test_advantages_are_normalised_under_their_weights():
     loss.weight.uniform_()
     loss.advantage.normal_(mean=3.0)
     records = kept_by(loss)
-    records = records._replace(advantage=loss._normalised(records))
+    advantage = normalised(records.advantage, records.weight)
     share = records.weight / records.weight.sum()
-    mean = (share * records.advantage).sum()
+    mean = (share * advantage).sum()
     assert mean.item() == pytest.approx(0.0, abs=1e-4)
-    assert (share * (records.advantage - mean).square()).sum().item() == pytest.approx(1.0, abs=1e-3)
+    assert (share * (advantage - mean).square()).sum().item() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_no_advantage_counts_for_more_than_the_clip(monkeypatch):
+    loss = make_learner().losses["actor"]
+    for _ in range(3):
+        loss(make_starts())
+    loss.weight.uniform_()
+    loss.advantage.normal_(mean=3.0)
     loss.advantage[0, 0, 0], loss.weight[0, 0, 0] = 1e6, 1e-6  # rare, so that it does not stretch the deviation
-    assert loss._normalised(kept_by(loss)).max().item() == PPO.advantage_clip
+    made = []
+    monkeypatch.setattr(loss, "_make_epochs", lambda records: made.append(records) or {"ppo/kl": torch.zeros(())})
+    loss._improve_on(kept_by(loss))
+    assert made[0].advantage.max().item() == PPO.advantage_clip
 
 
 def test_a_checkpoint_between_two_improvements_loses_nothing():

@@ -159,7 +159,7 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
-    assert set(names) == {"discount", "entropy_scale", "max_std", "min_std", "noise_correlation"}
+    assert set(names) == {"discount", "entropy_scale", "max_std", "min_std"}
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates")]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
@@ -168,7 +168,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert end == dict.fromkeys(("rates", *names), 0.5)
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
     learner.adjust(**end)
-    assert float(learner.losses["actor"].noise_correlation) == learner.discount == 0.5
+    assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
 
 
 def test_nothing_goes_by_gates_where_there_are_none():

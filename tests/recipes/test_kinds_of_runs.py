@@ -20,23 +20,86 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, compose, recipe, recipe_module, rows
 
+SLOW_DISK = """
+import runpy, sys, time
+sys.path.insert(0, {folder!r})
+import dreamer_racing.training.checkpoint as checkpoint
+def save(*_):
+    print("saving slowly", flush=True)
+    time.sleep(100)
+checkpoint.RunCheckpoints.save = save
+sys.argv[0] = {path!r}
+runpy.run_path({path!r}, run_name="__main__")
+"""
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_exits_cleanly(number: signal.Signals, tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "recipes" / "dreamer_v3.py"), *SMALL, "total_env_steps=1000000",
-               "evaluation.every=0", "checkpoint.every=1000000", "run_dir=run"]  # fmt: skip
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(command, cwd=tmp_path, **pipes) as process:
+
+@pytest.mark.parametrize(
+    ("number", "times"),
+    [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)],
+    ids=["INT", "TERM", "INT twice", "TERM twice"],
+)
+def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
+    number: signal.Signals, times: int, tmp_path: Path
+) -> None:
+    path = ROOT / "recipes" / "dreamer_v3.py"
+    program = [str(path)] if times == 1 else ["-c", SLOW_DISK.format(folder=str(path.parent), path=str(path))]
+    command = [sys.executable, *program, *SMALL, "total_env_steps=1000000", "evaluation.every=0",
+               "checkpoint.every=1000000", "run_dir=run"]  # fmt: skip
+    with (
+        (tmp_path / "said").open("w") as said,
+        subprocess.Popen(command, cwd=tmp_path, stdout=said, stderr=subprocess.STDOUT) as process,
+    ):
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline:
             if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):
                 break
             time.sleep(0.2)
         process.send_signal(number)
-        output, _ = process.communicate(timeout=120)
+        while times == 2 and "saving slowly" not in (tmp_path / "said").read_text() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if times == 2:
+            process.send_signal(number)
+        process.wait(timeout=120)
+    output = (tmp_path / "said").read_text()
     assert process.returncode == 128 + number, output
-    assert number.name in output and "of 1,000,000 env_steps" in output
-    assert list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
+    assert f"{number.name}: saving; again: abandons" in output and "Traceback" not in output
+    saved = list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
+    if times == 1:
+        assert "of 1,000,000 env_steps" in output and saved
+    else:
+        assert "abandoned: there is no checkpoint yet" in output and not saved
+
+
+FULL_DISK = """
+import dreamer_racing.training.checkpoint as checkpoint
+sync, calls = checkpoint._sync_tree, []
+def full(path):
+    calls.append(path)
+    if len(calls) <= {times}:
+        raise OSError(28, "No space left on device")
+    sync(path)
+checkpoint._sync_tree = full
+"""
+
+
+def test_a_run_outlives_a_full_disk(tmp_path: Path) -> None:
+    """The best and the checkpoint at 400 cannot be written; those at 800 can."""
+    done = recipe("dreamer_v3", *SMALL, "run_dir=run", cwd=tmp_path, before=FULL_DISK.format(times=2))
+    assert done.returncode == 0 and done.stdout.count("NOT SAVED") == 2 and "No space left" in done.stdout, done.stderr
+    assert "The run goes on, and tries again" in done.stdout and "GB free" in done.stdout
+    assert latest_checkpoint(tmp_path / "run").name == "checkpoint-000000000800"
+
+
+def test_a_run_that_cannot_be_saved_at_its_end_says_so(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "run_dir=run", cwd=tmp_path, before=FULL_DISK.format(times=99))
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "could not be written" in done.stderr and "There is no checkpoint yet." in done.stderr
+
+
+def test_checkpoints_by_the_clock(tmp_path: Path) -> None:
+    done = recipe("dreamer_v3", *TINY, "checkpoint.minutes=1e-6", "checkpoint.keep=9", "run_dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))) > 2
 
 
 @pytest.mark.slow

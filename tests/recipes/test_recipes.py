@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import hydra
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.evaluation.lesions import LESIONS
 from tests.running_recipes import CONFIG, SMALL, build, recipe, recipe_module, rows
@@ -163,6 +164,52 @@ def test_a_run_goes_on_at_its_control_rate(run_dir: Path) -> None:
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         config, _ = resumed("dreamer_v3", str(run_dir), ["env.control_rate=50"])
     assert config.env.control_rate == 50
+
+
+def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp_path: Path) -> None:
+    """As after an update: what is saved is none of today's defaults, and what is not saved did not exist."""
+    copied = shutil.copytree(run_dir, tmp_path / "run")
+    saved = OmegaConf.load(copied / "config.yaml")
+    saved.model.replay_ratio, saved.loss.discount, saved.env.num_envs = 3.0, 0.9, 2
+    del saved.tuned, saved.model.average_rate
+    OmegaConf.save(saved, copied / "config.yaml")
+    resumed = recipe_module("composing.launching").resumed_config
+    recipe_module("composing.schema").register()
+
+    def composed(*overrides: str) -> DictConfig:
+        with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+            return resumed("dreamer_v3", str(copied), list(overrides))[0]
+
+    config = composed()
+    assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (3.0, 0.9, 2)
+    assert (config.tuned, config.model.average_rate, config.device) == ("none", None, "auto")
+    config = composed("model.replay_ratio=5", "loss=decoder_free", "schedule.discount.to=0.99")
+    assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (5.0, 0.997, 2)
+    assert config.loss.world_model == "decoder_free" and config.schedule.discount.to == 0.99
+    assert composed("tuned=race").loss.actor == "flown_ppo"
+
+
+def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
+    resumed = recipe_module("composing.launching").resumed_config
+    with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first run\."):
+        resumed("dreamer_v3", str(run_dir / "best"), [])
+    with pytest.raises(ValueError, match=r"run_dir=elsewhere: the run goes on in its own directory, .*first run"):
+        resumed("dreamer_v3", str(run_dir), ["run_dir=elsewhere"])
+    best = shutil.copytree(run_dir, tmp_path / "best")  # a run may have any name
+    recipe_module("composing.schema").register()
+    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+        assert resumed("dreamer_v3", str(best), [])[0].track == "circle"
+    copied = shutil.copytree(run_dir, tmp_path / "run")
+    whole = (copied / "config.yaml").read_text()
+    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3"):
+        (copied / "config.yaml").write_text(damage)
+        with pytest.raises(ValueError, match=r"config\.yaml is damaged|does not fit") as refusal:
+            resumed("dreamer_v3", str(copied), [])
+        assert "\n" not in str(refusal.value)
+    (copied / "config.yaml").write_text(whole)
+    (copied / "overrides.yaml").unlink()
+    with pytest.raises(ValueError, match=r"run cannot be continued: it lacks overrides.yaml"):
+        resumed("dreamer_v3", str(copied), [])
 
 
 def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:

@@ -62,7 +62,6 @@ REFUSED = [
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
-    (["schedule.noise_correlation.to=1"], ["schedule.noise_correlation.to=1.0: must be at least 0 and at most 0.99"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
     (["model.imagine_recent=true"], ["model.imagine_recent=true, and replay.recent_share=0 draws none"]),
     (
@@ -107,6 +106,28 @@ def test_what_cannot_work_is_refused_before_it_starts(
 def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         recipe_module("composing.checks").check_overrides(compose("dreamer_v3", *overrides), overrides)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("evaluate", ["checkpoint=nowhere", "episodes=0"]),
+        ("evaluate", ["checkpoint=nowhere", "start_noise=-1"]),
+        ("perception", ["checkpoint=nowhere", "episodes=0"]),
+        ("perception", ["checkpoint=nowhere", "num_envs=-3"]),
+        ("export", ["checkpoint=nowhere", "steps=0"]),
+        ("plot", ["window=-1"]),
+    ],
+)
+def test_numbers_out_of_their_range_are_refused_before_anything_is_read(
+    name: str, overrides: list[str], tmp_path: Path
+) -> None:
+    done = recipe(name, *overrides, cwd=tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert f"{overrides[-1].partition('=')[0]}={float(overrides[-1].partition('=')[2]):g}" in done.stderr.replace(
+        ".0", ""
+    )
+    assert "must be at least" in done.stderr
 
 
 def test_an_unknown_protocol_is_refused() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from dreamer_racing.training.checkpoint import CHECKSUMS
 from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import recipe_module
 
@@ -55,7 +56,7 @@ def parts(run_dir: Path) -> dict[str, Any]:
         name = str(path.relative_to(latest_checkpoint(run_dir)))
         if path.suffix == ".pt":
             found[name] = torch.load(path, weights_only=True)
-        elif path.suffix in (".bin", ".json") and path.name != "manifest.json":
+        elif path.suffix in (".bin", ".json") and path.name not in ("manifest.json", CHECKSUMS):
             found[name] = path.read_bytes()
     return found
 

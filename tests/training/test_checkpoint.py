@@ -8,6 +8,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -20,7 +21,14 @@ from torchrl.checkpoint import CheckpointError
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay, make_replay
 from dreamer_racing.training import checkpoint as checkpoint_module
-from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints, load_components
+from dreamer_racing.training.checkpoint import (
+    CHECKSUMS,
+    BestCheckpoint,
+    RunCheckpointError,
+    RunCheckpoints,
+    load_components,
+    newest_sound,
+)
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.signals import GracefulExit
 
@@ -326,6 +334,104 @@ def test_first_signal_sets_the_flag_second_raises(number):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def flip(file: Path) -> None:
+    """Change 16 bytes in the middle of a file."""
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
+    file.write_bytes(content)
+
+
+def files_of(checkpoint: Path) -> list[str]:
+    return sorted(str(file.relative_to(checkpoint)) for file in checkpoint.rglob("*") if file.is_file())
+
+
+def test_every_damaged_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
+    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
+    names = files_of(newest)
+    assert len(names) > 8 and CHECKSUMS in names and any("replay" in name for name in names)
+    for name in names:
+        whole = (newest / name).read_bytes()
+        for damage in (flip, lambda file: file.write_bytes(file.read_bytes()[:-1])):
+            caplog.clear()
+            damage(newest / name)
+            with caplog.at_level("WARNING"):
+                assert newest_sound(saved) == before, name
+            if name != "manifest.json":  # without it there is no checkpoint, which is passed over as such
+                assert f"{newest} is damaged: {name}" in caplog.text and "what came after it is lost" in caplog.text
+            (newest / name).write_bytes(whole)
+    assert newest_sound(saved) == newest
+
+
+def test_a_run_goes_on_from_before_a_damaged_checkpoint_and_replaces_it(saved):
+    flip(next((saved / "checkpoints/checkpoint-000000000030").rglob("*-learner/*.pt")))
+    run = Run(saved)
+    assert run.checkpoints.load(saved)["env_steps"] == 20
+    run.assert_consistent()
+    run.advance()
+    run.save()
+    assert newest_sound(saved).name == "checkpoint-000000000030"
+    assert Run(saved).checkpoints.load()["env_steps"] == 30
+
+
+def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
+    newest = saved / "checkpoints/checkpoint-000000000030"
+    flip(next(newest.rglob("*-learner/*.pt")))
+    with pytest.raises(RunCheckpointError, match=r"30 is damaged: .*-learner/.*\.pt is not .* checkpoint-000000000020"):
+        Run(saved).checkpoints.load(newest)
+    assert load_components(newest, {"counters": {}})["env_steps"] == 30  # what is read of it is sound
+
+
+def test_checkpoints_of_before_there_were_checksums_are_read(saved):
+    newest = saved / "checkpoints/checkpoint-000000000030"
+    (newest / CHECKSUMS).unlink()
+    assert Run(saved).checkpoints.load()["env_steps"] == 30
+    file = next(newest.rglob("*-learner/*.pt"))
+    file.write_bytes(b"not a state" * 100)
+    with pytest.raises(RunCheckpointError, match="could not be restored") as error:
+        Run(saved).checkpoints.load()
+    assert "weights_only" not in str(error.value)
+
+
+def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
+    counters = {"env_steps": 10}
+    best = BestCheckpoint(tmp_path, {"counters": counters})
+    best.offer(1.0, 10)
+    counters["env_steps"] = 20
+
+    def full(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(checkpoint_module, "_sync_tree", full)
+    with pytest.raises(RunCheckpointError, match="No space left"):
+        best.offer(2.0, 20)
+    monkeypatch.undo()
+    restored: dict[str, int] = {}
+    assert load_components(tmp_path / "best", {"counters": restored})["score"] == 1.0 and restored["env_steps"] == 10
+    assert best.score == 1.0 and best.offer(2.0, 20)
+    assert BestCheckpoint(tmp_path, {"counters": counters}).score == 2.0
+
+
+def test_a_signal_is_taken_where_nobody_reads_what_it_says(monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)  # as after `| tee` has died of the same Ctrl-C
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    with GracefulExit("saving") as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        while not stop.requested:
+            time.sleep(0.001)
+    assert stop.signal_name == "SIGINT"
+
+
+def test_a_damaged_best_is_replaced_by_the_next_evaluation(tmp_path):
+    counters = {"env_steps": 10}
+    BestCheckpoint(tmp_path, {"counters": counters}).offer(5.0, 10)
+    flip(next((tmp_path / "best").rglob("value.json")))
+    again = BestCheckpoint(tmp_path, {"counters": counters})
+    assert again.score is None and again.offer(1.0, 20)
+    assert BestCheckpoint(tmp_path, {"counters": counters}).score == 1.0
 
 
 def test_handlers_return_after_an_exception():

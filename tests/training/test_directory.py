@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from dreamer_racing.training.directory import RunDirectory
 
 
@@ -32,3 +34,15 @@ def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:
     assert run.finished_env_steps() == 0
     run.mark_finished(1200)
     assert run.finished_env_steps() == 1200
+    for damage in ("", "{", "[]", '{"env_steps": null}', "{}"):
+        run.finished.write_text(damage)
+        assert run.finished_env_steps() == 0, damage
+
+
+def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = RunDirectory(tmp_path)
+    run.note_start(0, [], None)
+    with run.starts.open("a") as file:
+        file.write("{damaged}\n")
+    run.note_start(8, [], None)
+    assert [start["env_steps"] for start in run.read_starts()] == [0, 8] and "is damaged" in caplog.text

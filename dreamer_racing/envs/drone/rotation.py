@@ -42,3 +42,19 @@ def from_roll_pitch_yaw(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
         ),
         dim=-1,
     )
+
+
+def align(body: Tensor, world: Tensor) -> Tensor:
+    """Return the attitudes (..., 4), wxyz, that best rotate body-frame vectors (..., K, 3) into world ones (..., K, 3).
+
+    Best by the sum of squared distances; longer vectors count for more. With K ≥ 2 that are not parallel it is unique.
+
+    Reference: Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", Section 4.
+    """
+    products = torch.einsum("...ki,...kj->...ij", body, world)
+    trace = products.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    cross = torch.linalg.cross(body, world).sum(-2)
+    symmetric = products + products.mT - trace * torch.eye(3, dtype=body.dtype, device=body.device)
+    upper = torch.cat((trace, cross.unsqueeze(-2)), -1)
+    matrix = torch.cat((upper, torch.cat((cross.unsqueeze(-1), symmetric), -1)), -2)
+    return torch.linalg.eigh(matrix).eigenvectors[..., -1]

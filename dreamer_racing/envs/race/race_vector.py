@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.rotation import rotate_inverse
+from dreamer_racing.envs.drone.rotation import align, rotate, rotate_inverse
 from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.envs.tracks import Track
 
@@ -70,3 +70,28 @@ class RaceVector:
         body = rotate_inverse(state.attitude.unsqueeze(1).expand(-1, 6, 4), world)
         rates = (state.body_rates / RATES).unsqueeze(1)
         return torch.cat((body[:, :1], rates, body[:, 1:]), 1).flatten(1).float()
+
+    def pose(self, vector: Tensor, target_gate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where a drone is whose race looks like this, as well as one can say of vectors that are not exact.
+
+        The attitude fits up, both gates' directions of flight and the line between them, by least squares; the position
+        is that from which the target gate lies where it seems to.
+
+        Args:
+            vector: As ``__call__`` returns them, ``(N, 21)``.
+            target_gate: The gate to pass next, int64 ``(N,)``.
+
+        Returns:
+            Positions ``(N, 3)`` in m, attitudes ``(N, 4)``, wxyz, and how badly these gates fit the vectors ``(N,)``:
+            the mean square of what is left, of vectors of length 1.
+        """
+        gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
+        up, to_gate, direction, to_next, next_direction = vector.to(self._up.dtype).view(-1, 7, 3)[:, 2:].unbind(1)
+        places, normals = self._positions[gates], self._normals[gates]
+        body = torch.stack((up, direction, next_direction, DISTANCE * (to_next - to_gate)), 1)
+        world = torch.cat((self._up.expand(len(gates), 1, 3), normals, places[:, 1:] - places[:, :1]), 1)  # (N, 4, 3)
+        length = world.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        body, world = body / length, world / length
+        attitude = align(body, world)
+        misfit = (rotate(attitude.unsqueeze(1), body) - world).square().sum(-1).mean(-1)
+        return places[:, 0] - rotate(attitude, DISTANCE * to_gate), attitude, misfit

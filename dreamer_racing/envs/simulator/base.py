@@ -129,4 +129,4 @@ class Simulator(ABC):
 
 def no_images() -> RuntimeError:
     """The error of asking a simulator without a renderer for images."""
-    return RuntimeError("This simulator was made with renderer=None: it has no images to give.")
+    return RuntimeError("This simulator has no images to give: it was made with renderer=None, or is closed.")

@@ -10,11 +10,14 @@ from typing import Any, Literal
 
 import yaml
 
-from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track
+from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track, quoted, shortened
 from dreamer_racing.envs.tracks.validation import validate_track
 
 BUILTIN_TRACKS: tuple[str, ...] = ("circle", "kidney", "figure8", "split_s", "figure8_decoys")
 """Names that ``load_track`` knows without a path."""
+
+MAX_BYTES = 100_000
+"""Size of a track file; the most gates that a track may have take a tenth of it [choice]."""
 
 _FOLDER = Path(__file__).parent
 
@@ -49,15 +52,20 @@ def _find(name_or_path: str | Path) -> Path:
             return _FOLDER / f"{name_or_path}.yaml"
         if not name_or_path.endswith((".yaml", ".yml")):
             raise TrackError(
-                f"unknown track {name_or_path!r}{_suggestion(name_or_path, BUILTIN_TRACKS)}: the known tracks are "
-                f"{', '.join(BUILTIN_TRACKS)}, and the path of a .yaml file works too."
+                f"unknown track {quoted(name_or_path)}{_suggestion(name_or_path, BUILTIN_TRACKS)}: the known tracks "
+                f"are {', '.join(BUILTIN_TRACKS)}, and the path of a .yaml file works too."
             )
+    if not isinstance(name_or_path, str | Path):
+        raise TrackError(f"a track is a name, the path of a .yaml file or a Track, not {quoted(name_or_path)}.")
     path = Path(name_or_path).expanduser()
-    if not path.is_file():
-        state = "is not a file" if path.exists() else "does not exist"
+    try:
+        state = "" if path.is_file() else "is not a file" if path.exists() else "does not exist"
+    except OSError as error:
+        state = f"cannot be looked at ({error.strerror})"
+    if state:
         raise TrackError(
-            f"the track file {str(path)!r} {state} (working folder: {Path.cwd()}). Give the path of a .yaml file or "
-            f"one of the known tracks: {', '.join(BUILTIN_TRACKS)}."
+            f"the track file {quoted(str(path))} {state} (working folder: {Path.cwd()}). Give the path of a .yaml file "
+            f"or one of the known tracks: {', '.join(BUILTIN_TRACKS)}."
         )
     return path
 
@@ -68,8 +76,17 @@ def _suggestion(word: Any, known: Collection[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML's safe loader, which also refuses a key given twice instead of keeping the last one silently."""
+class _PlainLoader(yaml.SafeLoader):
+    """YAML's safe loader, which refuses a key given twice instead of keeping the last one silently, and aliases.
+
+    Aliases let a small file stand for more than any memory holds.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(None, None, "aliases (*name) are not taken", event.start_mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()
@@ -117,11 +134,15 @@ class _TrackReader:
     def _parse(self) -> Any:
         """Return the file's content as Python objects."""
         try:
+            if (size := self._path.stat().st_size) > MAX_BYTES:
+                raise TrackError(
+                    f"{self._path}: the track file has {size:,} bytes, but must have no more than {MAX_BYTES:,}."
+                )
             text = self._path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise TrackError(f"{self._path}: the track file cannot be read: {error}.") from error
         try:
-            return yaml.load(text, Loader=_UniqueKeyLoader)
+            return yaml.load(text, Loader=_PlainLoader)
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark
             where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "somewhere"
@@ -180,13 +201,15 @@ class _TrackReader:
         for key in value:
             if key not in allowed:
                 raise TrackError(
-                    f"{self._path}: {prefix}{key} is an unknown field (its value is {value[key]!r})"
-                    f"{_suggestion(key, allowed)}; the allowed fields of {where} are {', '.join(allowed)}."
+                    f"{self._path}: {prefix}{shortened(str(key))} is an unknown field (its value is "
+                    f"{quoted(value[key])}){_suggestion(key, allowed)}; the allowed fields of {where} are "
+                    f"{', '.join(allowed)}."
                 )
         for key in sorted(required):
             if key not in value:
+                there = shortened(", ".join(map(str, value))) or "no field"
                 raise TrackError(
-                    f"{self._path}: {prefix}{key} is missing; {where} has {', '.join(map(str, value)) or 'no field'} "
+                    f"{self._path}: {prefix}{key} is missing; {where} has {there} "
                     f"and needs {', '.join(sorted(required))}."
                 )
         return value
@@ -230,4 +253,4 @@ class _TrackReader:
 
     def _error(self, where: str, value: Any, allowed: str) -> TrackError:
         """Return the refusal of one field."""
-        return TrackError(f"{self._path}: {where} is {value!r}, but must be {allowed}.")
+        return TrackError(f"{self._path}: {where} is {quoted(value)}, but must be {allowed}.")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from itertools import permutations
 
-from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
+from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector, quoted
 
 ROUNDING = 1e-9
 """How far (m) rounding may carry a point over a limit that it stands on."""
@@ -24,6 +24,15 @@ START_CLEARANCE = 0.3
 
 GATE_CLEARANCE = 1.0
 """Distance (m) of a start from a gate's plane: the noise of a training start moves it by at most 0.71 m [choice]."""
+
+FARTHEST = 1000.0
+"""Largest coordinate (m), at which float32 still tells 0.1 mm [choice]."""
+
+SMALLEST = 0.01
+"""Least opening, thickness and width of the bars of a gate (m) [choice]."""
+
+MAX_GATES, MAX_LAPS = 200, 1000
+"""Gates and decoys together, of which all pairs are checked, and laps [choice]."""
 
 
 def validate_track(track: Track, source: str) -> None:
@@ -76,6 +85,8 @@ def _check_numbers(track: Track, source: str) -> None:
     for field, vector in vectors.items():
         if len(vector) != 3 or not all(math.isfinite(number) for number in vector):
             raise _error(source, field, vector, "three finite numbers (x, y, z) in m")
+        if max(map(abs, vector)) > FARTHEST:
+            raise _error(source, field, vector, f"within {FARTHEST:.0f} m of the origin on every axis")
     numbers = {
         "start.yaw_degrees": track.start_yaw_degrees,
         **{f"{name}.yaw_degrees": gate.yaw_degrees for name, gate in _named_gates(track)},
@@ -84,14 +95,16 @@ def _check_numbers(track: Track, source: str) -> None:
     for field, number in numbers.items():
         if not math.isfinite(number):
             raise _error(source, field, number, "a finite number")
-    if track.laps < 1:
-        raise _error(source, "laps", track.laps, "a whole number of at least 1")
+    if not 1 <= track.laps <= MAX_LAPS:
+        raise _error(source, "laps", track.laps, f"a whole number of at least 1 and at most {MAX_LAPS:,}")
 
 
 def _check_kinds(track: Track, source: str) -> None:
     """Refuse too few race gates, and gates listed under the wrong name."""
     if len(track.gates) < 2:
         raise _error(source, "gates", track.gates, "at least 2 race gates, so that there is a lap")
+    if (count := len(track.gates) + len(track.decoys)) > MAX_GATES:
+        raise TrackError(f"{source}: gates and decoys are {count:,} together, but must be {MAX_GATES} at most.")
     for name, gate in _named_gates(track):
         kind = "race" if name.startswith("gates") else "decoy"
         if gate.kind != kind:
@@ -100,12 +113,15 @@ def _check_kinds(track: Track, source: str) -> None:
 
 def _check_shape(shape: GateShape, source: str) -> None:
     """Refuse gates without an opening, a frame or a thickness."""
-    if shape.opening <= 0:
-        raise _error(source, "shape.opening", shape.opening, "greater than 0 m")
-    if shape.outer <= shape.opening:
-        raise _error(source, "shape.outer", shape.outer, f"greater than shape.opening, which is {shape.opening} m")
-    if shape.depth <= 0:
-        raise _error(source, "shape.depth", shape.depth, "greater than 0 m")
+    if shape.opening < SMALLEST:
+        raise _error(source, "shape.opening", shape.opening, f"greater than 0 m, {SMALLEST} m at least")
+    if shape.outer <= shape.opening + 2 * SMALLEST - ROUNDING:
+        allowed = f"greater than shape.opening, which is {shape.opening} m, by {2 * SMALLEST} m at least"
+        raise _error(source, "shape.outer", shape.outer, allowed)
+    if shape.outer > FARTHEST:
+        raise _error(source, "shape.outer", shape.outer, f"at most {FARTHEST:.0f} m")
+    if shape.depth < SMALLEST:
+        raise _error(source, "shape.depth", shape.depth, f"greater than 0 m, {SMALLEST} m at least")
     if not 0 <= shape.margin < shape.opening / 2:
         allowed = f"from 0 to less than half of shape.opening, which is {shape.opening / 2} m"
         raise _error(source, "shape.margin", shape.margin, allowed)
@@ -232,4 +248,4 @@ def _rounded(vector: Vector) -> Vector:
 
 def _error(source: str, field: str, value: object, allowed: str) -> TrackError:
     """Return the refusal of one field."""
-    return TrackError(f"{source}: {field} is {value!r}, but must be {allowed}.")
+    return TrackError(f"{source}: {field} is {quoted(value)}, but must be {allowed}.")

@@ -1,0 +1,130 @@
+"""Entry points: a recipe's `main`, given what hydra composes of the command line, or plain words on what it cannot."""
+
+import difflib
+import functools
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from composing.command_line import CONFIG_DIR, override_key, plain_errors
+
+WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
+"""A number such as 1e6."""
+TEXTS = ("run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor")
+"""Settings that are no numbers, whatever they look like."""
+
+
+def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
+    """Make a function of a configuration the recipe of a name, whose file in `config` hydra composes it from.
+
+    An override that hydra does not take is said in one paragraph on stderr, with exit status 2.
+    """
+
+    def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
+        main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(function)
+
+        @functools.wraps(function)
+        def start() -> None:
+            sys.argv[1:] = [whole_number(argument) for argument in sys.argv[1:]]
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
+            with plain_errors():
+                refuse_unknown_settings(sys.argv[1:], name)
+            try:
+                main()
+            except HydraException as error:
+                print(f"error: {in_plain_words(error, name, sys.argv[1:])}", file=sys.stderr)
+                raise SystemExit(2) from error
+
+        return start
+
+    return decorate
+
+
+def whole_number(argument: str) -> str:
+    """Return an override with its whole numbers, one or several with commas between, in full digits.
+
+    Hydra takes 1e6 for a fraction.
+    """
+    name, equals, value = argument.partition("=")
+    if not equals or override_key(argument) in TEXTS:
+        return argument
+    return f"{name}={','.join(map(_in_digits, value.split(',')))}"
+
+
+def _in_digits(value: str) -> str:
+    whole = WHOLE.fullmatch(value) and float(value).is_integer()
+    return str(int(float(value))) if whole else value
+
+
+def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[str]) -> str:
+    """Say what is wrong with an override, and what would be right."""
+    text, cause = str(error), error.__cause__
+    if match := re.search(r"Could not override '(.+?)'", text):
+        return no_such_setting(match[1], recipe_name)
+    if match := re.search(r"Could not find '(.+)/(.+?)'\n\nAvailable options in '.+?':\n((?:\t.+\n)+)", text):
+        group, choice, choices = match[1], match[2], [word for word in match[3].split() if word != "schema"]
+        return f"{group}={choice}: there are {', '.join(choices)}{suggestion(choice, choices)}."
+    if match := re.search(r"Error merging override (.+)", text):
+        wanted = str(cause).partition("\n")[0] if isinstance(cause, OmegaConfBaseException) else "it does not fit"
+        wanted = wanted.replace("could not be converted to Integer", "is no whole number")
+        return f"{match[1]}: {wanted.replace('could not be converted to Float', 'is no number')}."
+    if "parsing override" in text or "no viable alternative" in text:
+        match = re.search(r"Error parsing override '(.+?)'", text)
+        given = f"{match[1]}: an override is" if match else f"{' '.join(overrides)}: overrides are"
+        return f"{given} written name=value, and a value with brackets, commas or spaces in quotes: 'name=\"a, b\"'."
+    return " ".join(text.split())
+
+
+def no_such_setting(name: str, recipe_name: str) -> str:
+    """Say that there is no setting of a name, and which may be meant."""
+    with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+        known = setting_names(hydra.compose(recipe_name))
+    last = {full.rpartition(".")[2]: full for full in known}
+    close = difflib.get_close_matches(name, known, n=1) or [
+        last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)
+    ]
+    meant = f" (did you mean {close[0]}?)" if close else ""
+    return f"{name}: there is no such setting of recipes/{recipe_name}.py{meant}. docs/options.md has them all."
+
+
+def setting_names(config: DictConfig, prefix: str = "") -> list[str]:
+    """Return the dotted names of all settings and groups."""
+    names = []
+    for key in config:
+        name = prefix + str(key)
+        names.append(name)
+        if not OmegaConf.is_missing(config, key) and isinstance(inner := config[key], DictConfig):
+            names += setting_names(inner, f"{name}.")
+    return names
+
+
+def suggestion(word: str, known: Sequence[str]) -> str:
+    """Return a question for a likely slip of the pen, else nothing."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:
+    """Refuse +name=value of what is neither a group of configurations nor a free entry: nothing would read it.
+
+    Raises:
+        ValueError: the message says which may be meant.
+    """
+    added = [override_key(override) for override in overrides if override.startswith("+")]
+    if not added or any(override.startswith(("--config", "-c")) for override in overrides):
+        return  # with configurations of one's own there may be other groups
+    with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+        config = hydra.compose(recipe_name)
+    known = set(setting_names(config))
+    for name in added:
+        inside = OmegaConf.select(config, name.rpartition(".")[0]) if "." in name else None
+        free = isinstance(inside, DictConfig) and OmegaConf.get_type(inside) is dict
+        if not (free or name in known or name.startswith("hydra") or (CONFIG_DIR / name).is_dir()):
+            raise ValueError(no_such_setting(name, recipe_name))

@@ -1,0 +1,94 @@
+"""The command line: numbers as people write them, and hydra's refusals in plain words."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.errors import HydraException
+
+from tests.running_recipes import CONFIG, compose, recipe, recipe_module
+
+
+@pytest.mark.parametrize(
+    ("argument", "taken"),
+    [
+        ("total_env_steps=1e6", "total_env_steps=1000000"),
+        ("total_env_steps=1.5E+6", "total_env_steps=1500000"),
+        ("loss.entropy_scale=1e-3", "loss.entropy_scale=1e-3"),
+        ("loss.ppo.kl_target=0.02", "loss.ppo.kl_target=0.02"),
+        ("run_dir=1e6x", "run_dir=1e6x"),
+        ("run_dir=1e6", "run_dir=1e6"),
+        ("total_env_steps=1e5,2e5,7", "total_env_steps=100000,200000,7"),
+        ("variants.slow=['env.num_envs=4']", "variants.slow=['env.num_envs=4']"),
+        ("env.num_envs=1.5e0", "env.num_envs=1.5e0"),
+        ("--multirun", "--multirun"),
+        ("seed=1e999999999", "seed=1e999999999"),
+    ],
+)
+def test_whole_numbers_may_be_written_short(argument: str, taken: str) -> None:
+    assert recipe_module("composing.entry").whole_number(argument) == taken
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        (
+            "trak=kidney",
+            "trak: there is no such setting of recipes/dreamer_v3.py (did you mean track?). docs/options.md",
+        ),
+        (
+            "env.num_env=3",
+            "env.num_env: there is no such setting of recipes/dreamer_v3.py (did you mean env.num_envs?)",
+        ),
+        ("num_envs=3", "(did you mean env.num_envs?)"),
+        ("discont=0.9", "(did you mean loss.discount?)"),
+        ("xyzzy=1", "xyzzy: there is no such setting of recipes/dreamer_v3.py. docs/options.md has them all."),
+        ("model=cpu_smal", "(did you mean cpu_small?)."),
+        ("tuned=fast", "tuned=fast: there are auto, none, race."),
+        ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is no whole number."),
+        ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is not a valid bool (type str)."),
+        (
+            "schedule.max_std.by=gates",
+            "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes].",
+        ),
+        ("kidney", "kidney: an override is written name=value"),
+        ("run_dir=[a", "run_dir=[a: overrides are written name=value, and a value with brackets"),
+    ],
+)
+def test_what_hydra_refuses_is_said_in_plain_words(override: str, words: str) -> None:
+    entry = recipe_module("composing.entry")
+    with pytest.raises(HydraException) as refusal:
+        compose("dreamer_v3", override)
+    said = entry.in_plain_words(refusal.value, "dreamer_v3", [override])
+    assert words in said and "schema" not in said and "\n" not in said and "hydra.cc" not in said
+
+
+def test_a_setting_that_nothing_reads_is_not_added() -> None:
+    entry = recipe_module("composing.entry")
+    recipe_module("composing.schema").register()
+    entry.refuse_unknown_settings(["+decoys=paper", "track=kidney"], "dreamer_v3")
+    entry.refuse_unknown_settings(["++seed=1", "+hydra.launcher.ray.remote.num_gpus=1"], "dreamer_v3")
+    entry.refuse_unknown_settings(
+        ["+variants.slow=['env.num_envs=4']", "variant=slow"], "experiment"
+    )  # docs/baselines.md
+    with pytest.raises(ValueError, match=r"trak: there is no such setting .*did you mean track"):
+        entry.refuse_unknown_settings(["+trak=kidney"], "dreamer_v3")
+
+
+@pytest.mark.parametrize(("name", "override"), [("dreamer_v3", "trak=kidney"), ("fly", "+agnt=kidney")])
+def test_a_slip_of_the_pen_ends_in_a_line_and_status_2(name: str, override: str, tmp_path: Path) -> None:
+    done = recipe(name, override, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert "there is no such setting" in done.stderr and "did you mean" in done.stderr
+
+
+def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    start = recipe_module("composing.entry").recipe("plot")(lambda config: seen.append(config.window))
+    monkeypatch.setattr(sys, "argv", ["plot.py", "window=1e3"])
+    recipe_module("composing.schema").register()
+    start()
+    assert seen == [1000.0] and Path(CONFIG).is_dir() and not hydra.core.global_hydra.GlobalHydra().is_initialized()
