@@ -1,9 +1,11 @@
-"""Numbers that a person sets: what values they may have is said beside each, and checked in one place."""
+"""What a person sets: the values that numbers may have, checked in one place, and how messages quote and suggest."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 ALLOWED = "allowed"
@@ -59,3 +61,22 @@ def check_settings(config: Any, prefix: str = "") -> None:
             check_settings(value, f"{prefix}{field.name}.")
         elif allowed is not None and value is not None and value not in allowed:
             raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}.")
+
+
+def shortened(text: str, length: int = 80) -> str:
+    """Return a text for a message, cut where it is longer than that."""
+    return text if len(text) <= length else f"{text[:length]}…"
+
+
+def quoted(value: object) -> str:
+    """Return a value as a message quotes it."""
+    try:
+        return shortened(repr(value))
+    except ValueError:  # Python writes no integer of more than 4,300 digits
+        return "a number of thousands of digits"
+
+
+def suggestion(word: object, known: Collection[str]) -> str:
+    """Return ``" (did you mean x?)"`` for a likely slip of the pen, else nothing."""
+    close = difflib.get_close_matches(str(word), known, n=1)
+    return f" (did you mean {close[0]}?)" if close else ""

@@ -31,7 +31,7 @@ Painter = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Images uint8 ``(B, T, H, W, 3)`` of beliefs ``(B, T, D)``, states ``(B, T, S)`` and target gates int64 ``(B, T)``."""
 
 SEEN_FRAMES, PREDICTED_FRAMES = 3, 10  # that are stored: seen by the model, then predicted on its own
-FARTHEST = 100.0  # largest number of a race vector that is drawn
+FARTHEST = 100.0  # largest number of a race vector that is drawn, of its order-one units [choice]
 STRIDE = 4  # control steps from one stored frame to the next: noisy images of a young model take 10 KB each
 
 

@@ -38,7 +38,7 @@ from dreamer_racing.training.directory import (
 )
 
 CHECKSUMS = "checksums.json"
-"""The file with the CRC-32 of all others of a checkpoint, by path: against damage, at twice the speed of a hash."""
+"""The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
 
 logger = logging.getLogger(__name__)
 
@@ -262,17 +262,18 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
         FileNotFoundError: if there is no complete checkpoint.
         RunCheckpointError: if all are damaged.
     """
-    passed: list[str] = []
+    damaged: dict[str, str] = {}  # what is wrong with which
     for candidate in complete_checkpoints(path):
         damage = _damage(candidate, parts)
         if damage is None:
-            if passed:
-                logger.warning("%s. Going on from %s; what came after it is lost.", ". ".join(passed), candidate.name)
+            if damaged:
+                found = ". ".join(damaged.values())
+                logger.warning("%s. Going on from %s; what came after it is lost.", found, candidate.name)
             return candidate
-        passed.append(f"{candidate} is damaged: {damage}")
-    others = [other.name for other in complete_checkpoints(candidate.parent) if other.name not in " ".join(passed)]
+        damaged[candidate.name] = f"{candidate} is damaged: {damage}"
+    others = [other.name for other in complete_checkpoints(candidate.parent) if other.name not in damaged]
     advice = f"there are others beside it: {', '.join(others)}" if others else "there is no other beside it"
-    raise RunCheckpointError(f"{'. '.join(passed)}. It was not read; {advice}.")
+    raise RunCheckpointError(f"{'. '.join(damaged.values())}. It was not read; {advice}.")
 
 
 def load_state(

@@ -210,7 +210,8 @@ def train(run: Run) -> None:
             if due:
                 run.measure()
                 show(bar, run.metrics.write(counters["env_steps"]), run.unsaved)
-            if schedule.due("save", counters["env_steps"]) | minutes.due() and (problem := run.try_to_save()):
+            by_steps, by_minutes = schedule.due("save", counters["env_steps"]), minutes.due()  # both take note
+            if (by_steps or by_minutes) and (problem := run.try_to_save()):
                 bar.write(problem)
         saved = run.save()
         if stop.requested:

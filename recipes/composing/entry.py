@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from composing.command_line import CONFIG_DIR, override_key, plain_errors
+from dreamer_racing.settings import suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
@@ -103,12 +104,6 @@ def setting_names(config: DictConfig, prefix: str = "") -> list[str]:
         if not OmegaConf.is_missing(config, key) and isinstance(inner := config[key], DictConfig):
             names += setting_names(inner, f"{name}.")
     return names
-
-
-def suggestion(word: str, known: Sequence[str]) -> str:
-    """Return a question for a likely slip of the pen, else nothing."""
-    close = difflib.get_close_matches(word, known, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:

@@ -10,7 +10,7 @@ from yaml import YAMLError
 
 from composing.command_line import override_key
 from composing.schema import RECIPES, DreamerConfig, RunConfig
-from dreamer_racing.envs.tracks.track import shortened
+from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
 OF_THIS_MACHINE = ("device", "env.device", "env.renderer", "model.mixed_precision", "resume", "run_dir")

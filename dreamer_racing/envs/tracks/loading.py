@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Collection, Hashable
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import Any, Literal
 
 import yaml
 
-from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track, quoted, shortened
+from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track
 from dreamer_racing.envs.tracks.validation import validate_track
+from dreamer_racing.settings import quoted, shortened, suggestion
 
 BUILTIN_TRACKS: tuple[str, ...] = ("circle", "kidney", "figure8", "split_s", "figure8_decoys")
 """Names that ``load_track`` knows without a path."""
@@ -52,7 +52,7 @@ def _find(name_or_path: str | Path) -> Path:
             return _FOLDER / f"{name_or_path}.yaml"
         if not name_or_path.endswith((".yaml", ".yml")):
             raise TrackError(
-                f"unknown track {quoted(name_or_path)}{_suggestion(name_or_path, BUILTIN_TRACKS)}: the known tracks "
+                f"unknown track {quoted(name_or_path)}{suggestion(name_or_path, BUILTIN_TRACKS)}: the known tracks "
                 f"are {', '.join(BUILTIN_TRACKS)}, and the path of a .yaml file works too."
             )
     if not isinstance(name_or_path, str | Path):
@@ -68,12 +68,6 @@ def _find(name_or_path: str | Path) -> Path:
             f"or one of the known tracks: {', '.join(BUILTIN_TRACKS)}."
         )
     return path
-
-
-def _suggestion(word: Any, known: Collection[str]) -> str:
-    """Return ``" (did you mean 'x'?)"`` for a likely slip of the pen, else nothing."""
-    close = difflib.get_close_matches(str(word), known, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -202,7 +196,7 @@ class _TrackReader:
             if key not in allowed:
                 raise TrackError(
                     f"{self._path}: {prefix}{shortened(str(key))} is an unknown field (its value is "
-                    f"{quoted(value[key])}){_suggestion(key, allowed)}; the allowed fields of {where} are "
+                    f"{quoted(value[key])}){suggestion(key, allowed)}; the allowed fields of {where} are "
                     f"{', '.join(allowed)}."
                 )
         for key in sorted(required):

@@ -33,19 +33,6 @@ class TrackError(ValueError):
     """A track that cannot be flown, with one paragraph that says what is wrong, where, and what would be right."""
 
 
-def shortened(text: str, length: int = 80) -> str:
-    """Return a text for a message, cut where it is longer than that."""
-    return text if len(text) <= length else f"{text[:length]}…"
-
-
-def quoted(value: object) -> str:
-    """Return a value as a message quotes it."""
-    try:
-        return shortened(repr(value))
-    except ValueError:  # Python writes no integer of more than 4,300 digits
-        return "a number of thousands of digits"
-
-
 @dataclasses.dataclass(frozen=True)
 class Gate:
     """One square gate, standing upright.

@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 from itertools import permutations
 
-from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector, quoted
+from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
+from dreamer_racing.settings import quoted
 
 ROUNDING = 1e-9
 """How far (m) rounding may carry a point over a limit that it stands on."""
