@@ -300,12 +300,14 @@ class DreamerLearner:
         return {key: value for part in (model, behavior) for key, value in part.items()}
 
     def _behavior_losses(self, context: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Imagine from the latents of a batch and judge; losses and metrics of actor and critic."""
+        """Imagine from the latents of a batch, if the actor's loss does, and judge; losses and metrics of both."""
         self.latents = context.detach()
-        imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
-        imagination = imagined.pop("imagination")
         replay = batch.select("reward", "is_init", "terminated", "truncated")
         replay.update(context)
+        if not cast(ActorLoss, self.losses["actor"]).imagines:
+            return dict(self.losses["critic"](replay).items())
+        imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
+        imagination = imagined.pop("imagination")
         if self.config.imagination_starts is None:
             # Every record was a start: its first imagined return is a better value than the critic's.
             replay.set("bootstrap", imagination.get("lambda_return")[0].reshape(*batch.batch_size, 1))

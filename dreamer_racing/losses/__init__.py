@@ -13,6 +13,7 @@ from typing import Any, Protocol, TypeVar
 from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
+from dreamer_racing.losses.asymmetric_ppo_actor import AsymmetricPPOActorLoss
 from dreamer_racing.losses.config import ActorPPOConfig, LossConfig
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
@@ -51,6 +52,7 @@ ACTOR_LOSSES: dict[str, LossClass] = {
     "dynamics": DynamicsActorLoss,
     "ppo": PPOActorLoss,
     "flown_ppo": FlownPPOActorLoss,
+    "asymmetric_ppo": AsymmetricPPOActorLoss,
 }
 CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
 
@@ -108,6 +110,7 @@ __all__ = [
     "WORLD_MODEL_LOSSES",
     "ActorLoss",
     "ActorPPOConfig",
+    "AsymmetricPPOActorLoss",
     "CriticLoss",
     "DecoderFreeLoss",
     "DynamicsActorLoss",

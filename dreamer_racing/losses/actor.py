@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -79,6 +79,10 @@ class ActorLoss(LossModule):
         "continuation",
         "imagination",
     ]
+    imagines: ClassVar[bool] = True
+    """Whether the learner calls ``forward``, to imagine from what it replays."""
+    reads_privileged: ClassVar[bool] = False
+    """Whether ``watch`` needs ``("privileged", "vector")`` of the environment."""
     optimizer: torch.optim.Optimizer | None = None
     """Of the actor, where the loss steps it by itself in ``improve``; None: the learner's optimiser does."""
 

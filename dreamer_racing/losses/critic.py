@@ -75,15 +75,15 @@ class CriticLoss(LossModule):
         replay_gradient: Whether the replayed returns' loss reaches whatever graph ``belief`` and ``state`` carry, and
             so trains the world model too.
 
-    Reads ``imagination`` as ``ActorLoss`` writes it, and a batch ``[B, T]`` of ``belief``, ``state``, ``reward``,
-    ``is_init``, ``terminated``, ``truncated``, with an optional ``bootstrap`` ``(B, T, 1)``: values of the records,
-    default the critic's own. Writes the scalars ``loss_critic``, ``loss_replay_critic``, ``value_mean`` and
-    ``value_error`` (mean absolute, of the imagined returns).
+    Reads ``imagination`` as ``ActorLoss`` writes it, or goes without, and a batch ``[B, T]`` of ``belief``, ``state``,
+    ``reward``, ``is_init``, ``terminated``, ``truncated``, with an optional ``bootstrap`` ``(B, T, 1)``: values of the
+    records, default the critic's own. Writes the scalar ``loss_replay_critic``, and of what was imagined
+    ``loss_critic``, ``value_mean`` and ``value_error`` (mean absolute).
 
     Reference: DreamerV3, Eq. 10 and "Critic learning".
     """
 
-    in_keys = ["imagination", "belief", "state", "reward", "is_init", "terminated", "truncated"]
+    in_keys = ["belief", "state", "reward", "is_init", "terminated", "truncated"]
     out_keys = ["loss_critic", "loss_replay_critic", "value_mean", "value_error"]
 
     def __init__(
@@ -120,22 +120,24 @@ class CriticLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the losses; keys in the class's docstring."""
         require_keys(self, tensordict, self.in_keys)
-        imagination = tensordict.get("imagination")
+        losses = TensorDict({"loss_replay_critic": self.replay_scale * self._replay(tensordict)}, [])
+        if (imagination := tensordict.get("imagination", None)) is not None:
+            losses.update(self._imagined(imagination))
+        return losses
+
+    def _imagined(self, imagination: TensorDictBase) -> dict[str, Tensor]:
+        """Return the losses on imagined returns ``[H, N]``."""
         returns = imagination.get("lambda_return")
         features = imagination.get("features")
         logits = self.critic(features)
         imagined = self._regression(features, logits, returns)
         with torch.no_grad():
             value = self.critic.two_hot.decode(logits)
-        return TensorDict(
-            {
-                "loss_critic": (imagination.get("weight") * imagined).mean(),
-                "loss_replay_critic": self.replay_scale * self._replay(tensordict),
-                "value_mean": value.mean(),
-                "value_error": (value - returns).abs().mean(),
-            },
-            [],
-        )
+        return {
+            "loss_critic": (imagination.get("weight") * imagined).mean(),
+            "value_mean": value.mean(),
+            "value_error": (value - returns).abs().mean(),
+        }
 
     def _replay(self, tensordict: TensorDictBase) -> Tensor:
         """Return the unscaled loss on the replayed records, a scalar."""

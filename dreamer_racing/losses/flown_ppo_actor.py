@@ -11,10 +11,11 @@ Shape legend: N environments, T steps of a rollout, S steps kept of each environ
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from dreamer_racing.losses.clipped_actor import ClippedActorLoss, Minibatch
@@ -22,9 +23,6 @@ from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.losses.imagination import lambda_return
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.world_model import join_features
-
-FLOWN = ("features", "action", "old", "reward", "done", "terminated")
-"""What is kept of a step: latents, the clipped action, the policy that chose it, and what came of it."""
 
 
 class FlownPPOActorLoss(ClippedActorLoss):
@@ -44,6 +42,8 @@ class FlownPPOActorLoss(ClippedActorLoss):
     """
 
     log_prob = staticmethod(ActionDistribution.log_prob_clipped)
+    kept: ClassVar[tuple[str, ...]] = ("features", "action", "old", "reward", "done", "terminated")
+    """What is kept of a step: latents, the clipped action, the policy that chose it, and what came of it."""
     features: Tensor
     action: Tensor
     old: Tensor
@@ -52,7 +52,7 @@ class FlownPPOActorLoss(ClippedActorLoss):
     terminated: Tensor
     flown: Tensor
 
-    watched_keys = (
+    watched_keys: ClassVar[tuple[NestedKey, ...]] = (
         "action", "loc", "scale", ("next", "belief"), ("next", "state"), ("next", "reward"), ("next", "done"),
         ("next", "terminated"),
     )  # fmt: skip
@@ -60,7 +60,7 @@ class FlownPPOActorLoss(ClippedActorLoss):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        for name in FLOWN:
+        for name in self.kept:
             self.register_buffer(name, torch.empty(0))
         self.register_buffer("flown", torch.zeros(1, dtype=torch.int64))  # steps kept of each environment, to be saved
         self._flown = 0  # the same, to be read without waiting for the device
@@ -73,23 +73,17 @@ class FlownPPOActorLoss(ClippedActorLoss):
             KeyError: If it lacks one of ``watched_keys``, which ``DreamerPolicy`` and the environment write.
         """
         require_keys(self, rollout, self.watched_keys)
-        rollout = rollout.select(*self.watched_keys).to(self.flown.device).transpose(0, 1)  # [T, N]
-        after = rollout["next"]
-        steps = {
-            "features": join_features(after["belief"], after["state"]),
-            "action": rollout["action"],
-            "old": torch.cat((rollout["loc"], rollout["scale"]), -1),
-            **{name: after[name] for name in ("reward", "done", "terminated")},
-        }
+        steps = self._steps(rollout.select(*self.watched_keys).to(self.flown.device).transpose(0, 1))
+        rollout_steps = len(steps["reward"])
         self._make_room(steps)
         first = self._flown
         if first == len(self.reward):  # full, and no update has come: the oldest rollout makes room
-            first -= len(rollout)
-            for name in FLOWN:
-                self.get_buffer(name)[:first] = self.get_buffer(name)[len(rollout) :].clone()
+            first -= rollout_steps
+            for name in self.kept:
+                self.get_buffer(name)[:first] = self.get_buffer(name)[rollout_steps:].clone()
         for name, value in steps.items():
             self.get_buffer(name)[first : first + len(value)] = value
-        self._count(first + len(rollout))
+        self._count(first + rollout_steps)
 
     def improve(self, updates: int) -> dict[str, Tensor]:
         """Train the actor if enough was flown.
@@ -105,17 +99,42 @@ class FlownPPOActorLoss(ClippedActorLoss):
         self._count(0)
         # The policy flew in float32: at small deviations the rounding of bfloat16 would be a divergence of its own.
         with torch.autocast(self.reward.device.type, enabled=False):
-            advantage = self._advantage()
+            value = self._value()
+            returns = self._return(value)
+            advantage = returns - value
             steps = (self.features, self.action, self.old, advantage, torch.ones_like(advantage))
-            return self._improve_on(Minibatch(*(value.flatten(0, 1) for value in steps)))
+            learned = self._teach(returns, value)
+            return learned | self._improve_on(Minibatch(*(part.flatten(0, 1) for part in steps)))
+
+    def _steps(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Return what is kept of the steps of a rollout ``[T, N]``, by the names of ``kept``."""
+        after = rollout["next"]
+        return {
+            "features": join_features(after["belief"], after["state"]),
+            "action": rollout["action"],
+            "old": torch.cat((rollout["loc"], rollout["scale"]), -1),
+            **{name: after[name] for name in ("reward", "done", "terminated")},
+        }
 
     @torch.no_grad()
-    def _advantage(self) -> Tensor:
-        """Return the λ-returns of what was flown, less the values, ``(S, N, 1)``."""
-        value = self.critic.value(self.features)
+    def _value(self) -> Tensor:
+        """Return what the critic makes of what was flown, ``(S, N, 1)``."""
+        return self.critic.value(self.features)
+
+    @torch.no_grad()
+    def _return(self, value: Tensor) -> Tensor:
+        """Return the λ-returns of what was flown, ``(S, N, 1)``."""
         following = torch.where(self.done, value, torch.cat((value[1:], value[-1:])))
         discount = self.discount * (~self.terminated).float()
-        return lambda_return(self.reward, following, discount, self.lambda_ * (~self.done).float()) - value
+        return lambda_return(self.reward, following, discount, self.lambda_ * (~self.done).float())
+
+    def _teach(self, returns: Tensor, value: Tensor) -> dict[str, Tensor]:
+        """Teach a critic of the loss's own what came of it: returns, and the values before, ``(S, N, 1)``.
+
+        Returns:
+            Metrics, scalars.
+        """
+        return {}
 
     def _make_room(self, steps: dict[str, Tensor]) -> None:
         """Make room for ``ppo.flown`` steps in whole rollouts like this; what was kept of other shapes is forgotten."""
@@ -134,11 +153,11 @@ class FlownPPOActorLoss(ClippedActorLoss):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Take the shape of what is loaded, unless it is of another kind of loss."""
-        if all(prefix + name in state_dict for name in (*FLOWN, "flown")):
-            for name in FLOWN:
+        if all(prefix + name in state_dict for name in (*self.kept, "flown")):
+            for name in self.kept:
                 self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=self.flown.device))
         else:
-            for name in FLOWN:
+            for name in self.kept:
                 state_dict.pop(prefix + name, None)
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._flown = int(self.flown)

@@ -11,7 +11,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Flyer
-from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.training.run import Report
 
 Environment = DroneRacingEnv | ControlSuiteEnv
@@ -44,14 +44,13 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
     """Make the environment to train in, with `env.num_envs` worlds or another number."""
     env = config.env
     num_envs = num_envs or env.num_envs
-    loss = config.loss.world_model if isinstance(config, DreamerConfig) else None
-    reads_privileged = loss is not None and find_loss(WORLD_MODEL_LOSSES, loss).reads_privileged
+    readers = privileged_losses(config) if isinstance(config, DreamerConfig) else []
     if is_race(config):
         return DroneRacingEnv(
             num_envs=num_envs,
             episode_steps=env.episode_steps,
             from_pixels=env.from_pixels,
-            privileged=reads_privileged,
+            privileged=bool(readers),
             start_beyond_gate=env.start_beyond_gate,
             start_on_line=env.start_on_line,
             miss_radius=env.miss_radius,
@@ -60,12 +59,23 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             seed=config.seed,
             **worlds_of(config),
         )
-    if reads_privileged:
+    if readers:
         raise ValueError(
-            f"loss.world_model={loss} decodes the race's privileged state, which env=dmc does not "
-            "have: choose another loss, e.g. loss=reconstruction."
+            f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
+            "losses, e.g. loss=reconstruction loss.actor=reinforce."
         )
     return make_suite(config, num_envs, config.seed)
+
+
+def privileged_losses(config: DreamerConfig) -> list[str]:
+    """Which losses of a run read the simulator's state, as on the command line."""
+    registries = {"world_model": WORLD_MODEL_LOSSES, "actor": ACTOR_LOSSES}
+    chosen = {part: (registry, getattr(config.loss, part)) for part, registry in registries.items()}
+    return [
+        f"loss.{part}={name}"
+        for part, (registry, name) in chosen.items()
+        if getattr(find_loss(registry, name), "reads_privileged", False)
+    ]
 
 
 def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
