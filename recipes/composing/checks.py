@@ -24,8 +24,8 @@ from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
-from dreamer_racing.losses import ActorPPOConfig
-from dreamer_racing.losses.clipped_actor import KL_TOLERANCE
+from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig
+from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
@@ -265,9 +265,12 @@ def check_wait(config: DreamerConfig) -> None:
     limit = config.schedule.wait_for_model
     if limit is not None and limit <= 1:
         raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
-    if config.loss.actor not in ("ppo", "flown_ppo"):
+    alone = [
+        name for name, loss in ACTOR_LOSSES.items() if isinstance(loss, type) and issubclass(loss, ClippedActorLoss)
+    ]
+    if config.loss.actor not in alone:
         raise ValueError(
-            f"schedule.wait_for_model={limit} is for loss.actor=ppo or flown_ppo, whose actors step alone; with "
+            f"schedule.wait_for_model={limit} is for actors that step alone, loss.actor={', '.join(alone)}; with "
             f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
         )
     if not config.replay.held_out:

@@ -71,7 +71,7 @@ def test_advantages_by_hand():
     expected[2] = reward[2] + 0.9 * (0.2 * value[3] + 0.8 * (expected[3] + value[3])) - value[2]
     expected[1] = reward[1] - value[1]
     expected[0] = reward[0] + 0.9 * (0.2 * value[1] + 0.8 * reward[1]) - value[0]
-    torch.testing.assert_close(loss._advantage()[:, 0, 0], expected)
+    torch.testing.assert_close((loss._return(loss._value()) - loss._value())[:, 0, 0], expected)
 
 
 def test_where_time_runs_out_the_value_stands_for_what_comes():
@@ -80,7 +80,7 @@ def test_where_time_runs_out_the_value_stands_for_what_comes():
     rollout["next", "done"][0, 0] = True
     loss.watch(rollout)
     value, reward = loss.critic.value(loss.features)[0, 0, 0], rollout["next", "reward"][0, 0, 0]
-    torch.testing.assert_close(loss._advantage()[0, 0, 0], reward + 0.9 * value - value)
+    torch.testing.assert_close(loss._return(loss._value())[0, 0, 0], reward + 0.9 * value)
 
 
 def test_the_actor_stands_still_until_enough_was_flown():
