@@ -50,8 +50,8 @@ MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
   70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
-  25 actions a second; the actor learns by PPO from what it flew, in the model's latents, its critic from imagination
-  too; averaged weights fly evaluations and exports
+  25 actions a second; the actor learns by PPO from what it flew, in the model's latents; in training a critic that
+  sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 400  # env_steps/s of tuned=race on one core with bfloat16: 440 (entry 18) and 370 (19) were measured

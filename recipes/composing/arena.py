@@ -69,13 +69,11 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
 
 def privileged_losses(config: DreamerConfig) -> list[str]:
     """Which losses of a run read the simulator's state, as on the command line."""
-    registries = {"world_model": WORLD_MODEL_LOSSES, "actor": ACTOR_LOSSES}
-    chosen = {part: (registry, getattr(config.loss, part)) for part, registry in registries.items()}
-    return [
-        f"loss.{part}={name}"
-        for part, (registry, name) in chosen.items()
-        if getattr(find_loss(registry, name), "reads_privileged", False)
-    ]
+    chosen: dict[str, Any] = {
+        f"loss.world_model={config.loss.world_model}": find_loss(WORLD_MODEL_LOSSES, config.loss.world_model),
+        f"loss.actor={config.loss.actor}": find_loss(ACTOR_LOSSES, config.loss.actor),
+    }
+    return [words for words, loss in chosen.items() if getattr(loss, "reads_privileged", False)]
 
 
 def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
