@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from dreamer_racing.learners.cuda_graph import GraphedStep, Step
+from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
@@ -145,10 +145,8 @@ class DreamerLearner:
         self._rates = [group["lr"] for group in self._groups]
         self._timed: Timer = untimed
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-        self._compute = (
-            torch.compile(self.compute_losses, dynamic=False) if self.config.compile else self.compute_losses
-        )
-        self._step = self._make_step()
+        self._compiled = torch.compile(self.compute_losses, dynamic=False) if self.config.compile else None
+        self._graph = self._make_graph() if self.config.cuda_graph else None
 
     @property
     def discount(self) -> float:
@@ -188,7 +186,7 @@ class DreamerLearner:
         batch = batch.to(self.device, non_blocking=True)
         if self._actor_optimizer is not None:
             cast(ActorLoss, self.losses["actor"]).prepare(self._number_of_starts(batch))
-        metrics = self._step(batch)
+        metrics = self._backward(batch) if self._graph is None else self._graph(batch)
         self._guard.check(metrics, batch)
         with timed("optimise"):
             self.optimizer.step()
@@ -269,10 +267,8 @@ class DreamerLearner:
         """Return the context in which the networks run: bfloat16 where it does not matter, if ``mixed_precision``."""
         return autocast(self.device, bool(self.config.mixed_precision))
 
-    def _make_step(self) -> Step:
-        """Return the function that computes gradients, as fast as the configuration allows."""
-        if not self.config.cuda_graph:
-            return self._backward
+    def _make_graph(self) -> GraphedStep:
+        """Return what replays ``_backward`` as one CUDA graph."""
         if self.device.type != "cuda":
             raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
         return GraphedStep(self._backward, nn.ModuleList([self.agent, self.losses]))
@@ -280,7 +276,7 @@ class DreamerLearner:
     def _backward(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
         with self.autocast():
-            metrics = self._compute(batch)
+            metrics = self.compute_losses(batch) if self._compiled is None else self._compiled(batch)
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with self._timed("optimise"):
             total.backward()
