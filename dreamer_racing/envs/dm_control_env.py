@@ -328,16 +328,19 @@ class DroneRace(base.Task):
         """Give the action (4,) to the flight controller; what lies beyond [-1, 1] is clipped.
 
         Raises:
+            TypeError: not of a floating-point type.
             ValueError: wrong shape.
         """
-        action = np.asarray(action, np.float64)
+        action = np.asarray(action)
+        if action.dtype.kind != "f":
+            raise TypeError(f"Action of {action.dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
         if action.shape != (ACTION_SIZE,):
             raise ValueError(
                 f"Action of shape {action.shape}: this environment takes one of shape ({ACTION_SIZE},): collective "
                 "thrust and body rates x, y, z, each in [-1, 1]."
             )
         self._invalid_action = not np.isfinite(action).all()
-        physics.command(np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0))
+        physics.command(np.nan_to_num(action.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0))
 
     def after_step(self, physics: Physics) -> None:
         """Judge the control step."""

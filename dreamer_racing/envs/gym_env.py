@@ -99,6 +99,7 @@ class GymWorlds:
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
         self._onboard: Renderer | None = None
+        self._begun = False
 
     @property
     def frames_per_second(self) -> int:
@@ -124,9 +125,22 @@ class GymWorlds:
         spaces["target_gate"] = Discrete(self.worlds.track.num_gates)
         return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
 
+    def begin(self, mask: np.ndarray | None = None) -> None:
+        """Begin episodes everywhere, or where masked (N,) bool."""
+        self.worlds.reset(None if mask is None else torch.from_numpy(mask))
+        self._begun = True
+
     def step(self, actions: Any) -> tuple[RaceStep, np.ndarray]:
-        """Fly one control step; return what it did and the rewards (N,)."""
-        outcome = self.worlds.step(torch.as_tensor(np.asarray(actions, np.float64)))
+        """Fly one control step; return what it did and the rewards (N,).
+
+        Raises:
+            ResetNeeded: no episode has begun.
+            TypeError, ValueError: actions of another type or shape.
+        """
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
+        action = torch.as_tensor(np.asarray(actions))
+        outcome = self.worlds.step(action.double() if action.is_floating_point() else action)
         return outcome, outcome.reward(self.body_rate_weight).numpy()
 
     def observe(self, mask: np.ndarray | None = None) -> Observation:
@@ -237,7 +251,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None:
             self.race.worlds.seed(seed)
-        self.race.worlds.reset()
+        self.race.begin()
         return row_of(self.race.observe(), 0), row_of(self.race.info(None), 0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -344,7 +358,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None:
             self.race.worlds.seed(int(seed))
-        self.race.worlds.reset()
+        self.race.begin()
         self._ended[:] = False
         return self.race.observe(), self._masked(self.race.info(None))
 
@@ -360,7 +374,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         begun = self._ended
         outcome, reward = self.race.step(actions)
         if begun.any():
-            self.race.worlds.reset(torch.from_numpy(begun))
+            self.race.begin(begun)
         terminated = outcome.terminated.numpy() & ~begun
         truncated = outcome.truncated.numpy() & ~begun
         self._ended = terminated | truncated

@@ -9,7 +9,6 @@ from typing import Any, Unpack, cast
 
 import gymnasium
 import numpy as np
-import torch
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
@@ -74,7 +73,7 @@ class DroneRaceVecEnv(VecEnv):
             self.race.worlds.seed(self._seeds[0])
         self._reset_seeds()
         self._reset_options()
-        self.race.worlds.reset()
+        self.race.begin()
         self.reset_infos = self._rows(self.race.info(None))
         return self.race.observe()
 
@@ -102,7 +101,7 @@ class DroneRaceVecEnv(VecEnv):
 
     def _begin(self, mask: np.ndarray, observation: Observation) -> Observation:
         """Begin episodes where masked (N,) bool; return the observations with their first ones in place."""
-        self.race.worlds.reset(torch.from_numpy(mask))
+        self.race.begin(mask)
         info = self.race.info(None)
         for index in np.flatnonzero(mask).tolist():
             self.reset_infos[index] = row_of(info, index)

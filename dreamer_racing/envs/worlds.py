@@ -217,8 +217,11 @@ class RaceWorlds:
                 has crashed: its episode ends and the others fly on.
 
         Raises:
+            TypeError: not of a floating-point type.
             ValueError: wrong shape or device.
         """
+        if not action.is_floating_point():
+            raise TypeError(f"Action of {action.dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
@@ -323,6 +326,13 @@ class RaceWorlds:
         self.race.load_state_dict(state_dict["race"])
         self._images = None
         self._generator.set_state(generator)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled, as simulators and their OpenGL contexts cannot be."""
+        raise TypeError(
+            "Worlds cannot be copied or pickled: make others with the same arguments; the state of a DroneRacingEnv "
+            "goes from one to the other by state_dict() and load_state_dict()."
+        )
 
     def close(self) -> None:
         """Free rendering contexts and threads."""

@@ -209,6 +209,13 @@ def test_wrong_action_shape_is_explained() -> None:
         env.step(np.zeros(3))
 
 
+def test_an_action_of_whole_numbers_is_refused() -> None:
+    env = load("circle")
+    env.reset()
+    with pytest.raises(TypeError, match="Action of int64: thrust and body rates are floating-point numbers"):
+        env.step(np.zeros(4, np.int64))
+
+
 def test_time_limit_of_less_than_a_step_is_refused() -> None:
     with pytest.raises(ValueError, match=r"time_limit=0\.001 s"):
         load("circle", time_limit=0.001)

@@ -153,6 +153,23 @@ def test_action_that_is_not_finite_ends_the_single_environment() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("kind", [int, bool, complex])
+def test_actions_that_are_no_fractions_are_refused(kind: type) -> None:
+    env = DroneRaceGymEnv("circle", observation="state")
+    env.reset()
+    with pytest.raises(TypeError, match=r"Action of torch\.\w+: thrust and body rates are floating-point"):
+        env.step(np.zeros(4, kind))
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    env, envs = DroneRaceGymEnv("circle", observation="state"), make_vec(observation="state")
+    for each, action in ((env, np.zeros(4)), (envs, np.zeros((3, 4)))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="before the first reset"):
+            each.step(action)
+        each.reset()
+        each.step(action)
+
+
 def test_wrong_arguments_are_explained() -> None:
     env = DroneRaceGymEnv("circle", observation="state")
     env.reset()

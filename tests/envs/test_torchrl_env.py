@@ -1,7 +1,10 @@
 """`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/architecture.md` promises."""
 
+import copy
 import gc
+import pickle
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -237,6 +240,20 @@ def test_wrong_action_shape_is_explained() -> None:
     data = env.reset()
     with pytest.raises(ValueError, match=r"Action of shape \(3, 3\): 3 environment\(s\) take one of shape \(3, 4\)"):
         env.step(data.set("action", torch.zeros(3, 3)))
+
+
+@pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.complex64])
+def test_actions_that_are_no_fractions_are_refused(kind: torch.dtype) -> None:
+    env = blind()
+    data = env.reset()
+    with pytest.raises(TypeError, match=f"Action of {kind}: thrust and body rates are floating-point numbers"):
+        env.step(data.set("action", torch.zeros(3, 4, dtype=kind)))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_an_environment_is_not_copied(copied: Callable[[object], object]) -> None:
+    with pytest.raises(TypeError, match=r"make others with the same arguments.*state_dict\(\)"):
+        copied(blind())
 
 
 def test_actions_beyond_the_bounds_are_clipped() -> None:
