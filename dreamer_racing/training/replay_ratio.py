@@ -11,8 +11,6 @@ class ReplayRatio(NamedTuple):
         records: that an update trains on.
         prefill: env_steps collected before the first update.
         setting: name of the ratio in the configuration.
-        first_ratio: the same, of the first steps after the prefill: to see before it flies.
-        first_steps: how many these are.
 
     Example:
         >>> ReplayRatio(ratio=4.0, records=64, prefill=100, setting="model.replay_ratio").updates(env_steps=180)
@@ -23,11 +21,7 @@ class ReplayRatio(NamedTuple):
     records: int
     prefill: int
     setting: str
-    first_ratio: float = 0.0
-    first_steps: int = 0
 
     def updates(self, env_steps: int) -> int:
         """Updates in a run of so many env_steps."""
-        learned_from = max(0, env_steps - self.prefill)
-        first = min(learned_from, self.first_steps)
-        return int((first * self.first_ratio + (learned_from - first) * self.ratio) / self.records)
+        return max(0, int((env_steps - self.prefill) * self.ratio / self.records))

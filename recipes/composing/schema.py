@@ -51,8 +51,6 @@ class ModelConfig(LearnerConfig):
     batch_size: int = setting(MISSING, COUNT)  # windows in a batch
     batch_length: int = setting(MISSING, Range(2))  # records in a window
     replay_ratio: float = setting(MISSING, POSITIVE)  # records trained on per environment step
-    first_ratio: float = setting(1.0, POSITIVE)  # the same, of first_steps after the prefill: to see before it flies
-    first_steps: int = setting(0, NOT_NEGATIVE)  # env_steps
     imagination_horizon: int = setting(MISSING, COUNT)
     # Those of an update that the size decides:
     imagination_starts: int | None = setting(MISSING, COUNT)
@@ -212,8 +210,7 @@ class DreamerConfig(ReplayRunConfig):
         """How much the run trains."""
         model = self.model
         records = model.batch_size * model.batch_length
-        first = (model.first_ratio, model.first_steps)
-        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio", *first)
+        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio")
 
 
 @dataclass
