@@ -1,6 +1,7 @@
-"""How far integrators of preset `easy` stray from RK4 in 2 s of racing, and what each costs.
+"""How far integrators stray from RK4 in 2 s of racing, and what each costs.
 
     python benchmarks/integrators.py --json results/integrators.json
+    python benchmarks/integrators.py --preset faithful --json results/integrators_faithful.json
 
 The scripted pilot's actions of 2 s at racing speed on every track are replayed open loop. Two effects are told apart:
 
@@ -13,7 +14,8 @@ Variants: `plain` is an explicit step: the loop takes the rates at its beginning
 speed at its end, in the direction of its middle. `+position` and `+pose` bring MuJoCo's x' = x + dt v' to the
 trapezoidal rule after each step (position only; attitude too). `midpoint` is what the package does: `Quadrotor.wrench`
 is of the middle of the step, and unless the integrator is RK4, `RigidStep` corrects torque and pose. Columns in mm are
-the greatest position error over all tracks.
+the greatest position error over all tracks. Of `faithful` only `midpoint` is flown, at nominal parameters, and
+`wrench` is left out: with drag a wrench is no given thing.
 """
 
 import argparse
@@ -26,7 +28,7 @@ from measuring import print_table, write_json
 from mujoco.batch import Batch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.drone.parameters import PRESETS, QuadrotorParameters, without_randomisation
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import turn
@@ -37,7 +39,6 @@ from dreamer_racing.envs.worlds import RaceWorlds
 
 SECONDS, WARM_UP = 2.0, 3.0  # s of racing replayed, and flown before, so that it is at racing speed
 HOLD = 0.002  # s
-EASY = PRESETS["easy"]
 
 
 class PlainQuadrotor(Quadrotor):
@@ -57,14 +58,15 @@ class Drones:
     """N drones of a variant, and their bodies in MuJoCo.
 
     Args:
+        drone: preset.
         variant: see the head of this file.
         integrator: MuJoCo's name of it.
         step: s.
         num: N.
     """
 
-    def __init__(self, variant: str, integrator: str, step: float, num: int) -> None:
-        self.parameters = replace(EASY, physics_dt=step, integrator=integrator)
+    def __init__(self, drone: QuadrotorParameters, variant: str, integrator: str, step: float, num: int) -> None:
+        self.parameters = replace(drone, physics_dt=step, integrator=integrator)
         midpoint = variant == "midpoint"
         self.quadrotor = (Quadrotor if midpoint else PlainQuadrotor)(self.parameters, num)
         batch = Batch(build_drone(self.parameters).compile(), num, min(2, num))
@@ -91,29 +93,30 @@ class Drones:
 
 @dataclass(frozen=True)
 class Recording:
-    """What the pilot did on each of the tracks; N tracks."""
+    """What the pilot did with a drone on each of the tracks; N tracks."""
 
+    drone: QuadrotorParameters
     qpos: Tensor  # (N, 7) at the beginning
     qvel: Tensor  # (N, 6)
     rotor_speed: Tensor  # (N, 4)
     actions: Tensor  # (T, N, 4)
 
 
-def record() -> Recording:
+def record(drone: QuadrotorParameters) -> Recording:
     """Fly each track for a while and record the last two seconds."""
-    rows = [_record_one(track) for track in PLAIN_TRACKS]
+    rows = [_record_one(track, drone) for track in PLAIN_TRACKS]
     qpos, qvel, rotor_speed, actions = zip(*rows, strict=True)
-    return Recording(torch.cat(qpos), torch.cat(qvel), torch.cat(rotor_speed), torch.cat(actions, dim=1))
+    return Recording(drone, torch.cat(qpos), torch.cat(qvel), torch.cat(rotor_speed), torch.cat(actions, dim=1))
 
 
-def _record_one(track: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _record_one(track: str, drone: QuadrotorParameters) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """State at the beginning (position and attitude, velocities, rotor speeds), and the actions (T, 1, 4)."""
-    worlds = RaceWorlds(track, 1, EASY, evaluation=True, from_pixels=False)
-    pilot = ScriptedPilot(track, EASY, dtype=worlds.dtype)
+    worlds = RaceWorlds(track, 1, drone, evaluation=True, from_pixels=False)
+    pilot = ScriptedPilot(track, drone, dtype=worlds.dtype)
     worlds.reset()
     simulator: Any = worlds.simulator
     actions = []
-    warm_up, steps = (round(seconds / EASY.control_dt) for seconds in (WARM_UP, SECONDS))
+    warm_up, steps = (round(seconds / drone.control_dt) for seconds in (WARM_UP, SECONDS))
     for step in range(warm_up + steps):
         state = simulator.state
         if step == warm_up:
@@ -130,7 +133,7 @@ def _record_one(track: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -> tuple[Tensor, Tensor]:
     """Replay the actions; return positions (T·10, N, 3) every `HOLD`, and the wrenches (T·10, N, 6) applied then."""
-    drones = Drones(variant, integrator, step, len(PLAIN_TRACKS))
+    drones = Drones(recording.drone, variant, integrator, step, len(PLAIN_TRACKS))
     drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
     drones.quadrotor.rotor_speed.copy_(recording.rotor_speed)
     every = round(HOLD / step)
@@ -148,7 +151,7 @@ def fly_loop(recording: Recording, variant: str, integrator: str, step: float) -
 
 def fly_wrenches(recording: Recording, wrenches: Tensor, variant: str, integrator: str, step: float) -> Tensor:
     """Apply wrenches (T·10, N, 6), each for `HOLD`; return the positions (T·10, N, 3)."""
-    drones = Drones(variant, integrator, step, len(PLAIN_TRACKS))
+    drones = Drones(recording.drone, variant, integrator, step, len(PLAIN_TRACKS))
     drones.qpos[:], drones.qvel[:] = recording.qpos, recording.qvel
     positions = []
     for wrench in wrenches:
@@ -163,9 +166,11 @@ def error_mm(positions: Tensor, reference: Tensor) -> list[float]:
     return [1000.0 * float(value) for value in (positions - reference).norm(dim=-1).amax(0)]
 
 
-def cost(variant: str, integrator: str, step: float, num: int = 1024) -> tuple[float, float]:
+def cost(
+    drone: QuadrotorParameters, variant: str, integrator: str, step: float, num: int = 1024
+) -> tuple[float, float]:
     """µs per world and physics step, of the body (with its correction) and of controller and motors."""
-    drones = Drones(variant, integrator, step, num)
+    drones = Drones(drone, variant, integrator, step, num)
     drones.quadrotor.command(torch.zeros(num, 4))
     spent = []
     for _ in range(300):
@@ -200,30 +205,34 @@ CASES = (
 def main() -> None:
     """Replay through every case."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="easy")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    recording = record()
+    drone = without_randomisation(PRESETS[arguments.preset])
+    bare = not any(drone.drag)
+    recording = record(drone)
     reference, _ = fly_loop(recording, "midpoint", "RK4", 0.001)
     limit, _ = fly_loop(recording, "midpoint", "RK4", 0.0001)
     _, wrenches = fly_loop(recording, "midpoint", "RK4", HOLD)
     exact = fly_wrenches(recording, wrenches, "plain", "RK4", 0.0005)
     records = []
-    for variant, integrator, step in CASES:
+    for variant, integrator, step in [case for case in CASES if bare or case[0] == "midpoint"]:
         positions, _ = fly_loop(recording, variant, integrator, step)
-        by_wrench = error_mm(fly_wrenches(recording, wrenches, variant, integrator, step), exact)
+        by_wrench = error_mm(fly_wrenches(recording, wrenches, variant, integrator, step), exact) if bare else None
         against_reference, against_limit = error_mm(positions, reference), error_mm(positions, limit)
-        body_us, drone_us = cost(variant, integrator, step)
+        body_us, drone_us = cost(drone, variant, integrator, step)
         records.append(
             {
+                "preset": arguments.preset,
                 "variant": variant,
                 "integrator": integrator,
                 "step_ms": 1000 * step,
-                "wrench": max(by_wrench),
+                "wrench": by_wrench and max(by_wrench),
                 "loop_vs_1ms": max(against_reference),
                 "loop_vs_limit": max(against_limit),
                 "body_us": body_us,
                 "drone_us": drone_us,
-                "env_steps_per_s": 1e6 / (body_us + drone_us) / round(EASY.control_dt / step),
+                "env_steps_per_s": 1e6 / (body_us + drone_us) / round(drone.control_dt / step),
                 **{f"loop_vs_limit_{track}": value for track, value in zip(PLAIN_TRACKS, against_limit, strict=True)},
             }
         )

@@ -80,7 +80,6 @@ PRESETS: dict[str, QuadrotorParameters] = {
         drag=(0.26, 0.28, 0.42),  # [rpg]
         command_delay=0.020,  # [rpg]
         physics_dt=0.001,  # [rpg]
-        integrator="RK4",  # [rpg]
         randomisation=Randomisation(),
     ),
 }

@@ -72,6 +72,7 @@ class Quadrotor:
         self._inertia = tensor(p.inertia)  # (3,)
         self._rate_gain = self._inertia * p.rate_gain  # (3,)
         self._drag = tensor(p.drag)  # (3,)
+        self._gravity = tensor((0.0, 0.0, -GRAVITY)).expand(num_drones, 3)
         self._has_drag = any(p.drag)
         # a = -1 … 1 → (total thrust N, body rates rad/s), affine
         thrust_scale = p.collective_thrust_scale * p.mass
@@ -223,13 +224,21 @@ class Quadrotor:
     def _perturb(
         self, wrench: Tensor, attitude: Tensor, linear_velocity: Tensor, body_rates: Tensor, gyroscopic: Tensor
     ) -> Tensor:
-        """Add drag, and map the wrench of drones with their own parameters to the nominal body's."""
+        """Add the drag of the step's middle, and map the wrench of drones of their own to the nominal body's."""
         force, torque = wrench[:, :3], wrench[:, 3:]
-        drag = self._drag * rotate_inverse(attitude, linear_velocity)
-        drones = self._drones
-        if drones is None or self.parameters.randomisation is None:
-            return torch.cat((force - drag, torque), dim=1)
-        force = (drones.thrust * force - drones.drag * drag) / drones.mass
+        drones = self._drones if self.parameters.randomisation is not None else None
+        velocity = rotate_inverse(attitude, linear_velocity)  # body frame
+
+        def with_drag(velocity: Tensor) -> Tensor:
+            if drones is None:
+                return force - self._drag * velocity
+            return (drones.thrust * force - drones.drag * self._drag * velocity) / drones.mass
+
+        acceleration = with_drag(velocity) / self.parameters.mass + rotate_inverse(attitude, self._gravity)
+        change = acceleration - torch.linalg.cross(body_rates, velocity)  # as the turning body sees it, m/s²
+        force = with_drag(torch.add(velocity, change, alpha=0.5 * self.parameters.physics_dt))
+        if drones is None:
+            return torch.cat((force, torque), dim=1)
         torque = drones.thrust * torque
         torque = torch.cat((torque[:, :2], drones.torque * torque[:, 2:]), dim=1)
         own_gyroscopic = torch.linalg.cross(body_rates, drones.inertia * self._inertia * body_rates)

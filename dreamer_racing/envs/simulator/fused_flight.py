@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import ROTOR_SPINS
+from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
@@ -102,6 +102,7 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
     constants.decay, constants.decay_half = quadrotor.motor_decay, quadrotor.motor_decay**0.5
     constants.half_step = 0.5 * p.physics_dt
     constants.rate_gain = p.rate_gain
+    constants.mass, constants.gravity = p.mass, (0.0, 0.0, -GRAVITY)
     constants.inertia, constants.drag = p.inertia, p.drag
     constants.rotor_x, constants.rotor_y = x, y
     constants.rotor_yaw = [spin * p.torque_constant for spin in ROTOR_SPINS]
@@ -128,6 +129,8 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         decay_half: real
         half_step: real  # s
         rate_gain: real  # 1/s
+        mass: real  # kg
+        gravity: vec3  # m/s²
         inertia: vec3
         drag: vec3
         rotor_x: vec4
@@ -213,8 +216,11 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
 
         if c.perturbed != 0:  # the wrench that gives the nominal body the acceleration of this drone's own
             velocity = rotate(w, -v, vec3(qvel[i, 0], qvel[i, 1], qvel[i, 2]))
-            air = drag[i, 0] * wp.cw_mul(c.drag, velocity)
-            force = (thrust_factor[i, 0] * force - air) / mass[i, 0]
+            thrust = thrust_factor[i, 0] * force
+            now = (thrust - drag[i, 0] * wp.cw_mul(c.drag, velocity)) / mass[i, 0]
+            change = now / c.mass + rotate(w, -v, c.gravity) - wp.cross(rates, velocity)
+            middle_velocity = velocity + c.half_step * change
+            force = (thrust - drag[i, 0] * wp.cw_mul(c.drag, middle_velocity)) / mass[i, 0]
             factors = vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2])
             torque = thrust_factor[i, 0] * vec3(torque[0], torque[1], torque_factor[i, 0] * torque[2])
             own_gyroscopic = wp.cross(rates, wp.cw_mul(wp.cw_mul(factors, c.inertia), rates))

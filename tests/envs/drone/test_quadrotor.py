@@ -222,6 +222,20 @@ def test_length_of_the_physics_step_hardly_matters_under_hard_commands() -> None
     assert (path - fine[::2]).norm(dim=-1).max() < 0.01
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_drag_makes_a_long_physics_step_no_worse(integrator: str) -> None:
+    """That of a step's beginning would make it eight times worse."""
+    generator = torch.Generator().manual_seed(3)
+    targets = torch.rand(11, 16, 4, generator=generator, dtype=torch.float64) * 2 - 1
+    actions = targets.repeat_interleave(10, dim=0)[:100] * torch.tensor([0.5, 0.1, 0.1, 0.3])
+    errors = []
+    for drag in (EASY.drag, PRESETS["faithful"].drag):
+        drone = replace(EASY, drag=drag, integrator=integrator)
+        coarse, fine = (simulate(actions, replace(drone, physics_dt=step))[1][-1] for step in (0.002, 0.0001))
+        errors.append((coarse - fine).norm(dim=-1).mean())
+    assert errors[1] < 1.2 * errors[0] < 5e-4
+
+
 def test_unknown_preset_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"'hard'.*easy, faithful"):
         load_preset("hard")

@@ -113,12 +113,12 @@ def test_applied_forces_are_of_the_world_and_torques_of_the_body() -> None:
 
 
 def test_physics_options_are_those_of_the_parameters() -> None:
-    for preset, integrator in (
-        ("easy", mujoco.mjtIntegrator.mjINT_EULER),
-        ("faithful", mujoco.mjtIntegrator.mjINT_RK4),
+    for parameters, integrator in (
+        (PRESETS["easy"], mujoco.mjtIntegrator.mjINT_EULER),
+        (dataclasses.replace(PRESETS["faithful"], integrator="RK4"), mujoco.mjtIntegrator.mjINT_RK4),
     ):
-        model, _ = compiled("kidney", PRESETS[preset])
-        assert model.opt.timestep == PRESETS[preset].physics_dt
+        model, _ = compiled("kidney", parameters)
+        assert model.opt.timestep == parameters.physics_dt
         assert model.opt.integrator == integrator
         np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, -9.81])
 
