@@ -93,13 +93,13 @@ def measure(checkpoint: Path, updates: int, pairs: int) -> Iterator[dict[str, An
     for record in compare_windows(learner, long.sample()):
         yield {**where, "measured": "windows", **record}
     del long
+    if isinstance(learner.losses["actor"], FlownPPOActorLoss):
+        print("gradient, drift: not measured, an actor that learns from what it flies does not learn from a replay")
+        return
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
     starts = config.model.imagination_starts or config.model.batch_size * config.model.batch_length
     for number in (starts, starts * config.loss.ppo.updates):
         yield {**where, "measured": "gradient", **gradient_noise(learner, replay, number)}
-    if isinstance(learner.losses["actor"], FlownPPOActorLoss):
-        print("drift: not measured, an actor that learns from what it flies does not move by updates from a replay")
-        return
     yield {**where, "measured": "drift", **drift(config, checkpoint, replay, updates, pairs)}
 
 

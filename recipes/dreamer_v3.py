@@ -54,7 +54,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
-RACE_SPEED = 400  # env_steps/s of tuned=race on one core with bfloat16: 440 (entry 18) and 370 (19) were measured
+RACE_SPEED = 450  # env_steps/s of tuned=race on one core with bfloat16 and AMX, two runs side by side (entry 20)
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()

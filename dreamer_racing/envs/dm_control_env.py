@@ -30,7 +30,7 @@ from dm_env import specs
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters, at_control_rate, load_preset
-from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.drone.quadrotor import Quadrotor, wrong_action_type
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
@@ -333,7 +333,7 @@ class DroneRace(base.Task):
         """
         action = np.asarray(action)
         if action.dtype.kind != "f":
-            raise TypeError(f"Action of {action.dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
+            raise wrong_action_type(action.dtype)
         if action.shape != (ACTION_SIZE,):
             raise ValueError(
                 f"Action of shape {action.shape}: this environment takes one of shape ({ACTION_SIZE},): collective "

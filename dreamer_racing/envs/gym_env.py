@@ -30,6 +30,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
@@ -139,8 +140,10 @@ class GymWorlds:
         """
         if not self._begun:
             raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
-        action = torch.as_tensor(np.asarray(actions))
-        outcome = self.worlds.step(action.double() if action.is_floating_point() else action)
+        actions = np.asarray(actions)
+        if actions.dtype.kind != "f":
+            raise wrong_action_type(actions.dtype)
+        outcome = self.worlds.step(torch.from_numpy(actions.astype(np.float64)))
         return outcome, outcome.reward(self.body_rate_weight).numpy()
 
     def observe(self, mask: np.ndarray | None = None) -> Observation:
@@ -261,7 +264,8 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
             action: (4,); values beyond [-1, 1] are clipped, and one that is not finite is a crash.
 
         Raises:
-            ValueError: wrong shape.
+            ResetNeeded: no episode has begun.
+            TypeError, ValueError: an action of another type or shape.
         """
         if np.shape(action) != (ACTION_SIZE,):
             raise ValueError(

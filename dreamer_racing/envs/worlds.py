@@ -16,6 +16,7 @@ from dreamer_racing.envs.drone.parameters import (
     load_preset,
     without_randomisation,
 )
+from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
@@ -221,7 +222,7 @@ class RaceWorlds:
             ValueError: wrong shape or device.
         """
         if not action.is_floating_point():
-            raise TypeError(f"Action of {action.dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
+            raise wrong_action_type(action.dtype)
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "

@@ -40,7 +40,7 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
         - ``imagination/return_correlation`` and ``imagination/return_bias`` (imagined minus real): the return over the
           horizon plus the discounted value after it, imagined by the present policy, against the one that the world
           paid. The actions of newest records are those of nearly the same policy. Windows that begin at an episode's
-          last record, or in which time ran out, are left out.
+          last record, or in which time ran out, are left out. Not measured where updates do not imagine.
 
     Raises:
         ValueError: If the windows are too short.
@@ -72,6 +72,8 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
         metrics["held_out/open_loop_reward_error"] = (predicted - paid).abs().mean()
         metrics["held_out/open_loop_correlation"] = correlation(predicted, paid)
 
+    if not learner.imagines:
+        return metrics
     discount = learner.discount ** torch.arange(horizon + 1, device=reward.device)
     value = critic.value(join_features(belief[:, -1], state[:, -1])).squeeze(-1)
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())

@@ -154,6 +154,11 @@ class DreamerLearner:
         return float(cast(ActorLoss, self.losses["actor"]).discount)
 
     @property
+    def imagines(self) -> bool:
+        """Whether updates imagine; an actor's loss of one's own that does not say does."""
+        return getattr(self.losses["actor"], "imagines", True)
+
+    @property
     def horizon(self) -> int:
         """H, imagined actions from each start."""
         return cast(ActorLoss, self.losses["actor"]).horizon
@@ -169,12 +174,13 @@ class DreamerLearner:
         Args:
             batch: Replay records, batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``,
                 ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
-            timed: Context manager by activity (``world_model``, ``imagine``, ``optimise``), to measure the time spent
-                in each; tells them apart only on a CPU and without ``compile``.
+            timed: Context manager by activity (``world_model``, ``imagine``, of actor and critic whether they imagine
+                or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU and without
+                ``compile``.
 
         Returns:
-            Scalar tensors on the device: every loss and metric of the three losses, ``gradient_norm/<network>`` (before
-            clipping) and ``loss``. Reading one waits for the device; do it seldom.
+            Scalar tensors on the device: every loss and metric of those that were computed, ``gradient_norm/<network>``
+            (before clipping) and ``loss``. Reading one waits for the device; do it seldom.
 
         Raises:
             KeyError: If the batch lacks what a loss reads.
@@ -205,7 +211,8 @@ class DreamerLearner:
 
     def watch(self, rollout: TensorDictBase) -> None:
         """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights."""
-        cast(ActorLoss, self.losses["actor"]).watch(rollout)
+        if isinstance(loss := self.losses["actor"], ActorLoss):  # one of one's own need not care
+            loss.watch(rollout)
 
     def _average(self) -> None:
         """Move the averaged weights; while there are few updates they are the plain mean of all."""
@@ -217,6 +224,7 @@ class DreamerLearner:
         self,
         *,
         rates: float | None = None,
+        world_model_rate: float = 1.0,
         min_std: float | None = None,
         max_std: float | None = None,
         **numbers: float,
@@ -227,6 +235,7 @@ class DreamerLearner:
 
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
+            world_model_rate: Share of that share, of the world model's alone.
             min_std: Smallest standard deviation of actions, of the networks' own.
             max_std: Largest.
             numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
@@ -239,6 +248,7 @@ class DreamerLearner:
         if rates is not None:
             for group, rate in zip(self._groups, self._rates, strict=True):
                 group["lr"] = rate * rates
+            self._groups[0]["lr"] *= world_model_rate
         for name, value in numbers.items():
             self._set_in_losses(name, value)
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
@@ -300,7 +310,7 @@ class DreamerLearner:
         self.latents = context.detach()
         replay = batch.select("reward", "is_init", "terminated", "truncated")
         replay.update(context)
-        if not cast(ActorLoss, self.losses["actor"]).imagines:
+        if not self.imagines:
             return dict(self.losses["critic"](replay).items())
         imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
         imagination = imagined.pop("imagination")

@@ -27,7 +27,8 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
     """Keep what the collector's policy flew, and judge it by a critic of the simulator's state.
 
     That critic is a two-hot regression of the λ-returns, in as many epochs of minibatches as the actor makes, after the
-    advantages were computed. The learner does not call ``forward``: nothing is imagined.
+    advantages were computed. The learner does not call ``forward``: nothing is imagined. Where time ran out, and behind
+    the last step kept, the value of the step itself stands for what comes, as in ``FlownPPOActorLoss``.
 
     Args:
         privileged_dim: P.

@@ -24,7 +24,7 @@ from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
-from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig
+from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, find_loss
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
@@ -184,6 +184,11 @@ def check_imagination(config: DreamerConfig) -> None:
     model, share = config.model, config.replay.recent_share
     if not model.imagine_recent:
         return
+    if not getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True):
+        raise ValueError(
+            f"model.imagine_recent=true, and loss.actor={config.loss.actor} imagines nothing: leave it out, or choose "
+            "another loss."
+        )
     if not round(share * model.batch_size):
         raise ValueError(
             f"model.imagine_recent=true, and replay.recent_share={share:g} draws none of model.batch_size="
@@ -204,6 +209,7 @@ def check_schedule(config: DreamerConfig) -> None:
     """
     targets = {
         "learning_rates": POSITIVE,
+        "world_model_rate": POSITIVE,
         **{name: allowed_values(config.loss, name) for name in LOSS_RAMPS},
         "start_on_line": allowed_values(config.env, "start_on_line"),
     }
@@ -265,10 +271,9 @@ def check_wait(config: DreamerConfig) -> None:
     limit = config.schedule.wait_for_model
     if limit is not None and limit <= 1:
         raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
-    alone = [
-        name for name, loss in ACTOR_LOSSES.items() if isinstance(loss, type) and issubclass(loss, ClippedActorLoss)
-    ]
-    if config.loss.actor not in alone:
+    loss = find_loss(ACTOR_LOSSES, config.loss.actor)
+    if not (isinstance(loss, type) and issubclass(loss, ClippedActorLoss)):
+        alone = [name for name in ACTOR_LOSSES if name.endswith("ppo")]
         raise ValueError(
             f"schedule.wait_for_model={limit} is for actors that step alone, loss.actor={', '.join(alone)}; with "
             f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."

@@ -23,7 +23,8 @@ def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, flo
     """Arguments of `DreamerLearner.adjust` at what the clocks say."""
     schedule, loss = config.schedule, config.loss
     of_losses = {name: getattr(schedule, name).at(getattr(loss, name), times) for name in LOSS_RAMPS}
-    return {"rates": schedule.learning_rates.at(1.0, times), **of_losses}
+    rates = {"rates": schedule.learning_rates, "world_model_rate": schedule.world_model_rate}
+    return {**{name: ramp.at(1.0, times) for name, ramp in rates.items()}, **of_losses}
 
 
 def size_of(config: DreamerConfig) -> ModelSize:

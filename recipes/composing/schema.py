@@ -135,6 +135,7 @@ class ScheduleConfig:
     """
 
     learning_rates: Ramp = field(default_factory=Ramp)  # `to`: share of all learning rates that is left
+    world_model_rate: Ramp = field(default_factory=Ramp)  # `to`: share of that share, of the world model's alone
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std

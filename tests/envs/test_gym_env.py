@@ -157,8 +157,20 @@ def test_action_that_is_not_finite_ends_the_single_environment() -> None:
 def test_actions_that_are_no_fractions_are_refused(kind: type) -> None:
     env = DroneRaceGymEnv("circle", observation="state")
     env.reset()
-    with pytest.raises(TypeError, match=r"Action of torch\.\w+: thrust and body rates are floating-point"):
+    with pytest.raises(TypeError, match=r"Action of \w+: thrust and body rates are floating-point"):
         env.step(np.zeros(4, kind))
+
+
+def test_actions_of_any_layout_are_taken() -> None:
+    """Read-only ones, as JAX gives, and views that run backwards."""
+    env = DroneRaceGymEnv("circle", observation="state")
+    env.reset()
+    action = np.array([0.1, 0.0, 0.0, -0.26], np.float32)
+    action.setflags(write=False)
+    for each in (action, action[::-1]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            env.step(each)
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:

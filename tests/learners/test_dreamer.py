@@ -366,6 +366,8 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
     learner.update(make_batch())
     learner.adjust()
     assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    learner.adjust(rates=0.5, world_model_rate=0.1)
+    assert settings()[:2] == pytest.approx([5e-5, 2e-4])
     learner.adjust(rates=1.0)
     assert settings() == pytest.approx([1e-3, 4e-4, 0.9, 0.9, 0.9, 0.1])
     with pytest.raises(TypeError, match=r"adjust\(discont=...\): LossConfig has no such number"):

@@ -161,11 +161,11 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
     assert set(names) == {"discount", "entropy_scale", "max_std", "min_std"}
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
-    overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates")]
+    overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     begin, end = (learners.scheduled(config, {Clock.run: share}) for share in (0.0, 1.0))
-    assert begin == {"rates": 1.0} | {name: getattr(config.loss, name) for name in names}
-    assert end == dict.fromkeys(("rates", *names), 0.5)
+    assert begin == {"rates": 1.0, "world_model_rate": 1.0} | {name: getattr(config.loss, name) for name in names}
+    assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5)
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
     learner.adjust(**end)
     assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5

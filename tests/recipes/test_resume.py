@@ -88,7 +88,7 @@ def assert_same(first: Any, second: Any, where: str) -> None:
 
 
 RACE = [
-    "tuned=race", "schedule.learning_rates.to=null", "schedule.max_std.to=null",
+    "tuned=race", "schedule.learning_rates.to=null", "schedule.max_std.to=null", "schedule.world_model_rate.to=null",
     "evaluation.start_noise=0", "model.imagination_starts=8",
     "evaluation.stochastic=false", "loss.ppo.updates=7", "loss.ppo.flown=200", "loss.ppo.kl_target=1e-9",
     "schedule.wait_for_model=1.1", "schedule.wait_every=300", "model.mixed_precision=false",

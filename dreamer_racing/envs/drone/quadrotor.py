@@ -247,6 +247,11 @@ class Quadrotor:
         return torch.cat((force, torque), dim=1)
 
 
+def wrong_action_type(dtype: object) -> TypeError:
+    """Return the error for actions of a type that is none of floating-point numbers."""
+    return TypeError(f"Action of {dtype}: thrust and body rates are floating-point numbers in [-1, 1].")
+
+
 def _product(values: Tensor, matrix: Tensor) -> Tensor:
     """Multiply (N, K) by (K, M) in full precision, which a matrix product on CUDA may lack (TF32)."""
     return (values.unsqueeze(-1) * matrix).sum(1) if values.is_cuda else values @ matrix
