@@ -77,7 +77,7 @@ def out_of_memory_advice(error: RuntimeError) -> str:
     """Return the first line of the error, and which settings take memory, largest first."""
     first = str(error).splitlines()[0]
     return (
-        f"{first} What takes memory: the batch (model.batch_size times model.batch_length), imagination if there is any "
+        f"{first} What takes memory: the batch (model.batch_size times model.batch_length), imagination, if any "
         "(model.imagination_starts; null takes every record of the batch), the network (model=size12m and smaller), "
         "the replay (replay.device=cpu). model.mixed_precision=true halves what the networks keep."
     )
