@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +37,12 @@ from dreamer_racing.training.directory import RunDirectory, complete_checkpoints
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [
     "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4",
-    "env.num_envs=4", "env.episode_steps=40", "env.renderer=raycast", "prefill=64", "replay.capacity=1200",
+    "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=1200",
     "evaluation.every=800", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=400",
     "checkpoint.keep=2", "logger.every=400", "logger=csv", "device=cpu", "total_env_steps=2400",
 ]  # fmt: skip
-CLOCKS = ("time/", "rate/")  # columns that a wall clock writes
+KINDS = ("kill", "rename", "fsync", "damage", "disk", "clock", "not_finite")
+CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
 COUNT_CALLS = """
 import os, signal
 def counted(function, name, last, after):
@@ -88,6 +89,7 @@ DroneRacingEnv._step = poisoned
 def main() -> None:
     """Disturb runs in every way."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--faults", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--kills", type=int, default=50, help="at random times")
     parser.add_argument("--calls", type=int, default=10, help="renames, and fsyncs, to be killed at")
     parser.add_argument("--seed", type=int, default=0)
@@ -96,15 +98,16 @@ def main() -> None:
     draw = random.Random(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
         arena = Arena(Path(folder))
-        cases = [
-            *arena.kills(arguments.kills, draw),
-            *arena.kills_at_calls("replace", arguments.calls),
-            *arena.kills_at_calls("fsync", arguments.calls),
-            *arena.damages(),
-            *arena.full_disks(),
-            *arena.clocks(),
-            arena.not_finite(),
-        ]
+        ways: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {
+            "kill": lambda: arena.kills(arguments.kills, draw),
+            "rename": lambda: arena.kills_at_calls("replace", arguments.calls),
+            "fsync": lambda: arena.kills_at_calls("fsync", arguments.calls),
+            "damage": arena.damages,
+            "disk": arena.full_disks,
+            "clock": arena.clocks,
+            "not_finite": arena.not_finite,
+        }
+        cases = [case for kind in arguments.faults for case in ways[kind]()]
     kinds = list(dict.fromkeys(case["fault"] for case in cases))
     counts = [
         {"fault": kind, "cases": len(own), "survived": sum(case["survived"] for case in own)}
@@ -202,14 +205,14 @@ class Arena:
             self._run(*self._arguments(name), before=before)
             yield self._verdict("clock", where, name)
 
-    def not_finite(self) -> dict[str, Any]:
+    def not_finite(self) -> Iterator[dict[str, Any]]:
         """Poison a reward; the run is to end, and its checkpoint to be continued without the poison."""
         name = self._name()
         process = self._start(*self._arguments(name), before=INFINITE)
         _, printed = process.communicate()
         ended = process.returncode == 1 and "is not finite" in printed and "Traceback" not in printed
         self._run(f"resume={name}")
-        return self._verdict("not finite", "reward", name, "" if ended else f"exit status {process.returncode}")
+        yield self._verdict("not finite", "reward", name, "" if ended else f"exit status {process.returncode}")
 
     def _name(self) -> str:
         self._number += 1
