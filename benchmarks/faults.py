@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ import torch
 from measuring import print_table, write_json
 
 from dreamer_racing.training.checkpoint import CHECKSUMS
-from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, latest_checkpoint
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [
@@ -108,12 +109,9 @@ def main() -> None:
             "not_finite": arena.not_finite,
         }
         cases = [case for kind in arguments.faults for case in ways[kind]()]
-    kinds = list(dict.fromkeys(case["fault"] for case in cases))
-    counts = [
-        {"fault": kind, "cases": len(own), "survived": sum(case["survived"] for case in own)}
-        for kind in kinds
-        for own in [[case for case in cases if case["fault"] == kind]]
-    ]
+    all_cases = Counter(case["fault"] for case in cases)
+    survived = Counter(case["fault"] for case in cases if case["survived"])
+    counts = [{"fault": kind, "cases": number, "survived": survived[kind]} for kind, number in all_cases.items()]
     print_table(counts, ["fault", "cases", "survived"])
     for case in cases:
         if not case["survived"]:
@@ -189,7 +187,7 @@ class Arena:
             yield self._verdict("damage", str(file), name, "" if named else "the damage was not said")
 
     def full_disks(self) -> Iterator[dict[str, Any]]:
-        """Let no file grow while checkpoints are written, from the first or from a later one on."""
+        """Let no file grow while checkpoints are written, from the second or from the third on."""
         for first in (1, 2):
             name = self._name()
             done = self._start(*self._arguments(name), before=FULL.format(first=first))
@@ -220,11 +218,12 @@ class Arena:
 
     def _arguments(self, name: str) -> list[str]:
         """Return what begins a run, or continues it once it has a checkpoint."""
-        resumed = complete_checkpoints(self._folder / name) if (self._folder / name / "checkpoints").is_dir() else []
-        if list(resumed):
-            return [f"resume={name}"]
-        shutil.rmtree(self._folder / name, ignore_errors=True)
-        return [f"run_dir={name}", *SETTINGS]
+        try:
+            latest_checkpoint(self._folder / name)
+        except FileNotFoundError:
+            shutil.rmtree(self._folder / name, ignore_errors=True)
+            return [f"run_dir={name}", *SETTINGS]
+        return [f"resume={name}"]
 
     def _start(self, *overrides: str, before: str = "") -> subprocess.Popen[str]:
         program = [str(RECIPE)]

@@ -235,7 +235,7 @@ class DreamerLearner:
 
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
-            world_model_rate: Share of that share, of the world model's alone.
+            world_model_rate: Share of that share, of the world model's alone; given together with ``rates``.
             min_std: Smallest standard deviation of actions, of the networks' own.
             max_std: Largest.
             numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
@@ -95,10 +95,5 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         """Make one gradient step of the critic; return its loss."""
         log_probabilities = self.state_critic(state).log_softmax(-1)
         loss = self.state_critic.two_hot.cross_entropy(log_probabilities, target).mean()
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.state_critic.parameters(), self.ppo.gradient_clip)
-        if norm.isfinite():
-            self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        self._descend(loss, self.state_critic)
         return loss.detach()

@@ -156,13 +156,18 @@ class ClippedActorLoss(ActorLoss):
         """Make one gradient step; the divergence is that from before it."""
         policy = self.actor(batch.features)
         loss, metrics = clipped_objective(policy, batch, self.ppo.clip_epsilon, self.entropy_scale, self.log_prob)
+        norm = self._descend(loss, self.actor)
+        return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
+
+    def _descend(self, loss: Tensor, network: nn.Module) -> Tensor:
+        """Make one gradient step of a network, unless its gradient is not finite; return the norm before clipping."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.ppo.gradient_clip)
+        norm = nn.utils.clip_grad_norm_(network.parameters(), self.ppo.gradient_clip)
         if norm.isfinite():
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
+        return norm
 
 
 def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:

@@ -271,15 +271,20 @@ def check_wait(config: DreamerConfig) -> None:
     limit = config.schedule.wait_for_model
     if limit is not None and limit <= 1:
         raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
-    loss = find_loss(ACTOR_LOSSES, config.loss.actor)
-    if not (isinstance(loss, type) and issubclass(loss, ClippedActorLoss)):
-        alone = [name for name in ACTOR_LOSSES if name.endswith("ppo")]
+    if not steps_alone(config.loss.actor):
+        alone = filter(steps_alone, ACTOR_LOSSES)
         raise ValueError(
             f"schedule.wait_for_model={limit} is for actors that step alone, loss.actor={', '.join(alone)}; with "
             f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
         )
     if not config.replay.held_out:
         raise ValueError(f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0.")
+
+
+def steps_alone(actor_loss: str) -> bool:
+    """Whether the actor of a loss of this name learns in improvements of its own."""
+    loss = find_loss(ACTOR_LOSSES, actor_loss)
+    return isinstance(loss, type) and issubclass(loss, ClippedActorLoss)
 
 
 def check_image_size(image_size: int, size: str) -> None:

@@ -72,7 +72,7 @@ class Quadrotor:
         self._inertia = tensor(p.inertia)  # (3,)
         self._rate_gain = self._inertia * p.rate_gain  # (3,)
         self._drag = tensor(p.drag)  # (3,)
-        self._gravity = tensor((0.0, 0.0, -GRAVITY)).expand(num_drones, 3)
+        self._gravity = tensor((0.0, 0.0, -GRAVITY)).expand(num_drones, 3)  # m/s², world frame
         self._has_drag = any(p.drag)
         # a = -1 … 1 → (total thrust N, body rates rad/s), affine
         thrust_scale = p.collective_thrust_scale * p.mass
