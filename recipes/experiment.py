@@ -31,7 +31,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.lock import RunLock
 
 RECIPES = Path(__file__).resolve().parent
 LOG = "log.txt"
@@ -80,8 +79,7 @@ def bring_to_its_end(config: ExperimentConfig, run_dir: Path, given: list[str]) 
     if command is None:
         print(f"{run_dir}: finished, skipped", flush=True)
         return
-    run_dir.mkdir(parents=True, exist_ok=True)
-    RunLock(run_dir).release()  # refuses here, rather than into the log of a live run
+    RunDirectory(run_dir).claim().release()  # refuses here, rather than into the log of a live run
     began = "resumed" if any("resume=" in word for word in command) else "started"
     print(f"{run_dir}: {began}, budget={config.budget}", flush=True)
     if status := run(command, run_dir):

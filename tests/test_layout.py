@@ -110,8 +110,6 @@ def test_every_module_and_all_that_is_public_says_what_it_is(folder):
             f"{path.relative_to(ROOT)}: {getattr(node, 'name', 'module')}"
             for node in (tree, *(node for node in public if node.name[0] != "_"))
             if not ast.get_docstring(node)
-            and not any(
-                isinstance(d, ast.Attribute) and d.attr == "setter" for d in getattr(node, "decorator_list", [])
-            )
+            and not is_setter(node)
         ]
     assert silent == []

@@ -14,6 +14,8 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint
 
+from dreamer_racing.training.lock import RunLock
+
 logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "checkpoints"
@@ -98,6 +100,15 @@ class RunDirectory:
     def finished(self) -> Path:
         """What says that all that the run was asked for is done, evaluation and metrics included."""
         return self.path / "finished.json"
+
+    def claim(self) -> RunLock:
+        """Make the folder if needed, and hold it for this process alone.
+
+        Raises:
+            PermissionError: nothing can be written there.
+            ValueError: a live run holds it.
+        """
+        return RunLock(ensure_writable(self.path))
 
     def latest_checkpoint(self) -> Path:
         """As the function of that name."""

@@ -33,7 +33,7 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory, ensure_writable
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
@@ -208,7 +208,7 @@ def claim(config: RunConfig) -> RunLock:
         ValueError: it holds another run, or is in use by a live one.
     """
     assert config.run_dir is not None, "resolve_common() names it"
-    lock = RunLock(ensure_writable(config.run_dir))
+    lock = RunDirectory(Path(config.run_dir)).claim()
     refuse_to_replace(config)
     return lock
 
