@@ -109,7 +109,6 @@ def test_every_module_and_all_that_is_public_says_what_it_is(folder):
         silent += [
             f"{path.relative_to(ROOT)}: {getattr(node, 'name', 'module')}"
             for node in (tree, *(node for node in public if node.name[0] != "_"))
-            if not ast.get_docstring(node)
-            and not is_setter(node)
+            if not ast.get_docstring(node) and not is_setter(node)
         ]
     assert silent == []
