@@ -11,10 +11,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import zstandard
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -34,6 +37,7 @@ from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
 RACE_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
 """The reward of a race and the terms of which `RelabelReward` recomputes it."""
 _END_KEYS = ("terminated", "truncated")
+_FIELD = "{}.zst"
 
 
 def records_from_rollout(
@@ -179,16 +183,19 @@ class StreamReplay(TensorDictReplayBuffer):
     def dumps(self, path: str | Path) -> None:
         """Saves the filled part of every stream, the cursors and the random generator into a folder.
 
-        Plain files are written, not memory maps: on a full disk a map ends the process with a bus error.
+        Each field is a file of Zstandard frames, one a stream: drawn images shrink to a twentieth. Plain files are
+        written, not memory maps: on a full disk a map ends the process with a bus error.
         """
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
         fields = []
-        for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
-            fields.append({"key": key, "shape": list(stored.shape[1:]), "dtype": str(stored.dtype)})
-            with (path / f"{number}.bin").open("wb") as file:
-                for part in self._filled():
-                    file.write(stored[part].cpu().contiguous().view(torch.uint8).numpy().data)
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # compressing lets go of the interpreter
+            for number, (key, stored) in enumerate(self._storage.fields() if len(self) else ()):
+                with (path / _FIELD.format(number)).open("wb") as file:
+                    frames = threads.map(_compressed, (stored[part] for part in self._filled()))
+                    sizes = [file.write(frame) for frame in frames]
+                layout = {"shape": list(stored.shape[1:]), "dtype": str(stored.dtype)}
+                fields.append({"key": key, **layout, "frames": sizes})
         state = {"streams": self._writer.state_dict(), "fields": fields, "generator": self._rng.get_state().tolist()}
         (path / "replay.json").write_text(json.dumps(state), encoding="utf-8")
 
@@ -196,17 +203,22 @@ class StreamReplay(TensorDictReplayBuffer):
         """Restores what `dumps` saved.
 
         Raises:
-            ValueError: if the saved streams or records do not have this replay's shape.
+            ValueError: if the saved streams or records do not have this replay's shape, or are not compressed, as those
+                of older versions were.
         """
         path = Path(path)
         state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
-        saved = self._open_fields(path, state["fields"], sum(state["streams"]["filled"]))
+        keys = [field["key"] if isinstance(field["key"], str) else tuple(field["key"]) for field in state["fields"]]
+        self._check_fields(keys, state["fields"])
         self._writer.load_state_dict(state["streams"])
-        start = 0
-        for part in self._filled():
-            count = part.stop - part.start
-            self._storage.set(part, saved[start : start + count], set_cursor=False)
-            start += count
+        with ExitStack() as stack:
+            files = [stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(keys))]
+            for index, part in enumerate(self._filled()):
+                records = TensorDict({}, batch_size=[part.stop - part.start])
+                for key, field, file in zip(keys, state["fields"], files, strict=True):
+                    shape = (*records.batch_size, *field["shape"])
+                    records.set(key, _expanded(file.read(field["frames"][index]), shape, _dtype(field)))
+                self._storage.set(part, records, set_cursor=False)
         self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
 
     def _filled(self) -> list[slice]:
@@ -215,17 +227,33 @@ class StreamReplay(TensorDictReplayBuffer):
         pairs = zip(starts, self._writer.filled.tolist(), strict=True)
         return [slice(start, start + count) for start, count in pairs if count]
 
-    def _open_fields(self, path: Path, fields: list[dict[str, Any]], count: int) -> TensorDictBase:
-        saved = TensorDict({}, batch_size=[count])
-        for number, field in enumerate(fields):
-            key = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
-            dtype = getattr(torch, field["dtype"].removeprefix("torch."))
-            size = count * math.prod(field["shape"])
-            values = torch.from_file(str(path / f"{number}.bin"), shared=False, size=size, dtype=dtype)
-            saved.set(key, values.view(count, *field["shape"]))
+    def _check_fields(self, keys: list[NestedKey], fields: list[dict[str, Any]]) -> None:
+        """Refuse fields that are laid out otherwise than those stored here."""
+        if any("frames" not in field for field in fields):
+            raise ValueError("The saved replay is of an older version, which did not compress it: it cannot be read.")
+        layouts = {
+            key: torch.empty(0, *field["shape"], dtype=_dtype(field)) for key, field in zip(keys, fields, strict=True)
+        }
         for key, stored in self._storage.fields() if fields else ():
-            check_layout(key, saved.get(key), stored)
-        return saved
+            if key not in layouts:
+                raise ValueError(f"The replay stores {key!r}, which the saved one does not have.")
+            check_layout(key, layouts[key], stored)
+
+
+def _dtype(field: dict[str, Any]) -> torch.dtype:
+    return getattr(torch, field["dtype"].removeprefix("torch."))
+
+
+def _compressed(records: Tensor) -> bytes:
+    """A frame of the values of one field, by Zstandard's fastest ordinary level."""
+    return zstandard.compress(records.cpu().contiguous().view(torch.uint8).numpy().data, level=1)
+
+
+def _expanded(frame: bytes, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """What `_compressed` made a frame of."""
+    if zstandard.frame_content_size(frame) != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"A frame of the saved replay does not hold {list(shape)} values of {dtype}.")
+    return torch.frombuffer(bytearray(zstandard.decompress(frame)), dtype=dtype).view(shape)
 
 
 def replay_bytes(

@@ -91,8 +91,9 @@ class Run:
 
     def save(self) -> Path:
         """Save everything, unless the networks have just been spoilt."""
-        self.learner.check_finite()
-        return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
+        with self.clock.timed("save"):
+            self.learner.check_finite()
+            return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
 
     def try_to_save(self) -> str:
         """Save on the way, where a full disk is no reason to stop: return a line on what went wrong, or nothing."""

@@ -176,11 +176,11 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
     peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
     line = (
-        f"disk: up to {peak / 1e9:.1f} GB of replay in checkpoint.keep={config.checkpoint.keep} checkpoints and the "
-        f"one that is being written, {free / 1e9:.1f} GB free"
+        f"disk: at most {peak / 1e9:.1f} GB of replay in checkpoint.keep={config.checkpoint.keep} checkpoints and the "
+        f"one that is being written, a seventh of that if images compress as a race's do; {free / 1e9:.1f} GB free"
     )
     advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; a run goes on without saving"
-    return f"{line}: NOT ENOUGH, {advice}" if peak > free else line
+    return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 
 def make_sequence_replay(

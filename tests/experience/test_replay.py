@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -325,8 +327,6 @@ def test_dump_and_load_continue_the_same_samples(tmp_path):
         replay.extend(rollout)
     replay.sample()
     replay.dump(tmp_path)
-    size = sum(file.stat().st_size for file in tmp_path.glob("*.bin"))
-    assert size == replay_bytes(len(replay), (2, 2, 2)) < replay_bytes(150, (2, 2, 2))
     restored.load(tmp_path)
     assert len(restored) == len(replay) and restored.write_count == replay.write_count
     for rollout in rollouts[2:]:
@@ -360,6 +360,42 @@ def test_load_refuses_other_shapes(tmp_path):
     with pytest.raises(ValueError, match="pixels"):
         other.load(tmp_path)
     assert int(other.writer.filled.sum()) == len(other) < len(replay)
+
+
+def test_what_repeats_takes_little_room(tmp_path):
+    replay = make_replay(600, 2, 6, 4)
+    replay.extend(collect(CountingEnv(2, image_shape=(64, 64, 3)), steps=200, batches=1)[0])  # images of one colour
+    replay.dump(tmp_path)
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < replay_bytes(len(replay)) / 50
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda field: field.pop("frames"), "older version, which did not compress it"),
+        (lambda field: field.update(shape=[2, 2, 3]), "does not hold .* values of torch.uint8"),
+        (lambda field: field.update(dtype="torch.int64"), "does not hold .* values of torch.int64"),
+    ],
+)
+def test_load_refuses_what_does_not_fit_together(tmp_path, change, message):
+    replay = make_replay(60, 3, 6, 4)
+    replay.extend(collect(CountingEnv(3), steps=15, batches=1)[0])
+    replay.dump(tmp_path)
+    state = json.loads((tmp_path / "replay.json").read_text())
+    change(next(field for field in state["fields"] if field["key"] == "pixels"))
+    (tmp_path / "replay.json").write_text(json.dumps(state))
+    with pytest.raises(ValueError, match=message):
+        make_replay(60, 3, 6, 4).load(tmp_path)
+
+
+def test_load_refuses_a_replay_that_lacks_a_field(tmp_path):
+    rollout = collect(CountingEnv(3), steps=15, batches=1)[0]
+    replay, other = make_replay(60, 3, 6, 4, reward_keys=("reward",)), make_replay(60, 3, 6, 4)
+    for filled in (replay, other):
+        filled.extend(rollout)
+    replay.dump(tmp_path)
+    with pytest.raises(ValueError, match="stores 'reward_base', which the saved one does not have"):
+        other.load(tmp_path)
 
 
 def test_errors_say_what_is_wrong():

@@ -56,7 +56,7 @@ def parts(run_dir: Path) -> dict[str, Any]:
         name = str(path.relative_to(latest_checkpoint(run_dir)))
         if path.suffix == ".pt":
             found[name] = torch.load(path, weights_only=True)
-        elif path.suffix in (".bin", ".json") and path.name not in ("manifest.json", CHECKSUMS):
+        elif path.suffix in (".zst", ".json") and path.name not in ("manifest.json", CHECKSUMS):
             found[name] = path.read_bytes()
     return found
 
