@@ -17,6 +17,9 @@ from dreamer_racing.envs.tracks import Track
 EPISODE_TIME = 20.0
 """Time after which a training episode is truncated, s [choice]."""
 
+MAX_SPEED = 50.0
+"""No drone gets faster between the walls of a track, m/s: 2.7 times its weight over 30 m, without drag, give 39."""
+
 EVALUATION_TIME = 30.0
 """The same in evaluation, s: three laps of split_s take a good pilot 22 s [choice]."""
 
@@ -33,8 +36,8 @@ class RaceStep:
     """bool: the drone crashed."""
     truncated: torch.Tensor
     """bool: out of time, or the last lap is complete; never together with ``terminated``."""
-    passed: torch.Tensor
-    """bool: the target gate was passed in this step."""
+    passes: torch.Tensor
+    """int64: gates passed in this step; 2 only where gates lie within a control step's reach of each other."""
     gates_passed: torch.Tensor
     """int64: gates passed in this episode."""
     gate_offset: torch.Tensor
@@ -99,7 +102,7 @@ class Race:
         self.episode_steps = episode_steps or round(EPISODE_TIME / control_dt)
         self.laps = laps
         self.control_dt = control_dt
-        self._sweep = GateSweeper(track, device, dtype, miss_radius)
+        self._sweep = GateSweeper(track, device, dtype, miss_radius, reach=MAX_SPEED * control_dt)
         self._gate_positions = track.gate_positions(device, dtype)
         self._dtype = dtype
 
@@ -139,7 +142,7 @@ class Race:
             The outcome for each drone; its tensors are not changed by later steps.
         """
         path, body_rates = path.to(self._dtype), body_rates.to(self._dtype)
-        passed, gate_offset, crash = self._judge(path, body_rates, invalid_action)
+        passes, gate_offset, crash = self._judge(path, body_rates, invalid_action)
         crashed = crash != CrashCause.NONE
         reward_base, body_rate_norm = race_reward(
             self.weights,
@@ -147,10 +150,10 @@ class Race:
             self.position,
             path[-1],
             body_rates,
-            passed,
+            passes,
             crashed,
         )
-        lap_complete, lap_time = self._advance(passed, path[-1])
+        lap_complete, lap_time = self._advance(passes, path[-1])
         if self.laps is None:
             finished = torch.zeros_like(crashed)
         else:
@@ -160,7 +163,7 @@ class Race:
             body_rate_norm=body_rate_norm,
             terminated=crashed,
             truncated=~crashed & (finished | (self.step_count >= self.episode_steps)),
-            passed=passed,
+            passes=passes,
             gates_passed=self.gates_passed.clone(),
             gate_offset=gate_offset,
             lap_time=lap_time,
@@ -182,20 +185,20 @@ class Race:
         self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return passes, offsets and crashes (N,) of the path, the action before it and the body rates after it."""
-        passed, offset, crash = self._sweep(path, self.target_gate)
+        passes, offset, crash = self._sweep(path, self.target_gate)
         rates_lost = (crash == CrashCause.NONE) & ~body_rates.isfinite().all(-1)
         crash = crash.masked_fill(rates_lost, CrashCause.NON_FINITE_STATE)
         crash = crash.masked_fill(invalid_action, CrashCause.INVALID_ACTION)
-        return passed & ~invalid_action, offset.masked_fill(invalid_action, 0.0), crash
+        return passes.masked_fill(invalid_action, 0), offset.masked_fill(invalid_action, 0.0), crash
 
-    def _advance(self, passed: torch.Tensor, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _advance(self, passes: torch.Tensor, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Move every episode on by one control step; return which laps it completed and their times (N,), s."""
         num_gates = self.track.num_gates
         self.position.copy_(position)
         self.step_count += 1
-        self.gates_passed += passed
-        self.target_gate.add_(passed).remainder_(num_gates)
-        lap_complete = passed & (self.gates_passed % num_gates == 0)
+        self.gates_passed += passes
+        self.target_gate.add_(passes).remainder_(num_gates)
+        lap_complete = self.gates_passed.remainder(num_gates) < passes
         lap_steps = self.step_count - self.lap_start_step
         lap_time = torch.where(lap_complete, lap_steps * self.control_dt, 0.0).to(self._dtype)
         self.lap_start_step.copy_(torch.where(lap_complete, self.step_count, self.lap_start_step))

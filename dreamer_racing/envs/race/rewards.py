@@ -33,7 +33,7 @@ def race_reward(
     previous_position: torch.Tensor,
     position: torch.Tensor,
     body_rates: torch.Tensor,
-    passed: torch.Tensor,
+    passes: torch.Tensor,
     crashed: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the two parts of Eq. 1; the reward is ``reward_base - weights.body_rate * body_rate_norm``.
@@ -47,7 +47,7 @@ def race_reward(
         previous_position: position at the last control step, (N, 3), m.
         position: position now, (N, 3), m.
         body_rates: angular velocity, (N, 3), rad/s.
-        passed: the target gate was passed in this step, (N,) bool.
+        passes: gates passed in this step, each of which is paid, (N,) int64.
         crashed: the drone crashed in this step, (N,) bool.
 
     Returns:
@@ -57,7 +57,8 @@ def race_reward(
     Reference: paper, Eq. 1.
     """
     progress = (gate_position - previous_position).norm(dim=-1) - (gate_position - position).norm(dim=-1)
-    reward_base = torch.where(passed, weights.gate, weights.progress * progress)
+    passed = passes > 0
+    reward_base = torch.where(passed, weights.gate * passes, weights.progress * progress)
     reward_base = torch.where(crashed, weights.collision, reward_base)
     body_rate_norm = torch.where(passed | crashed, 0.0, body_rates.norm(dim=-1))
     return reward_base, body_rate_norm

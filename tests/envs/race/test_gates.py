@@ -74,14 +74,14 @@ def test_zones_of_a_gate(axis, sign, distance, forward, backward):
     after[axis] += sign * distance
     high = dataclasses.replace(PLAIN, gates=(Gate((0.0, 0.0, 5.0), 0.0), PLAIN.gates[1]))
     there, back = sweep(high, [before, after]), sweep(high, [after, before])
-    assert (there.passed, there.crash) == forward
-    assert (back.passed, back.crash) == backward
-    assert there.offset == pytest.approx(distance if there.passed else 0.0)
+    assert (there.passes, there.crash) == forward
+    assert (back.passes, back.crash) == backward
+    assert there.offset == pytest.approx(distance if there.passes else 0.0)
     assert back.offset == 0.0
 
 
 def test_corner_of_the_opening_is_square():
-    assert sweep(PLAIN, [(-0.1, 0.64, 3.64), (0.1, 0.64, 3.64)]).passed
+    assert sweep(PLAIN, [(-0.1, 0.64, 3.64), (0.1, 0.64, 3.64)]).passes
     assert sweep(PLAIN, [(-0.1, 1.02, 4.02), (0.1, 1.02, 4.02)]).crash == FRAME
 
 
@@ -96,7 +96,7 @@ def test_misses_that_end_episodes(axis, distance, cause):
     after[axis] += distance
     high = dataclasses.replace(PLAIN, gates=(Gate((0.0, 0.0, 5.0), 0.0), PLAIN.gates[1]))
     there = sweep(high, [before, after], miss_radius=3.0)
-    assert (there.passed, there.crash) == (distance < HALF_OPENING, cause)
+    assert (there.passes, there.crash) == (distance < HALF_OPENING, cause)
     if cause == MISSED:
         assert sweep(high, [after, before], miss_radius=3.0).crash == NONE  # on the way back to try again
         assert sweep(high, [before, after], target=1, miss_radius=3.0).crash == NONE
@@ -126,6 +126,25 @@ def test_every_split_s_gate_is_passed_along_its_yaw(gate):
     assert (passed, crash) == (True, NONE)
     assert offset == pytest.approx(0, abs=1e-9)
     assert sweep(track, there[::-1], gate).crash == BACKWARDS
+
+
+CLOSE = dataclasses.replace(PLAIN, gates=tuple(Gate((x, 0.0, 3.0), 0.0) for x in (0.0, 1.2, 2.4)), decoys=())
+
+
+@pytest.mark.parametrize(
+    ("end", "passes"),
+    [(0.1, 1), (1.1, 1), (1.3, 2), (2.5, 2)],  # the third is too much for one step
+)
+def test_two_gates_in_one_step_are_two_passes(end, passes):
+    assert sweep(CLOSE, [(-0.1, 0.1, 3.0), (end, 0.1, 3.0)]) == (passes, pytest.approx(0.1), NONE)
+
+
+def test_a_second_gate_counts_in_its_turn_and_before_a_crash():
+    assert sweep(CLOSE, [(-0.1, 0, 3), (1.3, 0, 3)], target=1).passes == 1
+    assert sweep(CLOSE, [(-0.1, 0, 3), (0.6, 0, 3), (1.3, 0.9, 3)]) == (1, 0.0, FRAME)
+    path = torch.tensor([(-0.1, 0.0, 3.0), (1.3, 0.0, 3.0)]).unsqueeze(1)
+    assert GateSweeper(CLOSE, reach=1.4)(path, torch.tensor([0])).passes == 2
+    assert GateSweeper(PLAIN, reach=1.4)._two_in_reach is False
 
 
 def test_gates_that_are_not_the_target():
@@ -182,7 +201,7 @@ def test_a_lost_position_is_a_crash_of_that_drone_alone(value, axis, sample):
     path[sample, 1, axis] = value
     result = GateSweeper(PLAIN, dtype=torch.float64)(path, torch.tensor([0, 0]))
     assert result.crash.tolist() == [NONE, NON_FINITE]
-    assert result.passed.tolist() == [True, sample == 3]  # lost after the gate: the pass had been
+    assert result.passes.tolist() == [True, sample == 3]  # lost after the gate: the pass had been
     assert result.offset.tolist() == [0.0, 0.0]
 
 
@@ -224,8 +243,8 @@ def test_order_inside_one_segment():
 def test_types_and_shapes(dtype):
     path = torch.zeros(11, 5, 3, dtype=dtype)
     result = GateSweeper(PLAIN, dtype=dtype)(path, torch.zeros(5, dtype=torch.int64))
-    assert result.passed.shape == result.offset.shape == result.crash.shape == (5,)
-    assert (result.passed.dtype, result.offset.dtype, result.crash.dtype) == (torch.bool, dtype, torch.int64)
+    assert result.passes.shape == result.offset.shape == result.crash.shape == (5,)
+    assert (result.passes.dtype, result.offset.dtype, result.crash.dtype) == (torch.int64, dtype, torch.int64)
 
 
 def test_wrong_shapes_are_refused():
@@ -257,7 +276,7 @@ def test_gpu_agrees_with_cpu_and_never_synchronises():
         result = sweeper(path, target)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert torch.equal(result.passed.cpu(), expected.passed)
+    assert torch.equal(result.passes.cpu(), expected.passes)
     assert torch.equal(result.crash.cpu(), expected.crash)
     torch.testing.assert_close(result.offset.cpu(), expected.offset)
 
@@ -274,9 +293,9 @@ def test_no_crossing_is_lost_or_counted_twice(xs):
     crossings = []
     for before, after in pairwise(xs):
         result = sweep(PLAIN, [(before, 0, 3), (after, 0, 3)])
-        assert not (result.passed and result.crash)
-        if result.passed or result.crash == BACKWARDS:
-            crossings.append(1 if result.passed else -1)
+        assert not (result.passes and result.crash)
+        if result.passes or result.crash == BACKWARDS:
+            crossings.append(1 if result.passes else -1)
     assert sum(crossings) == (xs[-1] >= 0) - (xs[0] >= 0)
     assert all(a == -b for a, b in pairwise(crossings))
 
@@ -288,7 +307,7 @@ def test_a_control_step_that_ends_on_the_plane(yaw):
     centre, normal = torch.tensor(gate.position), torch.tensor(gate.forward)
     before, on, after = ((centre + distance * normal).tolist() for distance in (-0.1, 0.0, 0.1))
     first, second = sweep(track, [before, on]), sweep(track, [on, after])
-    assert first.passed != second.passed
+    assert first.passes != second.passes
     first, second = sweep(track, [after, on]), sweep(track, [on, before])
     assert (first.crash == BACKWARDS) != (second.crash == BACKWARDS)
 
@@ -297,7 +316,7 @@ def test_a_control_step_that_ends_on_the_plane(yaw):
 
 
 class Reference(NamedTuple):
-    passed: bool
+    passes: int
     offset: float
     crash: int
     doubt: float  # how near the path comes to a different answer, m or segments
@@ -306,7 +325,7 @@ class Reference(NamedTuple):
 
 def reference(track: Track, points, target: int) -> Reference:
     """The rules again, event by event, for one drone whose positions are finite."""
-    events, doubts = [], [1.0]
+    events, passes_of, doubts = [], [], [1.0]
     nearest_sample = min(abs(_in_gate_axes(gate, point)[0]) for gate in track.gates for point in points)
     for segment, (start, end) in enumerate(pairwise(points)):
         for index, gate in enumerate(track.gates):
@@ -319,11 +338,11 @@ def reference(track: Track, points, target: int) -> Reference:
             doubts += [abs(far - HALF_OPENING), abs(far - HALF_OUTER), abs(a[0] - b[0])]
             if far < HALF_OUTER:
                 if far >= HALF_OPENING:
-                    events.append((segment + fraction, FRAME, 0.0))
+                    events.append((segment + fraction, FRAME))
                 elif b[0] < a[0]:
-                    events.append((segment + fraction, BACKWARDS, 0.0))
-                elif index == target:
-                    events.append((segment + fraction, NONE, math.hypot(left, up)))
+                    events.append((segment + fraction, BACKWARDS))
+                else:
+                    passes_of.append((segment + fraction, index, math.hypot(left, up)))
         for axis in range(3):
             floor = max(track.bounds_low[2], GROUND_HEIGHT) if axis == 2 else track.bounds_low[axis]
             for limit, sign, cause in (
@@ -333,16 +352,16 @@ def reference(track: Track, points, target: int) -> Reference:
                 a, b = (sign * (point[axis] - limit) for point in (start, end))
                 doubts.append(abs(b))
                 if a >= 0 > b:
-                    events.append((segment + a / (a - b), cause, 0.0))
+                    events.append((segment + a / (a - b), cause))
     events.sort()
-    doubts += [later[0] - earlier[0] for earlier, later in pairwise(events)]
-    passed, offset = False, 0.0
-    for _, cause, distance in events:
-        if cause != NONE:
-            return Reference(passed, offset, cause, min(doubts), nearest_sample)
-        if not passed:
-            passed, offset = True, distance
-    return Reference(passed, offset, NONE, min(doubts), nearest_sample)
+    times = sorted([time for time, *_ in events] + [time for time, *_ in passes_of])
+    doubts += [later - earlier for earlier, later in pairwise(times)]
+    crash_time, cause = events[0] if events else (math.inf, NONE)
+    passes, offset = 0, 0.0
+    for time, index, distance in sorted(passes_of):
+        if time < crash_time and passes < 2 and index == (target + passes) % track.num_gates:
+            passes, offset = passes + 1, distance if passes == 0 else offset
+    return Reference(passes, offset, cause, min(doubts), nearest_sample)
 
 
 def _in_gate_axes(gate: Gate, point):
@@ -387,7 +406,7 @@ def test_agrees_with_the_reference(flight):
     inside = all(low <= x <= high for low, x, high in zip(track.bounds_low, points[0], track.bounds_high, strict=True))
     assume(inside and points[0][2] >= GROUND_HEIGHT)
     result = sweep(track, points, target)
-    assert (result.passed, result.crash) == (expected.passed, expected.crash)
+    assert (result.passes, result.crash) == (expected.passes, expected.crash)
     assert result.offset == pytest.approx(expected.offset, abs=1e-6)
 
 
@@ -404,12 +423,12 @@ def test_inside_the_outer_square_every_crossing_counts(left0, up0, left1, up1, b
     assume(min(abs(far - HALF_OUTER), abs(far - HALF_OPENING)) > 1e-9)
     forward, backward = sweep(PLAIN, [start, end], target), sweep(PLAIN, [end, start], target)
     if far > HALF_OUTER:
-        assert (forward.passed, forward.crash, backward.crash) == (False, NONE, NONE)
+        assert (forward.passes, forward.crash, backward.crash) == (False, NONE, NONE)
     elif far > HALF_OPENING:
-        assert (forward.passed, forward.crash, backward.crash) == (False, FRAME, FRAME)
+        assert (forward.passes, forward.crash, backward.crash) == (False, FRAME, FRAME)
     else:
-        assert (forward.passed, forward.crash, backward.crash) == (target == 0, NONE, BACKWARDS)
-    assert not backward.passed
+        assert (forward.passes, forward.crash, backward.crash) == (target == 0, NONE, BACKWARDS)
+    assert not backward.passes
 
 
 @given(flights(), st.data())
@@ -425,7 +444,7 @@ def test_cutting_a_segment_changes_nothing(flight, data):
     middle = [a + fraction * (b - a) for a, b in zip(points[segment], points[segment + 1], strict=True)]
     whole = sweep(track, points, target)
     cut = sweep(track, [*points[: segment + 1], middle, *points[segment + 1 :]], target)
-    assert (cut.passed, cut.crash) == (whole.passed, whole.crash)
+    assert (cut.passes, cut.crash) == (whole.passes, whole.crash)
     assert cut.offset == pytest.approx(whole.offset, abs=1e-6)
 
 
@@ -439,8 +458,9 @@ def test_cutting_a_control_step_in_two_changes_nothing(flight, data):
     whole, first, second = (sweep(track, part, target) for part in (points, points[: cut + 1], points[cut:]))
     if first.crash:
         assert whole == first
-    elif first.passed:
-        assert whole.passed
+    elif first.passes:
+        rest = sweep(track, points[cut:], (target + first.passes) % track.num_gates)
+        assert whole.passes == min(2, first.passes + rest.passes)
         assert (whole.offset, whole.crash) == (first.offset, second.crash)
     else:
         assert whole == second
@@ -457,7 +477,7 @@ def test_moving_track_and_path_together_changes_nothing(points, turn, shift, lif
     wide = {"bounds_low": (-100.0, -100.0, 0.0), "bounds_high": (100.0, 100.0, 100.0)}
     here = sweep(dataclasses.replace(PLAIN, **wide), points)
     there = sweep(dataclasses.replace(PLAIN, gates=gates, **wide), [_out_of_gate_axes(mover, p) for p in points])
-    assert (here.passed, here.crash) == (there.passed, there.crash)
+    assert (here.passes, here.crash) == (there.passes, there.crash)
     assert here.offset == pytest.approx(there.offset, abs=1e-6)
 
 
@@ -480,6 +500,6 @@ def test_drones_together_are_drones_alone(seed, num_drones):
     sweeper = GateSweeper(track, dtype=torch.float64)
     together = sweeper(path, target)
     alone = [sweeper(path[:, [n]], target[[n]]) for n in range(num_drones)]
-    assert torch.equal(together.passed, torch.cat([result.passed for result in alone]))
+    assert torch.equal(together.passes, torch.cat([result.passes for result in alone]))
     assert torch.equal(together.crash, torch.cat([result.crash for result in alone]))
     torch.testing.assert_close(together.offset, torch.cat([result.offset for result in alone]))

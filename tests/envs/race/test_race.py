@@ -68,7 +68,7 @@ def test_progress_and_body_rate():
     outcome = fly(race, (0, 0, 1.35), (0.3, 0, 1.35), rates=(0.0, 3.0, 4.0))
     assert outcome.reward_base.item() == pytest.approx(0.3)
     assert outcome.body_rate_norm.item() == pytest.approx(5.0)
-    assert not (outcome.terminated | outcome.truncated | outcome.passed | outcome.finished).item()
+    assert not (outcome.terminated | outcome.truncated | (outcome.passes > 0) | outcome.finished).item()
     assert outcome.crash.item() == CrashCause.NONE
 
 
@@ -173,12 +173,29 @@ def test_the_last_lap_in_the_last_step():
     assert (outcome.truncated.item(), outcome.finished.item()) == (True, True)
 
 
+def test_two_gates_in_one_step_are_two_passes():
+    gates = tuple(dataclasses.replace(CIRCLE.gates[0], position=(x, 0.0, 1.35), yaw_degrees=0.0) for x in (0, 1, 2))
+    race = Race(dataclasses.replace(CIRCLE, gates=gates), 1, dtype=torch.float64, laps=2, control_dt=0.1)
+    race.begin(torch.tensor([True]), torch.tensor([[-0.1, 0.0, 1.35]]), torch.tensor([2]))
+    back = (-0.1, -3.0, 1.35), (-0.1, 0.0, 1.35)  # round the frames
+    outcome = fly(race, (1.9, 0, 1.35), (2.1, 0, 1.35), (2.1, -3.0, 1.35), *back)
+    assert (outcome.passes.item(), outcome.target_gate.item()) == (1, 0)
+    outcome = fly(race, back[1], (1.1, 0, 1.35))
+    assert (outcome.passes.item(), outcome.gates_passed.item(), outcome.target_gate.item()) == (2, 3, 2)
+    assert (outcome.reward_base.item(), outcome.lap_time.item()) == (20.0, pytest.approx(0.2))
+    fly(race, (1.1, 0, 1.35), (1.9, 0, 1.35))
+    outcome = fly(race, (1.9, 0, 1.35), (2.1, 0, 1.35), (2.1, -3.0, 1.35), *back, (0.1, 0, 1.35))
+    assert (outcome.passes.item(), outcome.gates_passed.item(), outcome.lap_time.item()) == (2, 5, 0.0)
+    outcome = fly(race, (0.1, 0, 1.35), (1.1, 0, 1.35))
+    assert (outcome.finished.item(), outcome.lap_time.item()) == (True, pytest.approx(0.3))
+
+
 def test_a_crash_behind_the_finish_is_a_crash():
     race = begin(laps=1)
     for gate in range(3):
         fly(race, *through(gate))
     outcome = fly(race, *through(3), (0, -4, 0.01))
-    assert (outcome.passed.item(), outcome.gates_passed.item()) == (True, 4)
+    assert (outcome.passes.item(), outcome.gates_passed.item()) == (1, 4)
     assert outcome.lap_time.item() == pytest.approx(0.08)  # the lap was flown
     assert (outcome.finished.item(), outcome.truncated.item(), outcome.terminated.item()) == (False, False, True)
     assert (outcome.reward_base.item(), outcome.body_rate_norm.item()) == (-4.0, 0.0)
@@ -214,7 +231,7 @@ def test_an_invalid_action_voids_the_step():
     race = begin()
     outcome = fly(race, *through(0), (4, 0.1, 0.01), invalid=True)
     assert outcome.crash.item() == CrashCause.INVALID_ACTION
-    assert (outcome.passed.item(), outcome.gates_passed.item(), outcome.gate_offset.item()) == (False, 0, 0.0)
+    assert (outcome.passes.item(), outcome.gates_passed.item(), outcome.gate_offset.item()) == (0, 0, 0.0)
     assert (outcome.terminated.item(), outcome.reward_base.item()) == (True, -4.0)
 
 
@@ -277,7 +294,7 @@ def test_any_flight_keeps_the_books(seed):
     alone = [run([n]) for n in range(8)]
     passes = torch.zeros(8, dtype=torch.int64)
     for step, outcome in enumerate(together):
-        passes += outcome.passed
+        passes += outcome.passes
         assert torch.equal(outcome.gates_passed, passes)
         assert torch.equal(outcome.target_gate, (target + passes) % 4)
         assert torch.equal(outcome.terminated, outcome.crash != 0)

@@ -11,7 +11,7 @@ GATE = torch.tensor([[10.0, 0.0, 0.0]])
 RATES = torch.tensor([[1.0, 2.0, 2.0]])  # norm 3
 
 
-def reward(previous, position, passed=False, crashed=False, weights=None, rates=RATES):
+def reward(previous, position, passes=0, crashed=False, weights=None, rates=RATES):
     """Reward one drone."""
     base, rate = race_reward(
         weights or RewardWeights(),
@@ -19,7 +19,7 @@ def reward(previous, position, passed=False, crashed=False, weights=None, rates=
         torch.tensor([previous]),
         torch.tensor([position]),
         rates,
-        torch.tensor([passed]),
+        torch.tensor([passes]),
         torch.tensor([crashed]),
     )
     return base.item(), rate.item()
@@ -43,12 +43,12 @@ def test_progress_is_the_decrease_of_the_distance(previous, position, progress):
 
 
 def test_a_pass_replaces_progress_and_the_rate_term():
-    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passed=True) == (10.0, 0.0)
+    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=1) == (10.0, 0.0)
 
 
-@pytest.mark.parametrize("passed", [False, True])
-def test_a_crash_outweighs_everything(passed):
-    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passed=passed, crashed=True) == (-4.0, 0.0)
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_crash_outweighs_everything(passes):
+    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=passes, crashed=True) == (-4.0, 0.0)
 
 
 def test_a_crash_hides_lost_numbers():
@@ -61,7 +61,7 @@ def test_weights():
     flight = ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
     # The rate term is left to the caller, so b₂ changes neither part.
     assert reward(*flight, weights=weights) == (pytest.approx(0.4), pytest.approx(3.0))
-    assert reward(*flight, weights=weights, passed=True) == (7.0, 0.0)
+    assert reward(*flight, weights=weights, passes=1) == (7.0, 0.0)
     assert reward(*flight, weights=weights, crashed=True) == (-1.0, 0.0)
 
 
