@@ -56,9 +56,7 @@ class MetricsLog:
         self.path = RunDirectory(run_dir).metrics
         self.loggers = list(loggers)
         if tensorboard:
-            from torchrl.record.loggers.tensorboard import TensorboardLogger
-
-            self.loggers.append(TensorboardLogger(exp_name="tensorboard", log_dir=str(run_dir)))
+            self.loggers.append(_tensorboard(run_dir, resume_env_steps))
         self._mean = RunningMean()
         self._columns = [X_AXIS]
         if resume_env_steps is None:
@@ -98,6 +96,8 @@ class MetricsLog:
         for sink in self.loggers:
             for name, value in values.items():
                 sink.log_scalar(name, value, step=env_steps)
+            if flush := getattr(sink.experiment, "flush", None):
+                flush()
         return values
 
     def close(self) -> None:
@@ -138,6 +138,19 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
     """Read the complete rows."""
     header, rows, _ = read_rows(path)
     return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def _tensorboard(run_dir: Path, resume_env_steps: int | None) -> Logger:
+    """Make the logger of a run's TensorBoard files; what they hold beyond a run's resumption is not shown any more."""
+    from torch.utils.tensorboard import SummaryWriter
+    from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+    class ResumingLogger(TensorboardLogger):
+        def _create_experiment(self) -> SummaryWriter:
+            purge_step = None if resume_env_steps is None else resume_env_steps + 1
+            return SummaryWriter(log_dir=str(run_dir / self.exp_name), purge_step=purge_step)
+
+    return ResumingLogger(exp_name="tensorboard", log_dir=str(run_dir))
 
 
 def _keep_aside(path: Path) -> None:

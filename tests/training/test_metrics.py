@@ -110,6 +110,34 @@ def test_a_new_run_keeps_the_old_file(tmp_path):
     assert read(tmp_path)[0]["a"] == "3"
 
 
+def test_tensorboard_shows_a_resumed_run_once(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    def fly(resume: int | None, value: float, steps: list[int]) -> None:
+        with MetricsLog(tmp_path, tensorboard=True, resume_env_steps=resume) as log:
+            for step in steps:
+                log.push({"loss": value})
+                log.write(step)
+
+    fly(None, 1.0, [100, 200, 300])
+    fly(200, 2.0, [250, 350])
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(event.step, event.value) for event in events.Scalars("loss")] == [(100, 1), (200, 1), (250, 2), (350, 2)]
+
+
+def test_tensorboard_is_written_row_by_row(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = MetricsLog(tmp_path, tensorboard=True)
+    log.push({"loss": 1.0})
+    log.write(100)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()  # as TensorBoard does while the run goes on
+    assert len(events.Scalars("loss")) == 1
+    log.close()
+
+
 def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from torchrl.record.loggers.csv import CSVLogger
