@@ -105,7 +105,7 @@ def measure(
 ) -> dict[str, Any]:
     """Time updates of one configuration; return one record."""
     torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision("medium")
+    torch.set_float32_matmul_precision("high")
     config = LearnerConfig(mixed_precision=mixed_precision, compile="compile" in backend, cuda_graph="graph" in backend)
     losses = LossConfig(world_model=loss, actor=actor)
     interface = interface_of(image_size)
