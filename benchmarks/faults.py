@@ -38,9 +38,9 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [
     "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4",
-    "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=1200",
-    "evaluation.every=800", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=400",
-    "checkpoint.keep=2", "logger.every=400", "logger=csv", "device=cpu", "total_env_steps=2400",
+    "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=600",
+    "evaluation.every=400", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=200",
+    "checkpoint.keep=2", "logger.every=200", "logger=csv", "device=cpu", "total_env_steps=1200",
 ]  # fmt: skip
 KINDS = ("kill", "rename", "fsync", "damage", "disk", "clock", "not_finite")
 CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
@@ -82,7 +82,7 @@ step, steps = DroneRacingEnv._step, []
 def poisoned(env, tensordict):
     steps.append(0)
     data = step(env, tensordict)
-    return data if len(steps) < 300 else data.set("reward_base", data["reward_base"] + float("inf"))
+    return data if len(steps) < 150 else data.set("reward_base", data["reward_base"] + float("inf"))
 DroneRacingEnv._step = poisoned
 """
 
@@ -171,7 +171,7 @@ class Arena:
     def damages(self) -> Iterator[dict[str, Any]]:
         """Damage each file of the newest of two checkpoints, and go on."""
         stopped = self._name()
-        self._run(f"run_dir={stopped}", *SETTINGS, "total_env_steps=1600")
+        self._run(f"run_dir={stopped}", *SETTINGS, "total_env_steps=800")
         newest = latest_checkpoint(self._folder / stopped)
         files = sorted(path.relative_to(newest) for path in newest.rglob("*") if path.is_file())
         for file in files:
@@ -182,7 +182,7 @@ class Arena:
             middle = len(content) // 2
             content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
             path.write_bytes(content)
-            done = self._run(f"resume={name}", "total_env_steps=2400")
+            done = self._run(f"resume={name}", "total_env_steps=1200")
             named = "is damaged" in done.stderr or "not complete" in done.stderr
             yield self._verdict("damage", str(file), name, "" if named else "the damage was not said")
 
@@ -271,7 +271,7 @@ def state_of(run_dir: Path) -> dict[str, Any]:
         name = path.relative_to(newest).as_posix()
         if path.suffix == ".pt":
             found[name] = torch.load(path, weights_only=True)
-        elif path.suffix in (".bin", ".json") and path.name not in ("manifest.json", CHECKSUMS):
+        elif path.suffix in (".zst", ".json") and path.name not in ("manifest.json", CHECKSUMS):
             found[name] = path.read_bytes()
     return found
 

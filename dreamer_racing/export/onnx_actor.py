@@ -14,6 +14,7 @@ import argparse
 import hashlib
 import json
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -28,6 +29,21 @@ CONTRACT = "contract.json"
 FORMAT, FORMAT_VERSION = "dreamer_racing.actor", 1
 RECURRENT = ("h", "z", "previous_action")
 WARM_UP_STEPS = 20
+
+_TENSOR = {"name": str, "shape": [int], "type": str}
+_LAYOUT = {
+    "inputs": [_TENSOR],
+    "outputs": [_TENSOR],
+    "files": {"onnx": {"sha256": str}, "weights?": {"name": str, "sha256": str}},
+    "model": {},
+    "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
+    "control": {"rate_hz": float},
+    "source": {},
+    "camera?": {"width_px": int, "height_px": int, "vertical_field_of_view_deg": float, "tilt_up_deg": float},
+}
+"""What is read of a contract: keys and types of values; of a list, what each entry is. ``?``: may be absent or null."""
+_TYPES = ("uint8", "float32", "bool")
+_MOST = 100_000_000  # values of one input
 
 
 class RecurrentActor:
@@ -179,7 +195,7 @@ def read_contract(path: str | Path) -> dict[str, Any]:
         raise FileNotFoundError(f"There is no {path}: it belongs beside the .onnx file, from the same export.")
     try:
         contract = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}.") from error
     found = (contract.get("format"), contract.get("format_version")) if isinstance(contract, dict) else (None, None)
     if found != (FORMAT, FORMAT_VERSION):
@@ -187,9 +203,53 @@ def read_contract(path: str | Path) -> dict[str, Any]:
             f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, version {FORMAT_VERSION}. "
             "Use the onnx_actor.py of the release that exported it, or export again."
         )
-    if absent := [key for key in ("inputs", "outputs", "files", "model", "action") if key not in contract]:
-        raise ValueError(f"{path} lacks {', '.join(absent)}: copy it from the export again.")
+    if misfit := _unlike(contract, _LAYOUT, "") or _unfit_inputs(contract):
+        raise ValueError(f"{path}: {misfit}. Copy it from the export again.")
     return contract
+
+
+def _unlike(value: Any, layout: Any, name: str) -> str:
+    """Say where a value is not laid out as it should be; nothing if it is."""
+    if isinstance(layout, dict):
+        if not isinstance(value, dict):
+            return f"{name} is {_short(value)}, not an object"
+        wanted = {
+            key.removesuffix("?"): inner for key, inner in layout.items() if key[-1] != "?" or value.get(key[:-1])
+        }
+        if absent := wanted.keys() - value.keys():
+            return f"{name or 'it'} lacks {', '.join(sorted(absent))}"
+        parts = [(value[key], inner, f"{name}.{key}".lstrip(".")) for key, inner in wanted.items()]
+    elif isinstance(layout, list):
+        if not isinstance(value, list) or not value:
+            return f"{name} is {_short(value)}, not a list of something"
+        parts = [(entry, layout[0], f"{name}[{index}]") for index, entry in enumerate(value)]
+    else:
+        fits = isinstance(value, (int, float) if layout is float else layout) and not isinstance(value, bool)
+        if not fits or (layout is float and not abs(value) < 1e9):
+            kinds = {float: "a number", int: "a whole number", str: "a text"}
+            return f"{name} is {_short(value)}, not {kinds[layout]}"
+        return ""
+    return next(filter(None, (_unlike(*part) for part in parts)), "")
+
+
+def _unfit_inputs(contract: dict[str, Any]) -> str:
+    """Say which input no actor has; nothing if all can be."""
+    inputs = {entry["name"]: entry for entry in contract["inputs"]}
+    if absent := [name for name in (*RECURRENT, "is_init") if name not in inputs]:
+        return f"inputs lacks {', '.join(absent)}"
+    for name, entry in inputs.items():
+        if entry["type"] not in _TYPES:
+            return f"the input {_short(name)} is of type {_short(entry['type'])}, not {', '.join(_TYPES)}"
+        if min(entry["shape"]) < 1 or math.prod(entry["shape"]) > _MOST:
+            return f"the input {_short(name)} has the shape {_short(entry['shape'])}"
+    rate = contract["control"]["rate_hz"]
+    return "" if rate > 0 else f"control.rate_hz is {rate}, not above 0"
+
+
+def _short(value: Any) -> str:
+    """A value as Python writes it, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def hash_file(path: str | Path) -> str:

@@ -432,6 +432,15 @@ def spoil(key: str, value: object):
     return write
 
 
+def spoil_input(number: int, key: str, value: object):
+    def write(path: Path) -> None:
+        contract = json.loads(path.read_text())
+        contract["inputs"][number][key] = value
+        path.write_text(json.dumps(contract))
+
+    return write
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -440,9 +449,21 @@ def spoil(key: str, value: object):
         (lambda path: path.write_text("[]"), ValueError, "format None"),
         (spoil("format_version", 2), ValueError, "version 2"),
         (spoil("files", {"onnx": {"name": "actor.onnx", "sha256": "0"}}), ValueError, "SHA-256"),
-        (spoil("outputs", [{"name": "thrust", "shape": [1, 4]}]), ValueError, "promises .*thrust"),
+        (spoil("outputs", [{"name": "thrust", "shape": [1, 4], "type": "f"}]), ValueError, "promises .*thrust"),
+        (spoil("files", {"onnx": 3}), ValueError, "files.onnx is 3, not an object"),
+        (
+            spoil("action", {"channels": [{"name": "x", "unit": "m", "offset": 0}]}),
+            ValueError,
+            "channels.0. lacks scale",
+        ),
+        (spoil("control", {"rate_hz": float("nan")}), ValueError, "rate_hz is nan, not a number"),
+        (spoil("control", {"rate_hz": -25}), ValueError, "rate_hz is -25, not above 0"),
+        (spoil("control", None), ValueError, "control is None, not an object"),
+        (spoil("inputs", [{"name": "h", "shape": [1], "type": "float32"}]), ValueError, "inputs lacks z, previous"),
+        (spoil_input(0, "shape", [2**40]), ValueError, "has the shape .1099511627776"),
+        (spoil_input(0, "type", "object"), ValueError, "is of type 'object', not uint8"),
+        (lambda path: path.write_text("[" * 100_000), ValueError, "not valid JSON"),
     ],
-    ids=["missing", "json", "other", "version", "hash", "outputs"],
 )
 def test_a_contract_of_another_file_is_refused(exported: Path, tmp_path: Path, change, error, words: str) -> None:
     for name in ("actor.onnx", "contract.json"):

@@ -1,0 +1,355 @@
+"""Input that nobody means: 100,000 cases at tracks, actions, contracts, overrides and checkpoints.
+
+    OMP_NUM_THREADS=1 python benchmarks/fuzz.py --json results/fuzz.json
+
+Each kind of input has a process of its own. A case is either taken or refused by the errors that are promised for it;
+everything else fails it: another error, more than 10 s, a process that dies. An audit hook fails what starts a process,
+opens a connection or writes outside the case's folder.
+
+* `tracks`: track files with turned bytes, pieces of text moved about, and values replaced in their structure; of those
+  taken, every hundredth is flown.
+* `actions`: 256 drones at once, fed float32 of random bits, NaN, infinities and huge numbers; a case is a drone's step.
+* `contracts`: `contract.json` of a shipped agent, treated as the tracks are; every twentieth with its actor.
+* `overrides`: one to three settings of `recipes/dreamer_v3.py` with values of any kind, composed, resolved and checked.
+* `checkpoints`: turned bytes and cut files in a checkpoint, half of them with checksums that fit again.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import os
+import platform
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+import yaml
+from hydra.errors import HydraException
+from measuring import print_table, write_json
+from omegaconf import OmegaConf
+from torchrl.envs import InitTracker, TransformedEnv
+
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.export.onnx_actor import OnnxActor, read_contract
+from dreamer_racing.training.checkpoint import CHECKSUMS, RunCheckpointError, RunCheckpoints, _checksum
+from dreamer_racing.training.directory import latest_checkpoint
+
+ROOT = Path(__file__).parents[1]
+TRACKS = ROOT / "dreamer_racing" / "envs" / "tracks"
+AGENT = ROOT / "agents" / "kidney"
+CASES = {"tracks": 40_000, "actions": 40_960, "contracts": 16_000, "overrides": 2_000, "checkpoints": 2_000}
+SECONDS = 10
+DRONES = 256
+ODD: tuple[Any, ...] = (
+    None, True, "", "x" * 3000, "\0", "é", "1e400", "nan", -1, 0, 1, 2**40, 10**30, -(10**30), 1e-300, 1e300, -1e300,
+    math.nan, math.inf, -math.inf, [], {}, [[[[]]]], [0.0] * 5000, {"a": {"b": None}},
+)  # fmt: skip
+PIECES = (
+    "&a [*a, *a]", "!!python/object/apply:os.system ['true']", "!!python/name:os.system", "<<: *a", "? [1]", "%YAML 9",
+    "---\n", "- ", ": ", "{", "}", "[", "]", "\t", "\x00", "#" * 99, "1e999", ".nan", "0x7f", "2001-01-01", "~", "'",
+)  # fmt: skip
+FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "socket.bind")
+
+
+class EscapedError(BaseException):
+    """A case did what no input may make the program do; nobody catches this by accident."""
+
+
+class HangError(BaseException):
+    """A case took too long."""
+
+
+def watch(folder: Path) -> None:
+    """From now on fail what starts processes, opens connections or writes outside a folder."""
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in FORBIDDEN:
+            raise EscapedError(f"{event}{arguments}")
+        if event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
+            path, mode, flags = arguments
+            writes = any(letter in (mode or "") for letter in "wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR)
+            inside = Path(os.fsdecode(path)).absolute().is_relative_to(folder)
+            if writes and not inside and os.fsdecode(path) != os.devnull and "__pycache__" not in os.fsdecode(path):
+                raise EscapedError(f"opens {path!r} for writing")
+
+    sys.addaudithook(hook)
+
+
+def twist(text: str, draw: random.Random) -> bytes:
+    """Turn bytes of a text, or move, drop, double and insert pieces."""
+    content = bytearray(text.encode())
+    for _ in range(draw.randint(1, 4)):
+        start = draw.randrange(len(content) + 1)
+        end = min(len(content), start + draw.choice((1, 2, 8, 40)))
+        way = draw.randrange(5)
+        if way == 0 and start < len(content):
+            content[start] = draw.randrange(256)
+        elif way == 1:
+            del content[start:end]
+        elif way == 2:
+            content[start:start] = content[start:end] * draw.choice((1, 2, 50))
+        elif way == 3:
+            content[start:end] = draw.choice(PIECES).encode()
+        else:
+            piece = content[start:end]
+            del content[start:end]
+            at = draw.randrange(len(content) + 1)
+            content[at:at] = piece
+    return bytes(content)
+
+
+def replace_somewhere(value: Any, draw: random.Random) -> Any:
+    """Replace, drop or double something at any depth of a structure of lists and dictionaries."""
+    if not isinstance(value, dict | list) or not value or draw.random() < 0.1:
+        return draw.choice(ODD)
+    key = draw.choice(list(value) if isinstance(value, dict) else range(len(value)))
+    way = draw.random()
+    if way < 0.1:
+        del value[key]
+    elif way < 0.2 and isinstance(value, list):
+        value.extend([value[key]] * draw.choice((1, 5, 300)))
+    elif way < 0.3 and isinstance(value, dict):
+        value[draw.choice(("name", "gates", "x", "", 7))] = draw.choice(ODD)
+    else:
+        value[key] = replace_somewhere(value[key], draw)
+    return value
+
+
+def tracks(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield cases that load a spoilt track file."""
+    texts = [path.read_text(encoding="utf-8") for path in sorted(TRACKS.glob("*.yaml"))]
+    file = folder / "track.yaml"
+
+    def case() -> bool:
+        text = draw.choice(texts)
+        structure = draw.random() < 0.5
+        spoilt = yaml.safe_dump(replace_somewhere(yaml.safe_load(text), draw)).encode() if structure else b""
+        file.write_bytes(spoilt or twist(text, draw))
+        try:
+            track = load_track(file)
+        except TrackError:
+            return False
+        if draw.random() < 0.01:
+            worlds = RaceWorlds(track, 2, from_pixels=False)
+            worlds.reset()
+            worlds.step(torch.zeros(2, 4))
+        return True
+
+    while True:
+        yield case
+
+
+def actions(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield cases, each a step of `DRONES` drones."""
+    generator = torch.Generator().manual_seed(draw.randrange(2**31))
+    env = DroneRacingEnv("kidney", num_envs=DRONES, from_pixels=False, seed=0)
+    carrier = env.reset()
+
+    def case() -> bool:
+        nonlocal carrier
+        bits = torch.randint(-(2**31), 2**31, (DRONES, 4), generator=generator).int().view(torch.float32)
+        tame = torch.rand(DRONES, 4, generator=generator) * 2 - 1
+        wild = torch.rand(DRONES, 1, generator=generator) < 0.3
+        action = torch.where(wild, bits, tame)
+        done, carrier = env.step_and_maybe_reset(carrier.set("action", action))
+        invalid = ~action.isfinite().all(-1)
+        said = done["next", "race", "crash"].squeeze(-1) == CrashCause.INVALID_ACTION
+        assert torch.equal(invalid, said), "an action that is not finite is a crash of that name, no other is"
+        assert done["next", "reward"].isfinite().all(), "a reward is not finite"
+        assert carrier["privileged", "position"].isfinite().all(), "a position is not finite"
+        return True
+
+    while True:
+        yield case
+
+
+def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield cases that read a spoilt contract."""
+    text = (AGENT / "contract.json").read_text(encoding="utf-8")
+    shutil.copytree(AGENT, folder, dirs_exist_ok=True)
+    file = folder / "contract.json"
+
+    def case() -> bool:
+        structure = draw.random() < 0.5
+        spoilt = json.dumps(replace_somewhere(json.loads(text), draw)).encode() if structure else twist(text, draw)
+        file.write_bytes(spoilt)
+        try:
+            OnnxActor(folder / "actor.onnx") if draw.random() < 0.05 else read_contract(file)
+        except (ValueError, FileNotFoundError):
+            return False
+        return True
+
+    while True:
+        yield case
+
+
+def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield cases that compose, resolve and check a configuration."""
+    sys.path.insert(0, str(ROOT / "recipes"))
+    from composing import checks, command_line, entry, schema
+    from dreamer_v3 import resolve
+
+    schema.register()
+    config_dir = str(ROOT / "recipes" / "config")
+    with hydra.initialize_config_dir(config_dir, version_base="1.3"):
+        names = entry.setting_names(hydra.compose("dreamer_v3"))
+    os.chdir(folder)
+
+    def value() -> str:
+        odd = draw.choice(ODD)
+        text = odd if isinstance(odd, str) else json.dumps(odd)
+        return draw.choice((text[:200], str(draw.randint(-3, 3)), str(draw.uniform(-2, 2)), "1e6", draw.choice(PIECES)))
+
+    def case() -> bool:
+        chosen = draw.choices(names, k=draw.choice((1, 1, 1, 2, 3)))
+        given = [f"{draw.choice(('',) * 8 + ('+', '~'))}{name}={value()}" for name in chosen]
+        given = ["device=cpu", *(entry.whole_number(override) for override in given)]
+        quiet = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), command_line.plain_errors():
+                entry.refuse_unknown_settings(given, "dreamer_v3")
+                with hydra.initialize_config_dir(config_dir, version_base="1.3"):
+                    config = hydra.compose("dreamer_v3", overrides=given)
+                checks.check_overrides(config, given)
+                checks.check_dreamer(OmegaConf.to_object(resolve(config)))
+        except HydraException as error:
+            return not entry.in_plain_words(error, "dreamer_v3", given)
+        except SystemExit as refused:
+            if refused.code == 2:
+                return False
+            raise
+        return True
+
+    while True:
+        yield case
+
+
+def checkpoints(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield cases that restore a damaged checkpoint."""
+
+    def run(place: Path) -> RunCheckpoints:
+        learner = torch.nn.Linear(30, 30)
+        parts = {"learner": learner, "replay": make_replay(200, 2, 4, 5), "counters": {"env_steps": 0}}
+        return RunCheckpoints(place, parts)
+
+    first = run(folder / "whole")
+    env = TransformedEnv(DroneRacingEnv("kidney", num_envs=2, seed=0), InitTracker())
+    first.components["replay"].extend(env.rollout(20, break_when_any_done=False))
+    env.close()
+    saved = first.save(10)
+    files = sorted(path.relative_to(saved) for path in saved.rglob("*") if path.is_file())
+
+    def case() -> bool:
+        place = folder / "damaged"
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(folder / "whole", place)
+        newest = latest_checkpoint(place)
+        path = newest / draw.choice(files)
+        content = bytearray(path.read_bytes())
+        if draw.random() < 0.3:
+            del content[draw.randrange(len(content)) :]
+        for _ in range(draw.choice((1, 1, 16))):
+            if content:
+                content[draw.randrange(len(content))] = draw.randrange(256)
+        path.write_bytes(content)
+        if draw.random() < 0.5:
+            sums = {name.as_posix(): _checksum(newest / name) for name in files if name.name != CHECKSUMS}
+            (newest / CHECKSUMS).write_text(json.dumps(sums))
+        try:
+            run(place).load()
+        except (FileNotFoundError, RunCheckpointError):
+            return False
+        return True
+
+    while True:
+        yield case
+
+
+KINDS = {
+    "tracks": tracks,
+    "actions": actions,
+    "contracts": contracts,
+    "overrides": overrides,
+    "checkpoints": checkpoints,
+}
+
+
+def attack(kind: str, cases: int, seed: int) -> dict[str, Any]:
+    """Go through the cases of a kind; return how many were taken, refused, and failed how."""
+    draw = random.Random(f"{kind} {seed}")
+    counts: Counter[str] = Counter()
+    failures: list[str] = []
+
+    def late(*_: Any) -> None:
+        raise HangError(f"more than {SECONDS} s")
+
+    signal.signal(signal.SIGALRM, late)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        each = DRONES if kind == "actions" else 1
+        ways = KINDS[kind](draw, folder)
+        case = next(ways)
+        case()  # what is loaded on first use is loaded before the watch begins
+        platform.processor()  # asks a process, once
+        watch(folder)
+        for number in range(cases // each):
+            signal.setitimer(signal.ITIMER_REAL, SECONDS)
+            try:
+                counts["taken" if case() else "refused"] += each
+            except (Exception, EscapedError, HangError, SystemExit):
+                counts["failed"] += each
+                failures.append(f"case {number}: {traceback.format_exc()[-1500:]}")
+            finally:
+                signal.setitimer(signal.ITIMER_REAL, 0)
+    return {"kind": kind, "cases": sum(counts.values()), **counts, "failures": failures[:20]}
+
+
+def main() -> None:
+    """Attack by every kind, each in a process of its own."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--share", type=float, default=1.0, help="of the cases of each kind")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    if arguments.child:
+        (kind,) = arguments.kinds
+        print(json.dumps(attack(kind, round(arguments.share * CASES[kind]), arguments.seed)))
+        return
+    records = []
+    for kind in arguments.kinds:
+        command = [sys.executable, __file__, "--child", "--kinds", kind]
+        command += ["--share", str(arguments.share), "--seed", str(arguments.seed)]
+        done = subprocess.run(command, text=True, capture_output=True, check=False)
+        died = done.returncode != 0
+        found = (
+            {"kind": kind, "failed": 1, "failures": [done.stderr[-1500:]]}
+            if died
+            else json.loads(done.stdout.splitlines()[-1])
+        )
+        records.append({"benchmark": "fuzz", "taken": 0, "refused": 0, "failed": 0, **found})
+    print_table(records, ("kind", "cases", "taken", "refused", "failed"))
+    for record in records:
+        print("\n".join(record["failures"]))
+    write_json(records, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
