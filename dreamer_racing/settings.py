@@ -12,16 +12,15 @@ ALLOWED = "allowed"
 
 
 class Range(NamedTuple):
-    """Allowed values of a setting: a whole interval, or one without its lower end."""
+    """Allowed values of a setting, finite ones: a whole interval, or one without its lower end."""
 
     low: float
     high: float = math.inf
     open_below: bool = False
 
     def __contains__(self, value: object) -> bool:
-        return isinstance(value, (int, float)) and (
-            self.low < value <= self.high if self.open_below else self.low <= value <= self.high
-        )
+        above = isinstance(value, (int, float)) and (self.low < value if self.open_below else self.low <= value)
+        return above and value < math.inf and value <= self.high
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -60,7 +59,8 @@ def check_settings(config: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
         elif allowed is not None and value is not None and value not in allowed:
-            raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}.")
+            finite = ", and finite" if value == math.inf else ""
+            raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}{finite}.")
 
 
 def shortened(text: str, length: int = 80) -> str:

@@ -39,6 +39,7 @@ def test_bad_input_gets_a_plain_error(overrides: list[str], words: list[str], tm
 
 REFUSED = [
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
+    (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
     (["prefill=4000", "total_env_steps=4000"], ["total_env_steps=4000", "above prefill=4000"]),
     (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
