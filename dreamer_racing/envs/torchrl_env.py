@@ -29,7 +29,7 @@ class DroneRacingEnv(EnvBase):
         from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        seed: of start poses and of the randomisation of physics and looks.
+        seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
         worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
 
     Attributes:
