@@ -7,6 +7,7 @@ counted in segments (1.5 is the middle of the second segment):
 
 * a race gate's plane is crossed inside the frame's outer square: through the margin-reduced opening in the direction
   of flight (a pass if it is the target gate, else nothing), through it backwards (crash), or anywhere else (crash);
+* a frame is touched from whatever side: it is a box as deep as the frame, around the margin-reduced opening (crash);
 * if misses end episodes: the target gate's plane is crossed in the direction of flight beside its frame (crash);
 * the free box is left: the ground at 0.05 m, or the track's bounding box (crash);
 * the position is not finite (crash).
@@ -42,6 +43,9 @@ class CrashCause(enum.IntEnum):
     NON_FINITE_STATE = 5
     INVALID_ACTION = 6
     GATE_MISSED = 7
+
+
+_PARALLEL = 1e-30  # m: stands for a way of zero, by which nothing can be divided
 
 
 class GateSweep(NamedTuple):
@@ -114,6 +118,7 @@ class GateSweeper:
         )
         self._half_opening = track.shape.pass_half_width
         self._half_outer = track.shape.outer / 2
+        self._half_depth = track.shape.depth / 2
         if miss_radius and not miss_radius > self._half_outer:
             raise ValueError(
                 f"miss_radius={miss_radius}: a gate is missed beyond its frame, more than {self._half_outer:g} m from "
@@ -125,6 +130,14 @@ class GateSweeper:
             math.dist(gate.position, after.position) < reach + track.shape.outer
             for gate, after in zip(track.gates, (*track.gates[1:], track.gates[0]), strict=True)
         )
+
+        self._picks = torch.device(device).type == "cpu"  # elsewhere picking drones out would wait for the device
+        # Half the sides of a gate's bounding box along the world's axes.
+        across, along = self._half_outer * sin.abs(), self._half_outer * cos.abs()
+        half_x, half_y = across + self._half_depth * cos.abs(), along + self._half_depth * sin.abs()
+        half = torch.stack((half_x, half_y, torch.full_like(x, self._half_outer)))  # (3, G)
+        centre = torch.stack((x, y, z))
+        self._frame_low, self._frame_high = ((centre + side * half).to(dtype).unsqueeze(-1) for side in (-1, 1))
 
         low_x, low_y, low_z = track.bounds_low
         floor = max(low_z, GROUND_HEIGHT)
@@ -170,7 +183,7 @@ class GateSweeper:
         through = crossings.crossed & (offset < self._half_opening)
         into_frame = crossings.crossed & (offset < self._half_outer) & ~through
         pass_time, pass_offset = self._first_pass(crossings, through, target_gate)
-        frame = _first(into_frame, crossings.time)
+        frame = torch.minimum(_first(into_frame, crossings.time), self._touch_frames(position, segment))
         backwards = _first(through & ~crossings.forward, crossings.time)
         non_finite = _first(~(finite[:-1] & finite[1:]), segment)
         # rows in the order of `_causes`
@@ -191,11 +204,7 @@ class GateSweeper:
 
     def _cross_gates(self, position: torch.Tensor, segment: torch.Tensor) -> _Crossings:
         """Intersect every segment with every race gate's plane; position is (3, P + 1, N)."""
-        x, y, z = position.unbind(0)
-        # (P + 1, N) -> (G, P + 1, N)
-        forward = x * self._cos + y * self._sin - self._centre_forward
-        left = y * self._cos - x * self._sin - self._centre_left
-        up = z - self._centre_up
+        forward, left, up = self._turn(position)
         ahead = forward >= 0
         before, after = forward[:, :-1], forward[:, 1:]
         fraction = before / (before - after)
@@ -206,6 +215,13 @@ class GateSweeper:
             left=torch.addcmul(left[:, :-1], fraction, left.diff(dim=1)),
             up=torch.addcmul(up[:, :-1], fraction, up.diff(dim=1)),
         )
+
+    def _turn(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return positions (3, P + 1, N) as forward, left and up of every race gate's centre, (G, P + 1, N) each."""
+        x, y, z = position.unbind(0)
+        forward = x * self._cos + y * self._sin - self._centre_forward
+        left = y * self._cos - x * self._sin - self._centre_left
+        return forward, left, z - self._centre_up
 
     def _first_pass(
         self,
@@ -228,6 +244,41 @@ class GateSweeper:
         left = crossings.left.flatten(0, 1).gather(0, index).squeeze(0)
         up = crossings.up.flatten(0, 1).gather(0, index).squeeze(0)
         return first_time, torch.hypot(left, up)
+
+    def _touch_frames(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
+        """Return when a frame is first touched, (N,), inf if never; position is (3, P + 1, N)."""
+        # (3, 1, N) against (3, G, 1): most drones are nowhere near a frame
+        low, high = position.amin(1, keepdim=True), position.amax(1, keepdim=True)
+        near = ((low <= self._frame_high) & (high >= self._frame_low)).all(0).any(0)  # (N,)
+        time = torch.full_like(position[0, 0], math.inf)
+        if not self._picks:
+            return self._enter_bars(position, segment).where(near, time)
+        drones = near.nonzero().squeeze(-1)
+        if len(drones):
+            time[drones] = self._enter_bars(position[:, :, drones], segment)
+        return time
+
+    def _enter_bars(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
+        """As `_touch_frames`, of drones that may be near one.
+
+        Inside the outer box the distance from the gate's axis is greatest at either end of the way: there the way is
+        outside the opening, or nowhere.
+        """
+        forward, left, up = self._turn(position)
+        sides = (
+            _within(forward, self._half_depth),
+            _within(left, self._half_outer),
+            _within(up, self._half_outer),
+        )
+        enter = torch.stack([side[0] for side in sides]).amax(0).clamp(min=0)  # (G, P, N)
+        leave = torch.stack([side[1] for side in sides]).amin(0).clamp(max=1)
+        starts_outside, ends_outside = (
+            torch.maximum(_at(left, fraction).abs(), _at(up, fraction).abs()) >= self._half_opening
+            for fraction in (enter, leave)
+        )
+        out_of_opening = torch.minimum(_within(left, self._half_opening)[1], _within(up, self._half_opening)[1])
+        touched = (enter <= leave) & (starts_outside | ends_outside)
+        return _first(touched, segment + torch.where(starts_outside, enter, out_of_opening.clamp(0, 1)))
 
     def _leave_box(self, position: torch.Tensor, segment: torch.Tensor) -> torch.Tensor:
         """Return when each side of the free box is first left, (6, N): low x, y, z, high x, y, z; inf if never.
@@ -253,3 +304,19 @@ class GateSweeper:
 def _first(event: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
     """Return the earliest time of an event for each drone, inf if it never happens: (..., N) -> (N,)."""
     return torch.where(event, time, math.inf).flatten(0, -2).amin(0)
+
+
+def _within(axis: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the fractions (G, P, N) of segments at which they come between -half and half, and are there no more.
+
+    Reference: Kay and Kajiya 1986, "Ray tracing complex scenes" (slabs).
+    """
+    before, delta = axis[:, :-1], axis.diff(dim=1)
+    delta = torch.where(delta == 0, _PARALLEL, delta)
+    one, other = (-half - before) / delta, (half - before) / delta
+    return torch.minimum(one, other), torch.maximum(one, other)
+
+
+def _at(axis: torch.Tensor, fraction: torch.Tensor) -> torch.Tensor:
+    """Return where segments of an axis (G, P + 1, N) are at a fraction (G, P, N) of each."""
+    return torch.addcmul(axis[:, :-1], fraction, axis.diff(dim=1))

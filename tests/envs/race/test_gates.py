@@ -128,6 +128,30 @@ def test_every_split_s_gate_is_passed_along_its_yaw(gate):
     assert sweep(track, there[::-1], gate).crash == BACKWARDS
 
 
+@pytest.mark.parametrize(
+    ("path", "crash"),
+    [
+        ([(-0.04, 1.2, 3.0), (-0.04, 0.8, 3.0)], FRAME),  # from beside it into the bar, before the plane
+        ([(0.04, 0.0, 3.0), (0.04, 0.8, 3.0)], FRAME),  # from within the opening
+        ([(0.04, 0.8, 5.0), (0.04, 0.8, 1.0)], FRAME),  # down through the whole frame
+        ([(-0.06, 1.2, 3.0), (-0.06, 0.0, 3.0)], NONE),  # a centimetre before it
+        ([(0.04, 0.0, 3.0), (0.04, 0.6, 3.6)], NONE),  # within the opening
+        ([(0.04, 1.1, 3.0), (0.04, 1.1, 4.0)], NONE),  # beside it
+        ([(0.04, 2.0, 3.1), (0.04, -0.6, 5.8)], NONE),  # past its corner
+    ],
+)
+@pytest.mark.parametrize("picks", [True, False])
+def test_a_frame_is_touched_from_any_side(path, crash, picks):
+    sweeper = GateSweeper(PLAIN, dtype=torch.float64)
+    sweeper._picks = picks
+    both = torch.tensor([path, path[::-1]], dtype=torch.float64).transpose(0, 1)
+    assert sweeper(both, torch.tensor([0, 0])).crash.tolist() == [crash, crash]
+
+
+def test_a_bar_behind_the_plane_is_touched_after_the_pass():
+    assert sweep(PLAIN, [(-0.1, 0.6, 3.0), (0.02, 0.6, 3.0), (0.03, 0.7, 3.0)]) == (1, pytest.approx(0.6), FRAME)
+
+
 CLOSE = dataclasses.replace(PLAIN, gates=tuple(Gate((x, 0.0, 3.0), 0.0) for x in (0.0, 1.2, 2.4)), decoys=())
 
 
@@ -258,6 +282,7 @@ def test_wrong_shapes_are_refused():
 def test_nothing_waits_for_the_host():
     with FakeTensorMode(allow_non_fake_inputs=True):  # refuses whatever needs a value: item, bool, nonzero
         sweeper = GateSweeper(load_track("split_s"), miss_radius=3.0)
+        sweeper._picks = False  # as on a GPU
         assert sweeper(torch.zeros(11, 8, 3), torch.zeros(8, dtype=torch.int64)).crash.shape == (8,)
 
 
@@ -330,6 +355,7 @@ def reference(track: Track, points, target: int) -> Reference:
     for segment, (start, end) in enumerate(pairwise(points)):
         for index, gate in enumerate(track.gates):
             a, b = (_in_gate_axes(gate, point) for point in (start, end))
+            events += [(segment + time, FRAME) for time in _bars_entered(a, b, doubts)]
             if (a[0] >= 0) == (b[0] >= 0):
                 continue
             fraction = a[0] / (a[0] - b[0])
@@ -362,6 +388,30 @@ def reference(track: Track, points, target: int) -> Reference:
         if time < crash_time and passes < 2 and index == (target + passes) % track.num_gates:
             passes, offset = passes + 1, distance if passes == 0 else offset
     return Reference(passes, offset, cause, min(doubts), nearest_sample)
+
+
+def _bars_entered(a, b, doubts):
+    """When a segment from a to b, in a gate's axes, is first in the frame: at one of the times when it meets a side."""
+    half = (0.05, HALF_OUTER, HALF_OUTER)
+    sides = [
+        (axis, sign * distance) for axis in range(3) for distance in (half[axis], HALF_OPENING) for sign in (-1, 1)
+    ]
+    met = [(side - a[axis]) / (b[axis] - a[axis]) for axis, side in sides if a[axis] != b[axis]]
+    times = [0.0, *sorted(time for time in met if 0 < time < 1), 1.0]
+    for start, end in pairwise(times):
+        forward, left, up = (a[axis] + (start + end) / 2 * (b[axis] - a[axis]) for axis in range(3))
+        far = max(abs(left), abs(up))
+        if abs(forward) < half[0] and HALF_OPENING < far < HALF_OUTER:
+            doubts.append(end - start)
+            return [start]
+    # a side that is nearly touched
+    doubts += [
+        abs(abs(point[axis]) - distance)
+        for point in (a, b)
+        for axis in range(3)
+        for distance in (half[axis], HALF_OPENING)
+    ]
+    return []
 
 
 def _in_gate_axes(gate: Gate, point):
@@ -422,7 +472,12 @@ def test_inside_the_outer_square_every_crossing_counts(left0, up0, left1, up1, b
     far = max(abs(left0 + fraction * (left1 - left0)), abs(up0 + fraction * (up1 - up0)))
     assume(min(abs(far - HALF_OUTER), abs(far - HALF_OPENING)) > 1e-9)
     forward, backward = sweep(PLAIN, [start, end], target), sweep(PLAIN, [end, start], target)
-    if far > HALF_OUTER:
+    doubts = [1.0]
+    bars = _bars_entered(*(_in_gate_axes(PLAIN.gates[0], point) for point in (start, end)), doubts)
+    assume(min(doubts) > 1e-9)
+    if bars and (far > HALF_OUTER or far < HALF_OPENING):  # through the depth of a bar, before or behind the plane
+        assert (forward.crash, backward.crash) in {(FRAME, FRAME), (FRAME, BACKWARDS)}
+    elif far > HALF_OUTER:
         assert (forward.passes, forward.crash, backward.crash) == (False, NONE, NONE)
     elif far > HALF_OPENING:
         assert (forward.passes, forward.crash, backward.crash) == (False, FRAME, FRAME)
