@@ -6,8 +6,9 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+T = TypeVar("T")
 ALLOWED = "allowed"
 
 
@@ -61,6 +62,17 @@ def check_settings(config: Any, prefix: str = "") -> None:
         elif allowed is not None and value is not None and value not in allowed:
             finite = ", and finite" if value == math.inf else ""
             raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}{finite}.")
+
+
+def given(value: T | None, field: str, needs_it: str) -> T:
+    """Return a setting that something needs.
+
+    Raises:
+        ValueError: it is missing; the message says of what.
+    """
+    if value is None:
+        raise ValueError(f"{field} is not given: {needs_it} needs it.")
+    return value
 
 
 def shortened(text: str, length: int = 80) -> str:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 from dreamer_racing.hil.links.crsf import encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
@@ -26,8 +25,7 @@ from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
 from dreamer_racing.hil.vehicle import at_rest
-
-T = TypeVar("T")
+from dreamer_racing.settings import given
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ def _radio(encode: Callable[[Sequence[float]], bytes]) -> Callable[[LinkConfig],
 
 
 def _mavlink(config: LinkConfig) -> TransportLink:
-    thrust = _given(config.thrust, "thrust", config)
+    thrust = given(config.thrust, "thrust", f"the link {config.name}")
     return MavlinkLink(_wire(config) if config.device is not None else _datagrams(config), thrust)
 
 
@@ -137,19 +135,14 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
 """What makes a link, by its name."""
 
 
-def _given(value: T | None, field: str, config: LinkConfig) -> T:
-    """Return a setting; refuse one that is missing."""
-    if value is None:
-        raise ValueError(f"{field} is not given: the link {config.name} needs it.")
-    return value
-
-
 def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:
-    return _given(config.rates, "rates", config), _given(config.thrust, "thrust", config)
+    return given(config.rates, "rates", f"the link {config.name}"), given(
+        config.thrust, "thrust", f"the link {config.name}"
+    )
 
 
 def _port(config: LinkConfig, default: int | None = None) -> int:
-    port = _given(default if config.port is None else config.port, "port", config)
+    port = given(default if config.port is None else config.port, "port", f"the link {config.name}")
     if not 1 <= port <= 65535:
         raise ValueError(f"port={port}: must be at least 1 and at most 65535.")
     return port
@@ -160,7 +153,7 @@ def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport
 
 
 def _wire(config: LinkConfig) -> Transport:
-    return SerialPort(_given(config.device, "device", config), _wire_settings(config))
+    return SerialPort(given(config.device, "device", f"the link {config.name}"), _wire_settings(config))
 
 
 def _wire_settings(config: LinkConfig) -> SerialSettings:

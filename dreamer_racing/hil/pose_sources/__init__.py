@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
 
 from dreamer_racing.hil.inlet import Inlet, UdpInlet
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort
@@ -23,9 +22,7 @@ from dreamer_racing.hil.pose_sources import mavlink, ros2
 from dreamer_racing.hil.pose_sources.mavlink import MavlinkPose
 from dreamer_racing.hil.pose_sources.messages import SMOOTHING
 from dreamer_racing.hil.pose_sources.ros2 import Ros2Pose
-from dreamer_racing.settings import Range, check_settings, setting
-
-T = TypeVar("T")
+from dreamer_racing.settings import Range, check_settings, given, setting
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def make_poses(config: PoseConfig) -> PoseSource:
 
 
 def _udp(config: PoseConfig) -> PoseSource:
-    return UdpPose(_given(config.port, "port", config), config.host)
+    return UdpPose(given(config.port, "port", f"the pose source {config.name}"), config.host)
 
 
 def _mavlink(config: PoseConfig) -> PoseSource:
@@ -85,18 +82,15 @@ def _mavlink(config: PoseConfig) -> PoseSource:
 
 
 def _ros2(config: PoseConfig) -> PoseSource:
-    return Ros2Pose(_given(config.topic, "topic", config), _message(config, ros2.MESSAGES), config.smoothing)
+    return Ros2Pose(
+        given(config.topic, "topic", f"the pose source {config.name}"),
+        _message(config, ros2.MESSAGES),
+        config.smoothing,
+    )
 
 
 POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
 """What makes a source of poses, by its name."""
-
-
-def _given(value: T | None, field: str, config: PoseConfig) -> T:
-    """Return a setting; refuse one that is missing."""
-    if value is None:
-        raise ValueError(f"{field} is not given: the pose source {config.name} needs it.")
-    return value
 
 
 def _message(config: PoseConfig, messages: Iterable[str]) -> str:
@@ -110,6 +104,6 @@ def _message(config: PoseConfig, messages: Iterable[str]) -> str:
 
 def _inlet(config: PoseConfig) -> Inlet:
     if config.device is None:
-        return UdpInlet(_given(config.port, "port or device", config), config.host)
+        return UdpInlet(given(config.port, "port or device", f"the pose source {config.name}"), config.host)
     settings = PROTOCOLS["mavlink"]
     return SerialPort(config.device, settings if config.baud is None else settings._replace(baud=config.baud))
