@@ -132,12 +132,9 @@ class GateSweeper:
         )
 
         self._picks = torch.device(device).type == "cpu"  # elsewhere picking drones out would wait for the device
-        # Half the sides of a gate's bounding box along the world's axes.
-        across, along = self._half_outer * sin.abs(), self._half_outer * cos.abs()
-        half_x, half_y = across + self._half_depth * cos.abs(), along + self._half_depth * sin.abs()
-        half = torch.stack((half_x, half_y, torch.full_like(x, self._half_outer)))  # (3, G)
-        centre = torch.stack((x, y, z))
-        self._frame_low, self._frame_high = ((centre + side * half).to(dtype).unsqueeze(-1) for side in (-1, 1))
+        self._frame_low, self._frame_high = (
+            corner.to(dtype).unsqueeze(-1) for corner in _frame_boxes(track, torch.stack((x, y, z)), yaw)
+        )
 
         low_x, low_y, low_z = track.bounds_low
         floor = max(low_z, GROUND_HEIGHT)
@@ -304,6 +301,14 @@ class GateSweeper:
 def _first(event: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
     """Return the earliest time of an event for each drone, inf if it never happens: (..., N) -> (N,)."""
     return torch.where(event, time, math.inf).flatten(0, -2).amin(0)
+
+
+def _frame_boxes(track: Track, centre: torch.Tensor, yaw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the lowest and the highest corner (3, G) of each frame's bounding box along the world's axes."""
+    wide, deep = track.shape.outer / 2, track.shape.depth / 2
+    sin, cos = yaw.sin().abs(), yaw.cos().abs()
+    half = torch.stack((wide * sin + deep * cos, wide * cos + deep * sin, torch.full_like(yaw, wide)))
+    return centre - half, centre + half
 
 
 def _within(axis: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
