@@ -1,0 +1,206 @@
+"""What a machine has for training and flying, and how what is missing can be had; no torch, which takes its time."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES
+
+DISTRIBUTION = "dreamer_racing"
+RECORD_BYTES = 13_570
+"""Of a record of the default run in its replay: image, numbers and latents."""
+NETWORKS_BYTES = 1.5e9
+"""What a default run takes beside its replay: networks, optimiser, batch, libraries."""
+SMALLER_ON_DISK = 7
+"""How much smaller a replay of a race is in a checkpoint (`benchmarks/saving.py`)."""
+PROBE = """
+import sys, time
+import numpy as np
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.camera import NoseCamera
+from dreamer_racing.hil.vehicle import Pose
+eyes = NoseCamera(load_track("kidney"), Camera(), sys.argv[1])
+still = np.zeros(3)
+pose = Pose(0.0, np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 0.0, 0.0]), still, still)
+end, frames = time.monotonic() + 1.0, 0
+while time.monotonic() < end:
+    frames += eyes.see(pose).any()
+print(frames)
+eyes.close()
+"""
+"""Counts the images of one second by an OpenGL back end, in a process of its own: two do not go together in one."""
+
+
+class State(Enum):
+    """Whether something is as it should be."""
+
+    fine = "ok"
+    note = "note"
+    wrong = "WRONG"
+
+
+class Finding(NamedTuple):
+    """What was looked at, how it is, and what to do about it."""
+
+    what: str
+    state: State
+    found: str
+    remedy: str = ""
+
+
+def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Finding]:
+    """Look at everything.
+
+    Args:
+        capacity: records of the replay.
+        keep: checkpoints.
+        run_dir: where runs are to go.
+    """
+    probes = {backend: _start_probe(backend) for backend in GL_LIBRARIES}
+    yield python()
+    yield from packages()
+    yield from accelerator()
+    yield from cores()
+    yield memory(capacity * RECORD_BYTES + NETWORKS_BYTES)
+    yield disk((keep + 1) * capacity * RECORD_BYTES / SMALLER_ON_DISK, run_dir)
+    yield from renderers(probes)
+
+
+def python() -> Finding:
+    """Look at the interpreter."""
+    wanted = importlib.metadata.metadata(DISTRIBUTION)["Requires-Python"]
+    fits = platform.python_version() in SpecifierSet(wanted)
+    remedy = "" if fits else f"PYTHON=/path/to/python{wanted} ./dev ..."
+    return Finding("python", State.fine if fits else State.wrong, platform.python_version(), remedy)
+
+
+def packages() -> Iterator[Finding]:
+    """Look at every package that the project requires, and at which extras are complete."""
+    extras: dict[str, list[str]] = {}
+    for text in importlib.metadata.requires(DISTRIBUTION) or ():
+        requirement = Requirement(text)
+        extra = re.search(r'extra == "(.+?)"', text)
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra[1] if extra else ""}):
+            continue
+        found = version_of(requirement.name)
+        fits = found is not None and found in requirement.specifier
+        if extra:
+            extras.setdefault(extra[1], []).extend([] if fits else [str(requirement)])
+        elif not fits or requirement.name in ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "dm-control"):
+            wanted = f"pip install '{requirement.name}{requirement.specifier}'"
+            state = State.fine if fits else State.wrong
+            yield Finding(requirement.name, state, found or "not installed", "" if fits else wanted)
+    complete = sorted(extra for extra, missing in extras.items() if not missing)
+    absent = sorted(extra for extra, missing in extras.items() if missing)
+    remedy = f"for {', '.join(absent)}: pip install 'dreamer_racing[NAME]'" if absent else ""
+    yield Finding("extras", State.fine, ", ".join(complete) or "none", remedy)
+
+
+def version_of(package: str) -> str | None:
+    """Return the version of what is installed, without its local part; None if it is not."""
+    try:
+        return importlib.metadata.version(package).partition("+")[0]
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def accelerator() -> Iterator[Finding]:
+    """Look for a GPU, its driver, and a torch that can use it."""
+    query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(query, capture_output=True, text=True, check=True, timeout=5).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        yield Finding("gpu", State.fine, "no NVIDIA driver answers: trains on the CPU")
+        return
+    yield Finding("gpu", State.fine, "; ".join(answer))
+    if cuda_of_torch() is None:
+        remedy = "reinstall torch from https://download.pytorch.org/whl (TORCH_INDEX_URL of ./dev)"
+        yield Finding("cuda", State.wrong, "this torch is a CPU build", remedy)
+
+
+def cuda_of_torch() -> str | None:
+    """Return the CUDA version that torch was built for, without importing it."""
+    files = [file for file in importlib.metadata.files("torch") or () if file.as_posix() == "torch/version.py"]
+    found = re.search(r"^cuda.*= '(.+)'", files[0].read_text(), re.MULTILINE) if files else None
+    return found[1] if found else None
+
+
+def cores() -> Iterator[Finding]:
+    """Look at the cores, at who else uses them, and at how many threads torch will start."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    load = os.getloadavg()[0]
+    busy = load > 0.5 * available
+    remedy = "other processes take their time from a training; two trainings want OMP_NUM_THREADS=1 each"
+    found = f"{available}, load {load:.1f}"
+    yield Finding("cores", State.note if busy else State.fine, found, remedy if busy else "")
+    threads = os.environ.get("OMP_NUM_THREADS")
+    too_many = threads is not None and threads.isdigit() and int(threads) > available
+    found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
+    remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""
+    yield Finding("threads", State.wrong if too_many else State.fine, found, remedy)
+    flags = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    bfloat16 = [name for name in ("amx_bf16", "avx512_bf16") if name in flags]
+    yield Finding("bfloat16", State.fine, ", ".join(bfloat16) or "not computed by this CPU: mixed precision is off")
+
+
+def memory(needed: float) -> Finding:
+    """Look whether a run fits."""
+    information = Path("/proc/meminfo")
+    if not information.exists():
+        return Finding("memory", State.note, f"a default run takes {needed / 1e9:.1f} GB")
+    lines = dict(line.split(":") for line in information.read_text(encoding="utf-8").splitlines())
+    free = 1024 * float(lines["MemAvailable"].split()[0])
+    found = f"{free / 1e9:.1f} GB free, such a run takes {needed / 1e9:.1f}"
+    remedy = "lower replay.capacity=, or replay.storage=memmap"
+    return Finding("memory", *_enough(found, free >= needed, remedy))
+
+
+def disk(needed: float, run_dir: Path) -> Finding:
+    """Look whether checkpoints fit."""
+    place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.exists())
+    free = shutil.disk_usage(place).free
+    found = f"{free / 1e9:.1f} GB free at {run_dir}, checkpoints of such a run take about {needed / 1e9:.1f}"
+    return Finding("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
+
+
+def _enough(found: str, enough: bool, remedy: str) -> tuple[State, str, str]:
+    return (State.fine, found, "") if enough else (State.wrong, found, remedy)
+
+
+def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Finding]:
+    """Look at what draws images, and how fast."""
+    found, reasons = {}, {}
+    for backend, probe in probes.items():
+        printed, errors = probe.communicate()
+        if probe.returncode == 0:
+            found[backend] = int(printed)
+        else:
+            reasons[backend] = (
+                errors.strip().splitlines()[-1].partition(": ")[2] if errors.strip() else "its probe died"
+            )
+    for backend, images in found.items():
+        yield Finding(backend, State.fine, f"{images:,} images a second, 64 × 64 pixels, one core")
+    for backend, reason in reasons.items():
+        yield Finding(backend, State.fine if found else State.note, f"not here: {reason}")
+    if not found:
+        remedy = "apt-get install libegl1 libopengl0 libgl1-mesa-dri: seven times as fast"
+        yield Finding("ray caster", State.note, "draws, for want of OpenGL", remedy)
+
+
+def _start_probe(backend: str) -> subprocess.Popen[str]:
+    program = [sys.executable, "-c", PROBE, backend]
+    return subprocess.Popen(program, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -1,0 +1,75 @@
+"""Says in a few seconds what this machine has for training, what is wrong with it, and how to mend that.
+
+    python recipes/doctor.py
+    python recipes/doctor.py replay.capacity=1000000 checkpoint.keep=3    # would that fit?
+    python recipes/doctor.py --json
+
+Its exit status is 1 if something is wrong.
+"""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from composing.command_line import plain_errors
+from composing.entry import recipe
+from composing.examination import Finding, State, examine
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.settings import COUNT, check_settings, setting
+
+
+@dataclass
+class ReplaySize:
+    """As in `recipes/dreamer_v3.py`."""
+
+    capacity: int = setting(250_000, COUNT)  # records
+
+
+@dataclass
+class CheckpointNumber:
+    """As in `recipes/dreamer_v3.py`."""
+
+    keep: int = setting(2, COUNT)
+
+
+@dataclass
+class DoctorConfig:
+    """`recipes/doctor.py`."""
+
+    replay: ReplaySize = field(default_factory=ReplaySize)
+    checkpoint: CheckpointNumber = field(default_factory=CheckpointNumber)
+    run_dir: str = "runs"  # where runs are to go
+    json: bool = False  # for programs, on stdout; --json does the same
+
+
+ConfigStore.instance().store(name="doctor_schema", node=DoctorConfig)
+
+
+@recipe("doctor")
+def main(config: DictConfig) -> None:
+    """Examine, and print what was found."""
+    with plain_errors():
+        check_settings(OmegaConf.to_object(config))
+    findings = []
+    for finding in examine(config.replay.capacity, config.checkpoint.keep, Path(config.run_dir)):
+        findings.append(finding)
+        if not config.json:
+            print(line(finding), flush=True)
+    if config.json:
+        print(json.dumps([{**finding._asdict(), "state": finding.state.value} for finding in findings], indent=1))
+    if any(finding.state is State.wrong for finding in findings):
+        raise SystemExit(1)
+
+
+def line(finding: Finding) -> str:
+    """Say a finding in a line, and its remedy in another."""
+    remedy = f"\n{'':25}→ {finding.remedy}" if finding.remedy else ""
+    return f"{finding.what:<14} {finding.state.value:<9} {finding.found}{remedy}"
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = ["json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
+    main()

@@ -1,0 +1,86 @@
+"""The doctor: what it finds, and what it says to do."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dreamer_racing.experience.replay import replay_bytes
+from dreamer_racing.modules import SIZES
+from tests.running_recipes import compose, recipe, recipe_module
+
+examination = recipe_module("composing.examination")
+State = examination.State
+
+
+def test_it_looks_at_everything_and_says_so(tmp_path: Path) -> None:
+    done = recipe("doctor", "json=true", cwd=tmp_path)
+    found = {finding["what"]: finding for finding in json.loads(done.stdout)}
+    assert {"python", "torch", "mujoco", "extras", "gpu", "cores", "threads", "memory", "disk", "egl"} <= found.keys()
+    assert found["python"]["state"] == found["torch"]["state"] == "ok"
+    assert done.returncode == int(any(finding["state"] == "WRONG" for finding in found.values())), done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_does_not_fit_is_wrong_and_ends_with_1(tmp_path: Path) -> None:
+    done = recipe("doctor", "replay.capacity=1e10", cwd=tmp_path)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    (memory,) = (number for number, line in enumerate(lines) if line.startswith("memory"))
+    assert "WRONG" in lines[memory] and "lower replay.capacity=" in lines[memory + 1]
+
+
+def test_it_asks_for_what_a_default_run_takes() -> None:
+    recipe_module("doctor")  # which has its own schema
+    run, doctor = compose("dreamer_v3", "tuned=race"), compose("doctor")
+    assert (doctor.replay.capacity, doctor.checkpoint.keep) == (run.replay.capacity, run.checkpoint.keep)
+    size = SIZES["cpu_small"]
+    context = 2 * size.belief + 2 * size.latents * size.classes  # as LatentFormat packs probabilities
+    assert pytest.approx(replay_bytes(1, numbers=21) + context, rel=0.03) == examination.RECORD_BYTES
+
+
+def test_a_missing_and_an_old_package_are_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"torch": "2.3.0", "tqdm": None}
+    version_of = examination.version_of
+    monkeypatch.setattr(examination, "version_of", lambda name: versions.get(name, version_of(name)))
+    found = {finding.what: finding for finding in examination.packages()}
+    assert found["torch"].state is State.wrong and found["torch"].remedy.startswith("pip install 'torch<2.14,>=2.11'")
+    assert found["tqdm"][1:3] == (State.wrong, "not installed")
+    assert found["torchrl"].state is State.fine
+
+
+def test_a_torch_without_cuda_beside_a_gpu_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = subprocess.CompletedProcess([], 0, stdout="NVIDIA H200, 570.1, 143771 MiB\n")
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: answer)
+    monkeypatch.setattr(examination, "cuda_of_torch", lambda: None)
+    gpu, cuda = examination.accelerator()
+    assert gpu.found.startswith("NVIDIA H200") and cuda.state is State.wrong and "whl" in cuda.remedy
+    monkeypatch.setattr(examination, "cuda_of_torch", lambda: "12.8")
+    assert len(list(examination.accelerator())) == 1
+
+
+def test_the_cuda_of_torch_is_read_without_importing_it() -> None:
+    import torch
+
+    assert examination.cuda_of_torch() == torch.version.cuda
+
+
+def test_more_threads_than_cores_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "512")
+    threads = next(finding for finding in examination.cores() if finding.what == "threads")
+    assert threads.state is State.wrong and "more threads than cores" in threads.remedy
+
+
+def test_without_opengl_the_ray_caster_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = "import sys; sys.exit('RendererUnavailableError: egl needs libEGL.so.1')"
+    monkeypatch.setattr(examination, "PROBE", program)
+    *_, last = examination.renderers({"egl": examination._start_probe("egl")})
+    assert last.what == "ray caster" and "apt-get install" in last.remedy
+
+
+def test_settings_are_checked(tmp_path: Path) -> None:
+    done = recipe("doctor", "checkpoint.keep=0", cwd=tmp_path)
+    assert done.returncode == 2 and "checkpoint.keep=0: must be at least 1" in done.stderr
