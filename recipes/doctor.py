@@ -8,7 +8,6 @@ Its exit status is 1 if something is wrong.
 """
 
 import json
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -71,5 +70,4 @@ def line(finding: Finding) -> str:
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = ["json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     main()

@@ -18,6 +18,8 @@ from dreamer_racing.settings import suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
+FLAGS = {"--json": "json=true"}
+"""Settings that are customary as flags, for recipes that have them."""
 TEXTS = ("run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor")
 """Settings that are no numbers, whatever they look like."""
 
@@ -33,7 +35,7 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
 
         @functools.wraps(function)
         def start() -> None:
-            sys.argv[1:] = [whole_number(argument) for argument in sys.argv[1:]]
+            sys.argv[1:] = [whole_number(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
             with plain_errors():
                 refuse_unknown_settings(sys.argv[1:], name)

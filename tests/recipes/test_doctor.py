@@ -17,7 +17,7 @@ State = examination.State
 
 
 def test_it_looks_at_everything_and_says_so(tmp_path: Path) -> None:
-    done = recipe("doctor", "json=true", cwd=tmp_path)
+    done = recipe("doctor", "--json", cwd=tmp_path)
     found = {finding["what"]: finding for finding in json.loads(done.stdout)}
     assert {"python", "torch", "mujoco", "extras", "gpu", "cores", "threads", "memory", "disk", "egl"} <= found.keys()
     assert found["python"]["state"] == found["torch"]["state"] == "ok"
