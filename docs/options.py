@@ -24,6 +24,11 @@ PAGE = ROOT / "docs" / "options.md"
 sys.path.append(str(ROOT / "recipes"))
 
 # Below code, because it is found only with the recipes' folder on the path.
+import doctor  # noqa: E402
+import fly  # noqa: E402
+import hil  # noqa: E402
+import plant  # noqa: E402
+import sim_to_real  # noqa: E402
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
@@ -36,13 +41,19 @@ OTHERS = (
     schema.PerceptionConfig,
     schema.ExportConfig,
     schema.PlotConfig,
+    fly.FlyConfig,
+    hil.HilConfig,
+    plant.PlantConfig,
+    sim_to_real.SimToRealConfig,
+    doctor.DoctorConfig,
 )
 HEAD = """# Options
 
-Made by `python docs/options.py` from [recipes/composing/schema.py](../recipes/composing/schema.py): change that, not
-this page. Options are [hydra](https://hydra.cc) overrides, `env.num_envs=64` or, for a whole group, `model=size12m`;
-the groups are the folders of [recipes/config](../recipes/config). What is "chosen" is settled by the recipe when it
-starts, by device, size or budget, and printed. A wrong name, type or value is refused with the field named.
+Made by `python docs/options.py` from [recipes/composing/schema.py](../recipes/composing/schema.py) and the recipes:
+change those, not this page. `--help` of a recipe says the same. Options are [hydra](https://hydra.cc) overrides,
+`env.num_envs=64` or, for a whole group, `model=size12m`; the groups are the folders of
+[recipes/config](../recipes/config). What is "chosen" is settled by the recipe when it starts, by device, size or
+budget, and printed. A wrong name, type or value is refused with the field named.
 """
 
 
@@ -55,7 +66,7 @@ def main() -> None:
     if not arguments.check:
         PAGE.write_text(text, encoding="utf-8")
     elif PAGE.read_text(encoding="utf-8") != text:
-        parser.error(f"{PAGE.relative_to(ROOT)} is not what the schema makes: run python docs/options.py.")
+        parser.error(f"{PAGE.relative_to(ROOT)} is not what the schemas make: run python docs/options.py.")
 
 
 def make_page() -> str:
@@ -105,6 +116,8 @@ def default_of(field: dataclasses.Field[Any]) -> str:
         return "chosen"
     if isinstance(value, enum.Enum):
         value = value.value
+    if dataclasses.is_dataclass(value):
+        return ""
     words = {None: "null", True: "true", False: "false"}
     if value is None or isinstance(value, bool):
         return f"`{words[value]}`"

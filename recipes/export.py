@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from composing.arena import worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.entry import recipe
@@ -26,6 +25,7 @@ from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
 from omegaconf import DictConfig, OmegaConf
+from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.protocol import MODES
@@ -66,7 +66,7 @@ def main(config: DictConfig) -> None:
     start_logging()
     # Its exporter says four times that torchvision is not installed, which nothing here needs.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    torch.set_num_threads(1)
+    set_num_threads(1)
     try:
         with plain_errors():
             export(cast(ExportConfig, OmegaConf.to_object(config)))

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
@@ -24,6 +23,7 @@ from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import as_tensor, tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
@@ -70,7 +70,7 @@ def scripted(track: Track, parameters: QuadrotorParameters) -> Policy:
 
 def hover(track: Track, parameters: QuadrotorParameters) -> Policy:
     """Make the pilot that stays at the start."""
-    still = torch.tensor([parameters.hover_action, 0.0, 0.0, 0.0])
+    still = tensor([parameters.hover_action, 0.0, 0.0, 0.0])
     return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
 
 
@@ -169,7 +169,7 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
 def second_lap(trajectory: Trajectory) -> Trajectory:
     """Cut out the second lap, which begins and ends at racing speed; the beginning of the flight if there is none."""
     gate = trajectory.target_gate
-    ends = (torch.nonzero((gate[1:] == 0) & (gate[:-1] != 0)).flatten() + 1).tolist()
+    ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
     first, last = ends[:2] if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
     return trajectory.part(first, last)
 
@@ -193,7 +193,7 @@ def on_time_steps(policy: Policy) -> Callable[[Any], np.ndarray]:
     """Let a policy of the batched environment fly the dm_control task: dm_env `TimeStep` → action (4,)."""
 
     def act(time_step: Any) -> np.ndarray:
-        state = {name: torch.as_tensor(np.asarray(value)).unsqueeze(0) for name, value in time_step.observation.items()}
+        state = {name: as_tensor(np.asarray(value)).unsqueeze(0) for name, value in time_step.observation.items()}
         floats = {name: value.float() if value.is_floating_point() else value for name, value in state.items()}
         return policy(TensorDict({"privileged": TensorDict(floats, [1])}, [1]))["action"][0].numpy()
 

@@ -1,1 +1,5 @@
 """What the recipes share: from overrides to a run that can be started or continued."""
+
+from composing.usage import answer_help
+
+answer_help()  # here, because it is before torch is loaded, which takes seconds

@@ -1,0 +1,46 @@
+"""`--help`: there at once, and in words of the recipe's own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.running_recipes import ROOT, recipe, recipe_module
+
+usage = recipe_module("composing.usage")
+RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_help_has_what_it_does_and_every_option_with_a_meaning(name: str) -> None:
+    text = "\n".join(usage.usage(name))
+    said = (ROOT / "recipes" / f"{name}.py").read_text(encoding="utf-8").splitlines()[0].lstrip('r"').rstrip('"')
+    assert said in text and f"python recipes/{name}.py" in text
+    assert usage.tables(usage.OPTIONS.read_text(encoding="utf-8"))[f"recipes/{name}.py"], "no options on the page"
+    assert "Powered by Hydra" not in text and "schema" not in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_groups_are_the_recipes_own() -> None:
+    found = usage.groups("dreamer_v3")
+    assert found["env"] == ["dmc", "easy", "faithful"] and "race" in found["tuned"]
+    assert "network" in usage.groups("ppo") and "network" not in found
+    assert usage.groups("fly") == {}
+
+
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help_loads_no_torch(flag: str, tmp_path: Path) -> None:
+    done = recipe("export", flag, cwd=tmp_path, before="import sys; sys.modules['torch'] = None")
+    assert done.returncode == 0 and done.stdout.startswith("usage: python recipes/export.py"), done.stderr
+
+
+def test_other_programs_keep_their_help(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/somewhere/export.py", "--help"])
+    usage.answer_help()
+
+
+def test_what_has_columns_and_bars_is_read() -> None:
+    page = "## A\n| option | default | may be | |\n|---|---|---|---|\n| `x=` | `1` | above 0 | a \\| b |\n"
+    assert usage.tables(page) == {"A": [("x=", "1", "above 0", "a | b")]}
