@@ -16,7 +16,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay
@@ -26,6 +25,7 @@ from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.signals import GracefulExit
 
@@ -189,10 +189,10 @@ def train(run: Run) -> None:
     minutes = Interval(config.checkpoint.minutes)
     with (
         GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
-        tqdm(total=config.total_env_steps, initial=counters["env_steps"], unit="step", dynamic_ncols=True) as bar,
+        Progress(config.total_env_steps, counters["env_steps"]) as progress,
     ):
         if run.directory.finished_env_steps() >= config.total_env_steps:
-            bar.write(
+            progress.say(
                 f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"
             )
         run.learn(None, stop)  # what an interrupted run still owes
@@ -200,39 +200,32 @@ def train(run: Run) -> None:
             with run.clock.timed("collect"):
                 rollout = next(run.rollouts)
                 run.take_in(rollout)
-            bar.update(counters["env_steps"] - bar.n)
+            progress.advance(counters["env_steps"])
             run.learn(rollout, stop)
             if stop.signal_name:
                 break
             due = schedule.due("log", counters["env_steps"])
             if schedule.due("evaluate", counters["env_steps"]):
-                bar.write(run.evaluate())
+                progress.say(run.evaluate())
                 due = True  # so that its numbers stand where they were measured
             if due:
                 run.measure()
-                show(bar, run.metrics.write(counters["env_steps"]), run.unsaved)
+                progress.show(run.metrics.write(counters["env_steps"]), run.unsaved)
             by_steps, by_minutes = schedule.due("save", counters["env_steps"]), minutes.due()  # both take note
             if (by_steps or by_minutes) and (problem := run.try_to_save()):
-                bar.write(problem)
+                progress.say(problem)
         saved = run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
-            bar.write(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
+            progress.say(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
         if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
-            bar.write(run.evaluate())
+            progress.say(run.evaluate())
         run.metrics.write(counters["env_steps"])
         if not stop.requested:
             run.directory.mark_finished(counters["env_steps"])
-        bar.write(f"checkpoint: {saved}")
+        progress.say(f"checkpoint: {saved}")
     if stop.signal_name:
         raise SystemExit(128 + signal.Signals[stop.signal_name])
-
-
-def show(bar: tqdm, row: dict[str, float], unsaved: str = "") -> None:
-    """Put the latest numbers behind the progress bar, and since when nothing could be saved."""
-    shown = {"return": "episode/return", "gates": "episode/gates_passed", "updates/s": "rate/updates"}
-    numbers = {label: f"{row[key]:.2f}" for label, key in shown.items() if key in row}
-    bar.set_postfix(({"NOT SAVED": unsaved} if unsaved else {}) | numbers)
 
 
 class Schedule:

@@ -1,5 +1,7 @@
 """Launching a recipe: from what hydra composed to a run that trains, begun or continued."""
 
+import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -13,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from composing.checks import check_overrides
 from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
+from composing.schema import RunConfig, is_race
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
@@ -56,6 +59,7 @@ def launch(
         print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     try:
         train(run)
+        print(what_next(run.config, run.directory))
     except KeyboardInterrupt as interrupt:
         print(f"abandoned: {run.last_good}", file=sys.stderr)
         raise SystemExit(128 + next(iter(interrupt.args), signal.SIGINT)) from interrupt
@@ -104,3 +108,15 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
     return config, merged
+
+
+def what_next(config: RunConfig, directory: RunDirectory) -> str:
+    """Say what a finished run left, and which commands go on from there."""
+    place, longer = shlex.quote(os.path.relpath(directory.path)), 2 * config.total_env_steps
+    lines = [
+        f"{place}: metrics.csv, plots/, videos/, evaluations/; best/ has the weights of the best evaluation",
+        f"evaluate it:  python recipes/evaluate.py checkpoint={place} episodes=100",
+        f"watch it fly: python recipes/fly.py agent={place}" if is_race(config) else "",
+        f"go on:        python recipes/{config.algorithm}.py resume={place} total_env_steps={longer}",
+    ]
+    return "\n".join(filter(None, lines))

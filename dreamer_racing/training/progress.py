@@ -1,0 +1,87 @@
+"""What a run says of itself while it goes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import TextIO
+
+from tqdm import tqdm
+
+SHOWN = {"return": "episode/return", "gates": "episode/gates_passed", "loss": "loss", "updates/s": "rate/updates"}
+"""Metrics that are shown, by the word they are shown under."""
+KEPT = {"success": "evaluation/success_rate"}
+"""Those that are shown until there are newer ones."""
+
+
+class Progress:
+    """A bar in a terminal; elsewhere, where carriage returns would pile up in a log, a line now and then.
+
+    Args:
+        total: env_steps at the end.
+        env_steps: those at the beginning, of a run that is continued.
+        seconds: between two lines of a log.
+
+    Example:
+        >>> progress = Progress(total=1000)
+        >>> progress.advance(500)
+        >>> progress.close()
+    """
+
+    def __init__(self, total: int, env_steps: int = 0, seconds: float = 30.0) -> None:
+        self._total, self._seconds = total, seconds
+        self._env_steps = env_steps
+        self._kept: dict[str, str] = {}
+        self._since, self._from = time.monotonic(), env_steps  # of the latest line
+        terminal = sys.stderr.isatty()
+        self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True) if terminal else None
+
+    def advance(self, env_steps: int) -> None:
+        """Take note of how far the run is."""
+        self._env_steps = env_steps
+        if self._bar is not None:
+            self._bar.update(env_steps - self._bar.n)
+
+    def show(self, metrics: Mapping[str, float], unsaved: str = "") -> None:
+        """Show the latest numbers, and since when nothing could be saved."""
+        self._kept |= {word: f"{metrics[name]:.0%}" for word, name in KEPT.items() if name in metrics}
+        numbers = {word: f"{metrics[name]:.2f}" for word, name in SHOWN.items() if name in metrics}
+        numbers = ({"NOT SAVED": unsaved} if unsaved else {}) | numbers | self._kept
+        if self._bar is not None:
+            self._bar.set_postfix(numbers)
+        elif time.monotonic() - self._since >= self._seconds:
+            self._write_line(", ".join(f"{word} {number}" for word, number in numbers.items()))
+
+    def say(self, text: str) -> None:
+        """Say something in a line of its own."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            _write(text, sys.stdout)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write_line(self, numbers: str) -> None:
+        now = time.monotonic()
+        speed = (self._env_steps - self._from) / (now - self._since)
+        left = timedelta(seconds=round((self._total - self._env_steps) / speed)) if speed else "unknown time"
+        done = f"{self._env_steps:,} of {self._total:,} env_steps, {speed:.0f}/s, {left} to go"
+        _write(f"{done}: {numbers}", sys.stderr)
+        self._since, self._from = now, self._env_steps
+
+
+def _write(text: str, stream: TextIO) -> None:
+    """Write a line with the time of day, at once: what follows a log sees it as it comes."""
+    stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
+    stream.flush()

@@ -1,0 +1,59 @@
+"""What a run says of itself: a bar in a terminal, lines in a log."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from dreamer_racing.training.progress import Progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+METRICS = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
+
+
+def test_a_log_gets_whole_lines_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(total=1_000_000, env_steps=500_000, seconds=0.0) as progress:
+        progress.show({"evaluation/success_rate": 0.5})
+        progress.advance(512_000)
+        progress.show(METRICS)
+        progress.say("evaluation at 512,000 env_steps")
+    said = capsys.readouterr()
+    assert "\r" not in said.err + said.out
+    first, second = said.err.splitlines()
+    assert "500,000 of 1,000,000 env_steps, 0/s, unknown time to go: success 50%" in first
+    assert "512,000 of 1,000,000 env_steps" in second
+    assert second.endswith("to go: return 12.35, gates 3.00, loss 1.25, updates/s 5.50, success 50%")
+    assert said.out.endswith("evaluation at 512,000 env_steps\n")
+
+
+def test_lines_keep_their_distance(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = Progress(total=10, seconds=3600.0)
+    for step in range(10):
+        progress.advance(step)
+        progress.show(METRICS)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_not_saved_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    Progress(total=10, seconds=0.0).show(METRICS, unsaved="since 5")
+    assert "NOT SAVED since 5" in capsys.readouterr().err
+
+
+def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with Progress(total=100) as progress:
+        progress.advance(50)
+        progress.show(METRICS | {"evaluation/success_rate": 1.0})
+    assert (
+        "50/100" in terminal.getvalue()
+        and "gates=3.00" in terminal.getvalue()
+        and "success=100%" in terminal.getvalue()
+    )
