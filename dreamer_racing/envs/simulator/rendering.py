@@ -17,6 +17,7 @@ Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the t
 """
 
 import logging
+import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
@@ -105,11 +106,16 @@ class Renderer:
         self.name = name
         self.camera = camera
         self._executors = [ThreadPoolExecutor(1, f"render_{index}") for index in range(num_workers)]
+        self._workers: list[Worker] = []
+        # Holds the executors beyond this object: among garbage they would end their threads before `close` needs them.
+        self._free = weakref.finalize(self, _free, self._executors, self._workers)
+        self._free.atexit = False  # no thread takes work by then; contexts are freed at exit as it is
         try:
             # one after the other: the first GL context of a process initialises the display
-            self._workers = [executor.submit(make_worker).result() for executor in self._executors]
+            for executor in self._executors:
+                self._workers.append(executor.submit(make_worker).result())
         except BaseException:
-            self._shutdown()
+            self._free()
             raise
         self._mount = NoseMount(camera)
 
@@ -131,15 +137,17 @@ class Renderer:
 
     def close(self) -> None:
         """Free every worker in its own thread, then end the threads."""
-        for executor, worker in zip(self._executors, self._workers, strict=True):
-            executor.submit(worker.close).result()
-        self._workers = []
-        self._shutdown()
+        self._free()
 
-    def _shutdown(self) -> None:
-        for executor in self._executors:
-            executor.shutdown()
-        self._executors = []
+
+def _free(executors: list[ThreadPoolExecutor], workers: list[Worker]) -> None:
+    """Free workers, of which there may be fewer, each in its thread; end the threads; leave both lists empty."""
+    for executor, worker in zip(executors, workers, strict=False):
+        executor.submit(worker.close).result()
+    for executor in executors:
+        executor.shutdown()
+    executors.clear()
+    workers.clear()
 
 
 class OpenGLWorker:

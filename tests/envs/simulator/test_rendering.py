@@ -1,0 +1,80 @@
+"""Workers of a renderer: freed once, in their threads, whoever lets go of them and how."""
+
+from __future__ import annotations
+
+import gc
+import threading
+from typing import Any
+
+import pytest
+
+from dreamer_racing.envs.simulator.rendering import Renderer
+from dreamer_racing.envs.simulator.scene import Camera
+
+
+class NotedWorker:
+    """Notes in which thread it was made and freed."""
+
+    def __init__(self, freed: list[bool]) -> None:
+        self._made_in = threading.get_ident()
+        self._freed = freed
+
+    def draw(self, *_: Any) -> None:
+        """Draw nothing."""
+
+    def close(self) -> None:
+        """Note whether this is the thread that made it."""
+        self._freed.append(threading.get_ident() == self._made_in)
+
+
+class Environment:
+    """Something in a circle of references that closes its renderer when it goes, as TorchRL's environments do."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer, self.itself = renderer, self
+
+    def __del__(self) -> None:
+        self.renderer.close()
+
+
+def collected_in(seconds: float) -> bool:
+    collector = threading.Thread(target=gc.collect, daemon=True)
+    collector.start()
+    collector.join(seconds)
+    return not collector.is_alive()
+
+
+@pytest.mark.parametrize("keep", ["a circle", "nothing"])
+def test_one_that_is_let_go_is_freed_and_nobody_waits_for_ever(keep: str) -> None:
+    freed: list[bool] = []
+    renderer = Renderer("noted", lambda: NotedWorker(freed), Camera(), num_workers=2)
+    threads = {thread for thread in threading.enumerate() if thread.name.startswith("render_")}
+    if keep == "a circle":
+        Environment(renderer)
+    del renderer
+    assert collected_in(10.0), "the collector waits for a thread that has ended"
+    assert freed == [True, True]
+    assert not threads & set(threading.enumerate())
+
+
+def test_closing_twice_frees_once() -> None:
+    freed: list[bool] = []
+    renderer = Renderer("noted", lambda: NotedWorker(freed), Camera(), num_workers=2)
+    renderer.close()
+    renderer.close()
+    assert freed == [True, True]
+
+
+def test_workers_that_were_made_are_freed_where_another_fails() -> None:
+    freed: list[bool] = []
+    made: list[int] = []
+
+    def make() -> NotedWorker:
+        made.append(0)
+        if len(made) == 2:
+            raise RuntimeError("no context")
+        return NotedWorker(freed)
+
+    with pytest.raises(RuntimeError, match="no context"):
+        Renderer("noted", make, Camera(), num_workers=3)
+    assert freed == [True]
