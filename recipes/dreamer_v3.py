@@ -27,7 +27,7 @@ from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, computes_bfloat16
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import clock_times, make_agent, scheduled
+from composing.learners import begin_with, clock_times, make_agent, scheduled
 from composing.schema import Collection, DreamerConfig, register
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -201,6 +201,8 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         agent = make_agent(config, Interface.of(env))
         losses = make_losses(agent, config.loss, config.model.imagination_horizon)
     learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, config.model), config.model)
+    if config.init_from and not config.resume:
+        print(begin_with(learner, config.init_from, env))
     seed_generators(config.seed)
     curriculum = make_curriculum(config)
     policy = learner.policy()

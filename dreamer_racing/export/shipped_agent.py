@@ -128,18 +128,7 @@ class ShippedAgent:
         for name in _ABSENT:
             parent, _, child = name.rpartition(".")
             agent.get_submodule(parent).register_module(child, None)
-        weights = read_weights(folder / WEIGHTS)
-        names = {"encoder": "world_model.encoder", "rssm": "world_model.rssm", "actor": "actor"}
-        try:
-            for short, name in names.items():
-                own = {
-                    key.removeprefix(f"{short}."): value
-                    for key, value in weights.items()
-                    if key.startswith(f"{short}.")
-                }
-                agent.get_submodule(name).load_state_dict(own)
-        except RuntimeError as error:
-            raise ValueError(f"{folder / WEIGHTS} does not fit {folder / CONTRACT}: {error}") from error
+        load_networks(folder, agent)
         if hash_weights(ActorStep(agent)) != contract["weights_sha256"]:
             raise ValueError(
                 f"{folder / WEIGHTS} holds other weights than {folder / CONTRACT} describes: copy it again."
@@ -149,6 +138,23 @@ class ShippedAgent:
     def evaluation_policy(self) -> DreamerPolicy:
         """Return the acting step, which shares the agent's parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor)
+
+
+def load_networks(folder: Path, agent: Agent) -> None:
+    """Load what ships into the networks that fly: encoder, RSSM and actor.
+
+    Raises:
+        ValueError: If they are of other shapes.
+    """
+    weights = read_weights(folder / WEIGHTS)
+    names = {"encoder": "world_model.encoder", "rssm": "world_model.rssm", "actor": "actor"}
+    try:
+        for short, name in names.items():
+            mine = f"{short}."
+            own = {key.removeprefix(mine): value for key, value in weights.items() if key.startswith(mine)}
+            agent.get_submodule(name).load_state_dict(own)
+    except RuntimeError as error:
+        raise ValueError(f"{folder / WEIGHTS} does not fit {folder / CONTRACT}: {error}") from error
 
 
 def is_agent(folder: str | Path) -> bool:

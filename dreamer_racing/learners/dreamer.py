@@ -369,21 +369,29 @@ class DreamerLearner:
             ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
                 changed then.
         """
-        check_saved(state_dict, self.agent, self.losses)
-        self.agent.load_state_dict(state_dict["agent"])
-        for name, loss in self.losses.items():
-            loss.load_state_dict(state_dict["losses"][name], strict=False)
+        self.adopt(state_dict)
         # Rates are settings of this learner, not state: a run may be continued with others.
         names = {"lr", "warmup_steps"}
         own = [{name: value for name, value in group.items() if name in names} for group in self._groups]
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self._actor_optimizer is not None:
             self._actor_optimizer.load_state_dict(state_dict["actor_optimizer"])
-        if self.averaged is not None:
-            self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
         for group, settings in zip(self._groups, own, strict=True):
             group.update(settings)
         self.updates = state_dict["updates"]
+
+    def adopt(self, state_dict: dict[str, Any]) -> None:
+        """Take over the weights of what another learner's ``state_dict`` returned: no optimiser, no counters.
+
+        Raises:
+            ValueError: As `load_state_dict`.
+        """
+        check_saved(state_dict, self.agent, self.losses)
+        self.agent.load_state_dict(state_dict["agent"])
+        for name, loss in self.losses.items():
+            loss.load_state_dict(state_dict["losses"][name], strict=False)
+        if self.averaged is not None:
+            self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
 
     @property
     def _groups(self) -> ParameterGroups:

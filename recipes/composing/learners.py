@@ -4,12 +4,19 @@ from dataclasses import replace
 
 import torch
 
+from composing.arena import Environment
+from composing.command_line import agent_path
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
+from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.learners.dreamer import make_dreamer
+from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
 from dreamer_racing.learners.learner import Learner
+from dreamer_racing.learners.saved_dreamer import check_size
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
+from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import Clock
 
@@ -36,6 +43,28 @@ def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
     """Make the networks of a resolved configuration, with initial weights from torch's generator."""
     decodes = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).decodes
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
+
+
+def begin_with(learner: DreamerLearner, source: str, env: Environment) -> str:
+    """Give a new learner the weights of another run or of an agent that ships; return a line on what that was.
+
+    Raises:
+        FileNotFoundError: there is no such run, checkpoint or agent.
+        ValueError: its networks are of another size, or were trained with another camera, control rate or loss.
+    """
+    folder = agent_path(source)
+    if not is_agent(folder):
+        state, metadata = load_state(folder, "learner")
+        learner.adopt(state)
+        return f"weights: all those of {folder} at {metadata['env_steps']:,} env_steps (init_from=)"
+    contract = read_contract(folder / CONTRACT)
+    check_size(contract["model"], learner.size)
+    if not isinstance(env, DroneRacingEnv):
+        raise ValueError(f"init_from={source}: this agent races; there is no race here.")
+    check_env(folder, contract, env)
+    for agent in filter(None, (learner.agent, learner.averaged)):
+        load_networks(folder, agent)
+    return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic begin anew"
 
 
 def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:

@@ -1,0 +1,92 @@
+"""A run that begins with the weights of another, or of an agent that ships."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from dreamer_racing.export.shipped_agent import WEIGHTS
+from dreamer_racing.export.weights_file import read_weights
+from tests.running_recipes import ROOT, TINY, build, compose, recipe_module
+
+NUMBERS = ["env.from_pixels=false", "prefill=64"]
+AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=8000", "replay.capacity=20000"]
+
+
+def make(*overrides: str) -> Any:
+    dreamer = recipe_module("dreamer_v3")
+    config = dreamer.resolve(compose("dreamer_v3", *overrides))
+    return dreamer.build(OmegaConf.to_object(config), list(overrides))
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """A run with weights that no other begins with."""
+    run = make(*TINY, *NUMBERS, f"run_dir={tmp_path / 'first'}", "seed=7", "model.average_rate=0.1")
+    with torch.no_grad():
+        for parameter in (*run.learner.agent.parameters(), *run.learner.averaged.parameters()):
+            parameter.add_(0.125)
+    run.counters["env_steps"], run.learner.updates = 640, 11
+    run.save()
+    run.close()
+    return tmp_path / "first"
+
+
+def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8",
+               "model.average_rate=0.1")  # fmt: skip
+    first = make(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "seed=7", "model.average_rate=0.1")
+    assert "all those of" in capsys.readouterr().out
+    for own, there in ((run.learner.agent, first.learner.agent), (run.learner.averaged, first.learner.averaged)):
+        theirs = there.state_dict()
+        assert all(torch.equal(value, theirs[name]) for name, value in own.state_dict().items())
+    assert (run.learner.updates, run.counters["env_steps"], first.learner.updates) == (0, 0, 11)
+    assert not run.learner.optimizer.state
+    for one in (run, first):
+        one.close()
+
+
+def test_a_resumed_run_goes_on_with_its_own_weights(trained: Path) -> None:
+    again = make(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "model.average_rate=0.1",
+                 "init_from=nowhere")  # fmt: skip
+    assert again.learner.updates == 11
+    again.close()
+
+
+def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make(*AS_SHIPPED, f"run_dir={tmp_path / 'run'}", "init_from=kidney", "track=circle", "env.preset=faithful")
+    weights = read_weights(ROOT / "agents" / "kidney" / WEIGHTS)
+    for agent in (run.learner.agent, run.learner.averaged):
+        encoder = agent.get_submodule("world_model.encoder").state_dict()
+        assert all(torch.equal(value, weights[f"encoder.{name}"]) for name, value in encoder.items())
+    assert "encoder, RSSM and actor of" in capsys.readouterr().out
+    run.close()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ([*TINY, *NUMBERS, "init_from=nowhere"], ["nowhere", "does not exist"]),
+        ([*TINY, "init_from=kidney"], ["size 'cpu_small'", "size 'debug'"]),
+        ([*AS_SHIPPED, "init_from=kidney", "env.control_rate=50"], ["control_rate"]),
+        ([*AS_SHIPPED, "init_from=kidney", "env.camera_tilt=10"], ["camera_tilt"]),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit), recipe_module("composing.command_line").plain_errors():
+        make(*overrides, f"run_dir={tmp_path / 'run'}")
+    said = capsys.readouterr().err
+    assert all(word in said for word in words), said
+
+
+def test_a_run_of_another_size_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model=size1m",
+              "model.batch_length=8", "model.batch_size=2")  # fmt: skip
+    assert "Weights cannot be converted between sizes" in capsys.readouterr().err
