@@ -31,7 +31,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -227,7 +227,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
                 checks.check_overrides(config, given)
-                checks.check_dreamer(OmegaConf.to_object(resolve(config)))
+                checks.check_dreamer(cast(schema.DreamerConfig, OmegaConf.to_object(resolve(config))))
         except HydraException as error:
             return not entry.in_plain_words(error, "dreamer_v3", given)
         except SystemExit as refused:

@@ -20,7 +20,9 @@ class Range(NamedTuple):
     open_below: bool = False
 
     def __contains__(self, value: object) -> bool:
-        above = isinstance(value, (int, float)) and (self.low < value if self.open_below else self.low <= value)
+        if not isinstance(value, (int, float)):
+            return False
+        above = self.low < value if self.open_below else self.low <= value
         return above and value < math.inf and value <= self.high
 
     def __str__(self) -> str:
