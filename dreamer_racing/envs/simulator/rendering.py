@@ -1,4 +1,4 @@
-"""Nose-camera images of M drones on CPU: K single-threaded executors, each with a worker and a slice of the frames.
+"""Nose-camera images of M drones on CPU: K threads, each with a worker and a slice of the frames.
 
 Only the camera moves: hall and gates stand still and the drone is hidden from its own camera. So a worker prepares the
 scene once, and per frame only places the camera and draws.
@@ -19,8 +19,11 @@ Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the t
 import logging
 import weakref
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from concurrent.futures import Future
+from itertools import zip_longest
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import mujoco
 import torch
@@ -38,6 +41,7 @@ from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.scene import Camera
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 RENDERERS = ("egl", "osmesa", "warp")
 HYBRID = "warp_cuda"
@@ -92,8 +96,65 @@ class Worker(Protocol):
         ...
 
 
+class RenderThread:
+    """A thread that does what it is given, in order, until it is ended.
+
+    Unlike an executor's, `end` takes no lock that could be held already: the garbage collector may call it anywhere.
+
+    Args:
+        name: of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._tasks: SimpleQueue[Task | None] = SimpleQueue()
+        self._thread = Thread(target=_serve, args=(self._tasks,), name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
+        """Have a function called, and return what will have its result."""
+        future: Future[T] = Future()
+        self._tasks.put(Task(future, function, arguments))
+        return future
+
+    def end(self, last: Callable[[], None] | None) -> None:
+        """End the thread once all is done, with a last function if there is one; does not wait for that."""
+        if last is not None:
+            self._tasks.put(Task(None, last, ()))
+        self._tasks.put(None)
+
+    def join(self) -> None:
+        """Wait for the end."""
+        self._thread.join()
+
+
+class Task(NamedTuple):
+    """Something to do in a thread."""
+
+    future: Future[Any] | None  # takes what it returns or raises; None: nobody waits
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+
+def _serve(tasks: SimpleQueue[Task | None]) -> None:
+    """Do what comes."""
+    while (task := tasks.get()) is not None:
+        try:
+            result = task.function(*task.arguments)
+        except BaseException as error:
+            if task.future is None:
+                logger.warning("A renderer could not be freed.", exc_info=error)
+            else:
+                task.future.set_exception(error)
+        else:
+            if task.future is not None:
+                task.future.set_result(result)
+        del task  # or the next wait would keep what it refers to
+
+
 class Renderer:
     """Spreads frames over workers, each of which lives in a thread of its own.
+
+    One that is let go without `close` frees its workers too, without waiting for it.
 
     Args:
         name: out of `RENDERERS`, or `HYBRID`.
@@ -105,48 +166,47 @@ class Renderer:
     def __init__(self, name: str, make_worker: Callable[[], Worker], camera: Camera, num_workers: int) -> None:
         self.name = name
         self.camera = camera
-        self._executors = [ThreadPoolExecutor(1, f"render_{index}") for index in range(num_workers)]
+        self._threads = [RenderThread(f"render_{index}") for index in range(num_workers)]
         self._workers: list[Worker] = []
-        # Holds the executors beyond this object: among garbage they would end their threads before `close` needs them.
-        self._free = weakref.finalize(self, _free, self._executors, self._workers)
-        self._free.atexit = False  # no thread takes work by then; contexts are freed at exit as it is
+        self._end = weakref.finalize(self, _end, self._threads, self._workers)
+        self._end.atexit = False  # contexts are freed at exit as it is
         try:
             # one after the other: the first GL context of a process initialises the display
-            for executor in self._executors:
-                self._workers.append(executor.submit(make_worker).result())
+            for thread in self._threads:
+                self._workers.append(thread.submit(make_worker).result())
         except BaseException:
-            self._free()
+            self.close()
             raise
         self._mount = NoseMount(camera)
 
     def render(self, position: Tensor, attitude: Tensor, looks: Looks | None = None) -> Tensor:
         """Images (M, height, width, 3) of drones at positions (M, 3) with attitudes (M, 4), wxyz."""
+        assert self._end.alive, "the renderer is closed"
         camera = self.camera
         frames = len(position)
         eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
         images = torch.empty((frames, camera.height, camera.width, 3), dtype=torch.uint8)
-        size = max(1, -(-frames // len(self._executors)))
+        size = max(1, -(-frames // len(self._threads)))
         slices = [slice(start, start + size) for start in range(0, frames, size)]
         jobs = [
-            executor.submit(worker.draw, eye[part], axes[part], images[part], None if looks is None else looks[part])
-            for executor, worker, part in zip(self._executors, self._workers, slices, strict=False)
+            thread.submit(worker.draw, eye[part], axes[part], images[part], None if looks is None else looks[part])
+            for thread, worker, part in zip(self._threads, self._workers, slices, strict=False)
         ]
         for job in jobs:
             job.result()
         return images
 
     def close(self) -> None:
-        """Free every worker in its own thread, then end the threads."""
-        self._free()
+        """Free every worker in its own thread, and wait for the threads' end."""
+        self._end()
+        for thread in self._threads:
+            thread.join()
 
 
-def _free(executors: list[ThreadPoolExecutor], workers: list[Worker]) -> None:
-    """Free workers, of which there may be fewer, each in its thread; end the threads; leave both lists empty."""
-    for executor, worker in zip(executors, workers, strict=False):
-        executor.submit(worker.close).result()
-    for executor in executors:
-        executor.shutdown()
-    executors.clear()
+def _end(threads: list[RenderThread], workers: list[Worker]) -> None:
+    """Free workers, of which there may be fewer, and end the threads."""
+    for thread, worker in zip_longest(threads, workers):
+        thread.end(None if worker is None else worker.close)
     workers.clear()
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from dreamer_racing.envs.simulator.rendering import Renderer
+from dreamer_racing.envs.simulator.rendering import Renderer, RenderThread
 from dreamer_racing.envs.simulator.scene import Camera
 
 
@@ -53,8 +53,45 @@ def test_one_that_is_let_go_is_freed_and_nobody_waits_for_ever(keep: str) -> Non
         Environment(renderer)
     del renderer
     assert collected_in(10.0), "the collector waits for a thread that has ended"
+    for thread in threads:
+        thread.join(10.0)
     assert freed == [True, True]
     assert not threads & set(threading.enumerate())
+
+
+def test_the_collector_may_come_while_another_renderer_is_given_work() -> None:
+    freed: list[bool] = []
+
+    def work() -> None:
+        busy = RenderThread("render_busy")
+        thresholds = gc.get_threshold()
+        gc.set_threshold(2)  # it comes inside of nearly every call
+        try:
+            for _ in range(200):
+                Environment(Renderer("noted", lambda: NotedWorker(freed), Camera(), num_workers=1))
+                busy.submit(int).result()
+        finally:
+            gc.set_threshold(*thresholds)
+        busy.end(None)
+
+    worker = threading.Thread(target=work, daemon=True)
+    worker.start()
+    worker.join(60.0)
+    assert not worker.is_alive(), "the collector waits for what its own thread holds"
+    gc.collect()
+    assert freed == [True] * 200
+
+
+def test_a_worker_that_cannot_be_freed_does_not_keep_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    freed: list[bool] = []
+
+    class Stuck(NotedWorker):
+        def close(self) -> None:
+            raise RuntimeError("no display")
+
+    workers = iter([Stuck(freed), NotedWorker(freed)])
+    Renderer("noted", lambda: next(workers), Camera(), num_workers=2).close()
+    assert len(freed) == 1 and "could not be freed" in caplog.text
 
 
 def test_closing_twice_frees_once() -> None:
