@@ -54,7 +54,7 @@ ROOT = Path(__file__).parents[1]
 TRACKS = ROOT / "dreamer_racing" / "envs" / "tracks"
 AGENT = ROOT / "agents" / "kidney"
 CASES = {"tracks": 40_000, "actions": 40_960, "contracts": 16_000, "overrides": 2_000, "checkpoints": 2_000}
-SECONDS = 10
+SECONDS, HOUR = 10, 3600  # of a case, and of a kind
 DRONES = 256
 ODD: tuple[Any, ...] = (
     None, True, "", "x" * 3000, "\0", "é", "1e400", "nan", -1, 0, 1, 2**40, 10**30, -(10**30), 1e-300, 1e300, -1e300,
@@ -64,7 +64,17 @@ PIECES = (
     "&a [*a, *a]", "!!python/object/apply:os.system ['true']", "!!python/name:os.system", "<<: *a", "? [1]", "%YAML 9",
     "---\n", "- ", ": ", "{", "}", "[", "]", "\t", "\x00", "#" * 99, "1e999", ".nan", "0x7f", "2001-01-01", "~", "'",
 )  # fmt: skip
-FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "socket.bind")
+FORBIDDEN = (
+    "os.symlink",
+    "os.link",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.fork",
+    "subprocess.Popen",
+    "socket.connect",
+    "socket.bind",
+)
 
 
 class EscapedError(BaseException):
@@ -337,18 +347,18 @@ def main() -> None:
     for kind in arguments.kinds:
         command = [sys.executable, __file__, "--child", "--kinds", kind]
         command += ["--share", str(arguments.share), "--seed", str(arguments.seed)]
-        done = subprocess.run(command, text=True, capture_output=True, check=False)
-        died = done.returncode != 0
-        found = (
-            {"kind": kind, "failed": 1, "failures": [done.stderr[-1500:]]}
-            if died
-            else json.loads(done.stdout.splitlines()[-1])
-        )
+        try:
+            done = subprocess.run(command, text=True, capture_output=True, check=True, timeout=HOUR)
+            found = json.loads(done.stdout.splitlines()[-1])
+        except subprocess.SubprocessError as error:  # it died, or hung where no signal reaches it
+            found = {"kind": kind, "cases": 0, "failed": 1, "failures": [f"{error}: {str(error.stderr)[-1500:]}"]}
         records.append({"benchmark": "fuzz", "taken": 0, "refused": 0, "failed": 0, **found})
     print_table(records, ("kind", "cases", "taken", "refused", "failed"))
     for record in records:
         print("\n".join(record["failures"]))
     write_json(records, arguments.json)
+    if any(record["failed"] for record in records):
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

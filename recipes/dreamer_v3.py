@@ -202,7 +202,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         losses = make_losses(agent, config.loss, config.model.imagination_horizon)
     learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, config.model), config.model)
     if config.init_from and not config.resume:
-        print(begin_with(learner, config.init_from, env))
+        print(begin_with(learner, config, env))
     seed_generators(config.seed)
     curriculum = make_curriculum(config)
     policy = learner.policy()

@@ -210,6 +210,7 @@ class StreamReplay(TensorDictReplayBuffer):
         state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
         keys = [field["key"] if isinstance(field["key"], str) else tuple(field["key"]) for field in state["fields"]]
         self._check_fields(keys, state["fields"])
+        self._check_frames(path, state)
         self._writer.load_state_dict(state["streams"])
         with ExitStack() as stack:
             files = [stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(keys))]
@@ -239,6 +240,15 @@ class StreamReplay(TensorDictReplayBuffer):
                 raise ValueError(f"The replay stores {key!r}, which the saved one does not have.")
             check_layout(key, layouts[key], stored)
 
+    @staticmethod
+    def _check_frames(path: Path, state: dict[str, Any]) -> None:
+        """Refuse files that cannot hold a frame of every stream, before anything is restored."""
+        streams = sum(filled > 0 for filled in state["streams"]["filled"])
+        for number, field in enumerate(state["fields"]):
+            file = path / _FIELD.format(number)
+            if len(field["frames"]) != streams or file.stat().st_size != sum(field["frames"]):
+                raise ValueError(f"{file} does not hold a frame for each of {streams} streams.")
+
 
 def _dtype(field: dict[str, Any]) -> torch.dtype:
     return getattr(torch, field["dtype"].removeprefix("torch."))
@@ -251,9 +261,13 @@ def _compressed(records: Tensor) -> bytes:
 
 def _expanded(frame: bytes, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """What `_compressed` made a frame of."""
-    if zstandard.frame_content_size(frame) != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"A frame of the saved replay does not hold {list(shape)} values of {dtype}.")
-    return torch.frombuffer(bytearray(zstandard.decompress(frame)), dtype=dtype).view(shape)
+    try:
+        if zstandard.frame_content_size(frame) != math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"A frame of the saved replay does not hold {list(shape)} values of {dtype}.")
+        content = zstandard.decompress(frame)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"A frame of the saved replay is damaged: {error}.") from error
+    return torch.frombuffer(bytearray(content), dtype=dtype).view(shape)
 
 
 def replay_bytes(

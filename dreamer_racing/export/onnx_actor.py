@@ -36,10 +36,17 @@ _LAYOUT = {
     "outputs": [_TENSOR],
     "files": {"onnx": {"sha256": str}, "weights?": {"name": str, "sha256": str}},
     "model": {},
+    "weights_sha256": str,
     "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
     "control": {"rate_hz": float},
     "source": {},
-    "camera?": {"width_px": int, "height_px": int, "vertical_field_of_view_deg": float, "tilt_up_deg": float},
+    "camera?": {
+        "width_px": int,
+        "height_px": int,
+        "vertical_field_of_view_deg": float,
+        "tilt_up_deg": float,
+        "position_body_m": [float],
+    },
 }
 """What is read of a contract: keys and types of values; of a list, what each entry is. ``?``: may be absent or null."""
 _TYPES = ("uint8", "float32", "bool")
@@ -160,7 +167,7 @@ class OnnxActor(RecurrentActor):
         """Refuse a contract that belongs to other files; there are `weights` where the ONNX file holds none."""
         described = self.contract["files"]
         files = {"onnx": path}
-        if "weights" in described:
+        if described.get("weights") is not None:
             files["weights"] = path.parent / described["weights"]["name"]
         for kind, file in files.items():
             if not file.is_file():
@@ -203,7 +210,7 @@ def read_contract(path: str | Path) -> dict[str, Any]:
             f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, version {FORMAT_VERSION}. "
             "Use the onnx_actor.py of the release that exported it, or export again."
         )
-    if misfit := _unlike(contract, _LAYOUT, "") or _unfit_inputs(contract):
+    if misfit := _unlike(contract, _LAYOUT, "") or _unfit(contract):
         raise ValueError(f"{path}: {misfit}. Copy it from the export again.")
     return contract
 
@@ -214,7 +221,9 @@ def _unlike(value: Any, layout: Any, name: str) -> str:
         if not isinstance(value, dict):
             return f"{name} is {_short(value)}, not an object"
         wanted = {
-            key.removesuffix("?"): inner for key, inner in layout.items() if key[-1] != "?" or value.get(key[:-1])
+            key.removesuffix("?"): inner
+            for key, inner in layout.items()
+            if key[-1] != "?" or value.get(key[:-1]) is not None
         }
         if absent := wanted.keys() - value.keys():
             return f"{name or 'it'} lacks {', '.join(sorted(absent))}"
@@ -232,16 +241,21 @@ def _unlike(value: Any, layout: Any, name: str) -> str:
     return next(filter(None, (_unlike(*part) for part in parts)), "")
 
 
-def _unfit_inputs(contract: dict[str, Any]) -> str:
-    """Say which input no actor has; nothing if all can be."""
-    inputs = {entry["name"]: entry for entry in contract["inputs"]}
-    if absent := [name for name in (*RECURRENT, "is_init") if name not in inputs]:
+def _unfit(contract: dict[str, Any]) -> str:
+    """Say what of a well laid out contract no actor has; nothing if all can be."""
+    names = [entry["name"] for entry in contract["inputs"]]
+    if absent := [name for name in (*RECURRENT, "is_init") if name not in names]:
         return f"inputs lacks {', '.join(absent)}"
-    for name, entry in inputs.items():
-        if entry["type"] not in _TYPES:
-            return f"the input {_short(name)} is of type {_short(entry['type'])}, not {', '.join(_TYPES)}"
-        if min(entry["shape"]) < 1 or math.prod(entry["shape"]) > _MOST:
-            return f"the input {_short(name)} has the shape {_short(entry['shape'])}"
+    if len(set(names)) < len(names):
+        return "inputs has a name twice"
+    for name, shape, kind in ((entry["name"], entry["shape"], entry["type"]) for entry in contract["inputs"]):
+        if kind not in _TYPES:
+            return f"the input {_short(name)} is of type {_short(kind)}, not {', '.join(_TYPES)}"
+        if min(shape) < 1 or math.prod(shape) > _MOST:
+            return f"the input {_short(name)} has the shape {_short(shape)}"
+    actions = contract["inputs"][names.index("previous_action")]["shape"][-1]
+    if (channels := len(contract["action"]["channels"])) != actions:
+        return f"action.channels has {channels} entries, of an actor with {actions} actions"
     rate = contract["control"]["rate_hz"]
     return "" if rate > 0 else f"control.rate_hz is {rate}, not above 0"
 

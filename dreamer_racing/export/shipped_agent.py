@@ -195,14 +195,15 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
         ValueError: The message names the setting, the agent's value and the environment's.
     """
     there = {"env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt)}
-    there["env.from_pixels"] = (contract["camera"] is not None, env.from_pixels)
-    if contract["camera"] is not None and env.from_pixels:
+    camera = contract.get("camera")
+    there["env.from_pixels"] = (camera is not None, env.from_pixels)
+    if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)
-        pairs = {name: (value, here[name]) for name, value in contract["camera"].items()}
+        pairs = {name: (value, here.get(name)) for name, value in camera.items()}
         there |= {_CAMERA_SETTINGS.get(name, f"camera.{name}"): pair for name, pair in pairs.items()}
     for setting, (trained, given) in there.items():
-        same = abs(trained - given) < 1e-6 * abs(trained) if isinstance(trained, float) else trained == given
-        if not same:
+        numbers = isinstance(trained, float) and isinstance(given, int | float)
+        if not (abs(trained - given) < 1e-6 * abs(trained) if numbers else trained == given):
             raise ValueError(
                 f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
                 "with nothing else."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import re
@@ -43,6 +44,9 @@ print(frames)
 eyes.close()
 """
 """Counts the images of one second by an OpenGL back end, in a process of its own: two do not go together in one."""
+
+
+PATIENCE = 15  # s
 
 
 class State(Enum):
@@ -134,8 +138,11 @@ def accelerator() -> Iterator[Finding]:
 
 def cuda_of_torch() -> str | None:
     """Return the CUDA version that torch was built for, without importing it."""
-    files = [file for file in importlib.metadata.files("torch") or () if file.as_posix() == "torch/version.py"]
-    found = re.search(r"^cuda.*= '(.+)'", files[0].read_text(), re.MULTILINE) if files else None
+    package = importlib.util.find_spec("torch")
+    places = package.submodule_search_locations if package is not None else None
+    version = Path(places[0]) / "version.py" if places else None
+    text = version.read_text(encoding="utf-8") if version is not None and version.is_file() else ""
+    found = re.search(r"^cuda.*= '(.+)'", text, re.MULTILINE)
     return found[1] if found else None
 
 
@@ -185,7 +192,11 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Finding]:
     """Look at what draws images, and how fast."""
     found, reasons = {}, {}
     for backend, probe in probes.items():
-        printed, errors = probe.communicate()
+        try:
+            printed, errors = probe.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            probe.kill()
+            printed, errors = probe.communicate()[0], f"TimeoutError: no image within {PATIENCE} s"
         if probe.returncode == 0:
             found[backend] = int(printed)
         else:

@@ -114,7 +114,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
     """Say what a finished run left, and which commands go on from there."""
     place, longer = shlex.quote(os.path.relpath(directory.path)), 2 * config.total_env_steps
     lines = [
-        f"{place}: metrics.csv, plots/, videos/, evaluations/; best/ has the weights of the best evaluation",
+        f"{place}: {', '.join(sorted(path.name for path in directory.path.iterdir() if path.name[0] != '.'))}",
         f"evaluate it:  python recipes/evaluate.py checkpoint={place} episodes=100",
         f"watch it fly: python recipes/fly.py agent={place}" if is_race(config) else "",
         f"go on:        python recipes/{config.algorithm}.py resume={place} total_env_steps={longer}",

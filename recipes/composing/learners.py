@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from omegaconf import OmegaConf
 
 from composing.arena import Environment
 from composing.command_line import agent_path
@@ -17,6 +18,7 @@ from dreamer_racing.learners.saved_dreamer import check_size
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import Clock
 
@@ -45,15 +47,21 @@ def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 
-def begin_with(learner: DreamerLearner, source: str, env: Environment) -> str:
-    """Give a new learner the weights of another run or of an agent that ships; return a line on what that was.
+def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment) -> str:
+    """Give a new learner the weights that ``init_from`` names; return a line on what that was.
 
     Raises:
         FileNotFoundError: there is no such run, checkpoint or agent.
         ValueError: its networks are of another size, or were trained with another camera, control rate or loss.
     """
+    source = str(config.init_from)
     folder = agent_path(source)
     if not is_agent(folder):
+        saved = OmegaConf.load(RunDirectory.of(latest_checkpoint(folder)).config)
+        for name in ("env.control_rate", "env.camera_tilt"):
+            there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
+            if there != here:
+                raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
         state, metadata = load_state(folder, "learner")
         learner.adopt(state)
         return f"weights: all those of {folder} at {metadata['env_steps']:,} env_steps (init_from=)"

@@ -375,6 +375,7 @@ def test_what_repeats_takes_little_room(tmp_path):
         (lambda field: field.pop("frames"), "older version, which did not compress it"),
         (lambda field: field.update(shape=[2, 2, 3]), "does not hold .* values of torch.uint8"),
         (lambda field: field.update(dtype="torch.int64"), "does not hold .* values of torch.int64"),
+        (lambda field: field["frames"].pop(), "does not hold a frame for each of 3 streams"),
     ],
 )
 def test_load_refuses_what_does_not_fit_together(tmp_path, change, message):
@@ -385,6 +386,17 @@ def test_load_refuses_what_does_not_fit_together(tmp_path, change, message):
     change(next(field for field in state["fields"] if field["key"] == "pixels"))
     (tmp_path / "replay.json").write_text(json.dumps(state))
     with pytest.raises(ValueError, match=message):
+        make_replay(60, 3, 6, 4).load(tmp_path)
+
+
+def test_load_refuses_a_damaged_frame(tmp_path):
+    replay = make_replay(60, 3, 6, 4)
+    replay.extend(collect(CountingEnv(3), steps=15, batches=1)[0])
+    replay.dump(tmp_path)
+    content = bytearray((tmp_path / "0.zst").read_bytes())
+    content[:4] = b"\0\0\0\0"
+    (tmp_path / "0.zst").write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
         make_replay(60, 3, 6, 4).load(tmp_path)
 
 

@@ -462,6 +462,13 @@ def spoil_input(number: int, key: str, value: object):
         (spoil("inputs", [{"name": "h", "shape": [1], "type": "float32"}]), ValueError, "inputs lacks z, previous"),
         (spoil_input(0, "shape", [2**40]), ValueError, "has the shape .1099511627776"),
         (spoil_input(0, "type", "object"), ValueError, "is of type 'object', not uint8"),
+        (
+            spoil("action", {"channels": [{"name": "x", "unit": "m", "offset": 0, "scale": 1}]}),
+            ValueError,
+            "1 entries, of",
+        ),
+        (spoil("camera", 0), ValueError, "camera is 0, not an object"),
+        (spoil("weights_sha256", None), ValueError, "weights_sha256 is None, not a text"),
         (lambda path: path.write_text("[" * 100_000), ValueError, "not valid JSON"),
     ],
 )

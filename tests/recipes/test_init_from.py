@@ -85,6 +85,12 @@ def test_what_does_not_fit_is_refused(
     assert all(word in said for word in words), said
 
 
+def test_a_run_at_another_rate_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "env.control_rate=25")
+    assert "env.control_rate=25.0: init_from=" in capsys.readouterr().err
+
+
 def test_a_run_of_another_size_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         build(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model=size1m",

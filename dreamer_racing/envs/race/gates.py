@@ -127,7 +127,7 @@ class GateSweeper:
         self._miss_radius = miss_radius
         self._gates = torch.arange(len(x), device=device).view(-1, 1, 1)
         self._two_in_reach = any(
-            math.dist(gate.position, after.position) < reach + track.shape.outer
+            math.dist(gate.position, after.position) < reach + 2 * math.hypot(self._half_opening, self._half_opening)
             for gate, after in zip(track.gates, (*track.gates[1:], track.gates[0]), strict=True)
         )
 
@@ -246,7 +246,8 @@ class GateSweeper:
         """Return when a frame is first touched, (N,), inf if never; position is (3, P + 1, N)."""
         # (3, 1, N) against (3, G, 1): most drones are nowhere near a frame
         low, high = position.amin(1, keepdim=True), position.amax(1, keepdim=True)
-        near = ((low <= self._frame_high) & (high >= self._frame_low)).all(0).any(0)  # (N,)
+        # (N,); who is lost, and so nowhere, may have touched one before
+        near = ~((high < self._frame_low) | (low > self._frame_high)).any(0).all(0)
         time = torch.full_like(position[0, 0], math.inf)
         if not self._picks:
             return self._enter_bars(position, segment).where(near, time)

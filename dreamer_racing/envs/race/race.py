@@ -18,7 +18,8 @@ EPISODE_TIME = 20.0
 """Time after which a training episode is truncated, s [choice]."""
 
 MAX_SPEED = 50.0
-"""No drone gets faster between the walls of a track, m/s: 2.7 times its weight over 30 m, without drag, give 39."""
+"""Up to which two gates in one control step both count, m/s: 2.7 times a drone's weight, and that weight, without drag
+over 30 m, give 47 [choice]."""
 
 EVALUATION_TIME = 30.0
 """The same in evaluation, s: three laps of split_s take a good pilot 22 s [choice]."""

@@ -148,6 +148,14 @@ def test_a_frame_is_touched_from_any_side(path, crash, picks):
     assert sweeper(both, torch.tensor([0, 0])).crash.tolist() == [crash, crash]
 
 
+@pytest.mark.parametrize("picks", [True, False])
+def test_what_is_touched_before_a_position_is_lost_is_a_touch(picks):
+    sweeper = GateSweeper(PLAIN, dtype=torch.float64)
+    sweeper._picks = picks
+    path = torch.tensor([(0.04, 1.1, 3.0), (0.04, 0.9, 3.0), (math.nan, 0.0, 3.0)], dtype=torch.float64).unsqueeze(1)
+    assert sweeper(path, torch.tensor([0])).crash == FRAME
+
+
 def test_a_bar_behind_the_plane_is_touched_after_the_pass():
     assert sweep(PLAIN, [(-0.1, 0.6, 3.0), (0.02, 0.6, 3.0), (0.03, 0.7, 3.0)]) == (1, pytest.approx(0.6), FRAME)
 
