@@ -351,7 +351,12 @@ def main() -> None:
             done = subprocess.run(command, text=True, capture_output=True, check=True, timeout=HOUR)
             found = json.loads(done.stdout.splitlines()[-1])
         except subprocess.SubprocessError as error:  # it died, or hung where no signal reaches it
-            found = {"kind": kind, "cases": 0, "failed": 1, "failures": [f"{error}: {str(error.stderr)[-1500:]}"]}
+            found = {
+                "kind": kind,
+                "cases": 0,
+                "failed": 1,
+                "failures": [f"{error}: {str(getattr(error, 'stderr', ''))[-1500:]}"],
+            }
         records.append({"benchmark": "fuzz", "taken": 0, "refused": 0, "failed": 0, **found})
     print_table(records, ("kind", "cases", "taken", "refused", "failed"))
     for record in records:

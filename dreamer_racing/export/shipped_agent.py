@@ -194,12 +194,14 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
     Raises:
         ValueError: The message names the setting, the agent's value and the environment's.
     """
-    there = {"env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt)}
+    there: dict[str, tuple[Any, Any]] = {
+        "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt)
+    }
     camera = contract.get("camera")
     there["env.from_pixels"] = (camera is not None, env.from_pixels)
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)
-        pairs = {name: (value, here.get(name)) for name, value in camera.items()}
+        pairs: dict[str, tuple[Any, Any]] = {name: (value, here.get(name)) for name, value in camera.items()}
         there |= {_CAMERA_SETTINGS.get(name, f"camera.{name}"): pair for name, pair in pairs.items()}
     for setting, (trained, given) in there.items():
         numbers = isinstance(trained, float) and isinstance(given, int | float)
