@@ -183,7 +183,8 @@ class Arena:
             content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
             path.write_bytes(content)
             done = self._run(f"resume={name}", "total_env_steps=1200")
-            named = "is damaged" in done.stderr or "not complete" in done.stderr
+            said = done.stdout + done.stderr
+            named = "is damaged" in said or "not complete" in said
             yield self._verdict("damage", str(file), name, "" if named else "the damage was not said")
 
     def full_disks(self) -> Iterator[dict[str, Any]]:
