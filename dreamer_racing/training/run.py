@@ -93,7 +93,9 @@ class Run:
         """Save everything, unless the networks have just been spoilt."""
         with self.clock.timed("save"):
             self.learner.check_finite()
-            return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
+            return self.checkpoints.save(
+                self.counters["env_steps"], {"wall_clock": self.clock.total, "evaluated": self.evaluated}
+            )
 
     def try_to_save(self) -> str:
         """Save on the way, where a full disk is no reason to stop: return a line on what went wrong, or nothing."""

@@ -49,6 +49,17 @@ def test_resume_continues_where_the_run_stopped(run_dir: Path) -> None:
     assert config.track == "circle" and config.model.size == "debug" and config.total_env_steps == 1000
 
 
+def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_dir: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
+    shutil.copytree(run_dir, killed)
+    (killed / "finished.json").unlink()
+    before = (killed / "metrics.csv").read_text()
+    done = recipe("dreamer_v3", f"resume={killed}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (killed / "finished.json").exists()
+    assert (killed / "metrics.csv").read_text() == before
+
+
 def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
     before = (run_dir / "config.yaml").read_text()
     done = recipe("dreamer_v3", f"resume='{run_dir}'", "track=kidney", cwd=run_dir.parent)
