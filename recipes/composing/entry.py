@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from composing.command_line import CONFIG_DIR, override_key, plain_errors
-from dreamer_racing.settings import suggestion
+from dreamer_racing.settings import shortened, suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
@@ -111,9 +111,15 @@ def setting_names(config: DictConfig, prefix: str = "") -> list[str]:
 def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:
     """Refuse +name=value of what is neither a group of configurations nor a free entry: nothing would read it.
 
+    A list of lists for a group is refused too: hydra fails on it.
+
     Raises:
         ValueError: the message says which may be meant.
     """
+    for override in overrides:
+        group, _, value = override.partition("=")
+        if value.replace(" ", "").startswith("[[") and (CONFIG_DIR / group.lstrip("+")).is_dir():
+            raise ValueError(f"{group}={shortened(value)}: a group takes the name of one of its configurations.")
     added = [override_key(override) for override in overrides if override.startswith("+")]
     if not added or any(override.startswith(("--config", "-c")) for override in overrides):
         return  # with configurations of one's own there may be other groups

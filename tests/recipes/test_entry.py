@@ -66,6 +66,11 @@ def test_what_hydra_refuses_is_said_in_plain_words(override: str, words: str) ->
     assert words in said and "schema" not in said and "\n" not in said and "hydra.cc" not in said
 
 
+def test_a_list_of_lists_is_no_choice_of_a_group() -> None:
+    with pytest.raises(ValueError, match="env=\\[\\[\\[\\]\\]\\]: a group takes the name"):
+        recipe_module("composing.entry").refuse_unknown_settings(["env=[[[]]]"], "dreamer_v3")
+
+
 def test_a_setting_that_nothing_reads_is_not_added() -> None:
     entry = recipe_module("composing.entry")
     recipe_module("composing.schema").register()
