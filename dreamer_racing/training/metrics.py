@@ -100,6 +100,10 @@ class MetricsLog:
                 flush()
         return values
 
+    def holds(self, name: str, env_steps: int) -> bool:
+        """Whether a row at these env_steps has a value of this metric."""
+        return any(int(row[X_AXIS]) == env_steps and row.get(name) for row in _read_rows(self.path))
+
     def close(self) -> None:
         """Closes the loggers that can be closed."""
         for sink in self.loggers:

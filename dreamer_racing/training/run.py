@@ -66,6 +66,10 @@ class Run:
 
     remedy: ClassVar[str] = "learning rate"  # what to lower once a loss is not finite, e.g. "ppo.learning_rate"
 
+    def __post_init__(self) -> None:
+        if self.metrics.holds("evaluation/return_mean", self.counters["env_steps"]):
+            self.evaluated = self.counters["updates"]  # a run killed behind its evaluation
+
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Make the updates that are due after a rollout; after none, those that an interrupted run still owes."""
         raise NotImplementedError
@@ -93,9 +97,7 @@ class Run:
         """Save everything, unless the networks have just been spoilt."""
         with self.clock.timed("save"):
             self.learner.check_finite()
-            return self.checkpoints.save(
-                self.counters["env_steps"], {"wall_clock": self.clock.total, "evaluated": self.evaluated}
-            )
+            return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
 
     def try_to_save(self) -> str:
         """Save on the way, where a full disk is no reason to stop: return a line on what went wrong, or nothing."""

@@ -262,10 +262,8 @@ def assemble(
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep)
     clock = RunClock(counters)
-    noted: dict[str, Any] = {}
     if config.resume:
-        noted = checkpoints.load(config.resume, may_lack=("lag", "passes"))
-        clock.total = noted.get("wall_clock", 0.0)
+        clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
@@ -276,7 +274,7 @@ def assemble(
         resume_env_steps=counters["env_steps"] if config.resume else None,
     )
     print(f"run directory: {directory.path}")
-    run = kind(
+    return kind(
         config=config,
         directory=directory,
         env=env,
@@ -294,5 +292,3 @@ def assemble(
         lock=lock,
         **own,
     )
-    run.evaluated = noted.get("evaluated", run.evaluated)
-    return run

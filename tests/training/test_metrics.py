@@ -90,6 +90,7 @@ def test_resuming_drops_later_rows_and_a_torn_one(tmp_path):
         file.write("1,2")  # killed while writing "1234567,2,3"
     log = MetricsLog(tmp_path, resume_env_steps=25)
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20"]
+    assert log.holds("a", 20) and not log.holds("a", 25) and not log.holds("c", 20)
     log.push({"b": 5.0, "c": 6.0})
     log.write(35)
     assert read(tmp_path)[-1] == {"env_steps": "35", "a": "", "b": "5", "c": "6"}
