@@ -47,6 +47,7 @@ from dreamer_racing.modules.rssm import mix_uniform
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
+pytestmark = pytest.mark.xdist_group("export")  # one worker makes what these tests share
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ModelSize("tiny", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4, blocks=4)

@@ -25,6 +25,8 @@ from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training.checkpoint import RunCheckpoints
 from tests.dreamers import learner_of
 
+pytestmark = pytest.mark.xdist_group("shipped")  # one worker makes what these tests share
+
 WORLDS = {"track": "circle", "num_envs": 1, "camera": Camera(32, 32, tilt=30.0), "control_rate": 25.0, "num_threads": 1}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import functools
 
 import pytest
 import torch
@@ -31,16 +31,20 @@ def make(device: str, **settings: object) -> DreamerLearner:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile on a CPU needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("device", "backend"),
+    [("cpu", "aot_eager"), pytest.param("cuda", "inductor", marks=pytest.mark.gpu)],  # inductor's C++ takes minutes
+)
 @torch._inductor.config.patch(fallback_random=True)  # the same random numbers as eager mode
-def test_compiled_updates_are_those_of_eager_mode() -> None:
+def test_compiled_updates_are_those_of_eager_mode(device: str, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     torch._dynamo.reset()
-    plain, compiled = make("cpu"), make("cpu", compile=True)
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+    plain, compiled = make(device), make(device, compile=True)
     for seed in range(3):
         metrics = []
         for learner in (plain, compiled):
             torch.manual_seed(seed)
-            metrics.append({name: value.item() for name, value in learner.update(batch("cpu", steps=2)).items()})
+            metrics.append({name: value.item() for name, value in learner.update(batch(device, steps=2)).items()})
         assert metrics[1] == pytest.approx(metrics[0], rel=1e-3, abs=1e-4)
 
 

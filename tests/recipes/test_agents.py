@@ -18,6 +18,7 @@ from tests.running_recipes import ROOT, recipe, recipe_module
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
+pytestmark = pytest.mark.xdist_group("agent")  # one worker makes what these tests share
 
 EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
 

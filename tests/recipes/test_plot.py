@@ -18,6 +18,8 @@ from tests.figures.test_curves import write_run
 from tests.figures.test_flights import flat_dream, random_flight
 from tests.running_recipes import ROOT, recipe_module
 
+pytestmark = pytest.mark.xdist_group("figures")  # one worker makes what these tests share
+
 RECIPE = ROOT / "recipes" / "plot.py"
 
 

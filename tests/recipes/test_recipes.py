@@ -13,6 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.evaluation.lesions import LESIONS
 from tests.running_recipes import CONFIG, SMALL, build, recipe, recipe_module, rows
 
+pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests share
+
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
