@@ -17,6 +17,7 @@ from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
 
 MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
 GL_LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
+_open_contexts: set[Any] = set()  # a thread that is not a context's own must not collect it
 
 
 class RendererUnavailableError(RuntimeError):
@@ -35,7 +36,8 @@ class OpenGLScene:
     def __init__(self, backend: str, model: mujoco.MjModel, camera: Camera) -> None:
         gl = importlib.import_module(f"mujoco.{backend}")
         self._gl: Any = gl.GLContext(camera.width, camera.height)
-        atexit.register(self._gl.free)  # runs before MuJoCo's own hook terminates the display
+        keep_display(backend)
+        _open_contexts.add(self._gl)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -85,7 +87,7 @@ class OpenGLScene:
         """Free the OpenGL context."""
         self._context.free()
         self._gl.free()
-        atexit.unregister(self._gl.free)
+        _open_contexts.discard(self._gl)
 
 
 def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
@@ -100,6 +102,22 @@ def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLSce
         return OpenGLScene(backend, model, camera)
     except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
         raise RendererUnavailableError(f"{backend} did not start ({type(error).__name__}: {error}).") from error
+
+
+def keep_display(backend: str) -> None:
+    """Leave EGL's display to the end of the process, where MuJoCo and dm_control, which share it, terminate it at exit.
+
+    The contexts of whichever of the two outlives the other's hook would print tracebacks then.
+    """
+    if backend == "egl":
+        atexit.unregister(importlib.import_module("OpenGL.EGL").eglTerminate)
+
+
+@atexit.register
+def _leave_contexts() -> None:
+    """Leave contexts to it too: dm_control, imported after the last of them was made, has terminated the display."""
+    for context in _open_contexts:
+        context._context = None
 
 
 def require_library(backend: str) -> None:

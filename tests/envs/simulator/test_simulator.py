@@ -374,3 +374,19 @@ def test_closing_twice_is_safe() -> None:
     made.close()
     with pytest.raises(RuntimeError):
         made.render()
+
+
+OURS = "from dreamer_racing.envs.torchrl_env import DroneRacingEnv; env = DroneRacingEnv('circle', 2, renderer='egl')"
+THEIRS = "from dm_control import suite; theirs = suite.load('cartpole', 'swingup'); theirs.physics.render(8, 8)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [(OURS, THEIRS), (THEIRS, OURS)], ids=["ours first", "theirs first"])
+def test_nothing_is_printed_at_the_end_beside_dm_controls_renderer(order: tuple[str, str]) -> None:
+    renderer_or_skip("egl")
+    script = "\n".join((*order, "env.reset()"))
+    environment = {**os.environ, "MUJOCO_GL": "egl", "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "Error" not in done.stderr and "Traceback" not in done.stderr
