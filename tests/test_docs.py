@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -12,7 +13,10 @@ import pytest
 import yaml
 
 from dreamer_racing import GYM_ENVIRONMENTS
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
+from dreamer_racing.envs.worlds import RaceOptions
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES
 
 ROOT = Path(__file__).parents[1]
@@ -96,6 +100,23 @@ def test_names_that_are_chosen_from_are_all_on_their_pages(options):
             assert f"`{name}`" in rows[f"loss.{setting}"], name
     for name in GYM_ENVIRONMENTS:
         assert re.search(rf"\b{name}\b", (ROOT / "README.md").read_text(encoding="utf-8")), name
+
+
+def test_the_page_of_the_environment_has_every_crash_and_every_argument():
+    text = (ROOT / "docs" / "environment.md").read_text(encoding="utf-8")
+    names = {cause.name.lower() for cause in CrashCause if cause}
+    names |= inspect.signature(DroneRacingEnv.__init__).parameters.keys() | RaceOptions.__annotations__.keys()
+    assert {name for name in names if f"`{name}`" not in text} == {"self", "worlds", "backend"}  # the last is for tests
+
+
+def test_the_page_of_learning_names_columns_that_there_are():
+    text = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    run = ROOT / "results" / "default_to_the_end" / "metrics_kidney_seed0.csv"
+    known = set(run.read_text(encoding="utf-8").partition("\n")[0].split(","))
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "dreamer_racing").rglob("*.py"))
+    named = set(re.findall(r"`([a-z_]+/[a-z_]+)`", text))
+    assert len(named) > 15
+    assert not {name for name in named - known if name not in sources}
 
 
 def test_the_readme_is_short():

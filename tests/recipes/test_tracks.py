@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS
-from tests.running_recipes import recipe
+from tests.running_recipes import ROOT, recipe
 
 TRIANGLE = """name: triangle
 gates:
@@ -24,6 +24,7 @@ def test_the_list_needs_no_torch_and_has_every_track(tmp_path: Path) -> None:
     assert done.returncode == 0 and head.startswith("track"), done.stderr
     assert [line.split()[0] for line in lines] == list(BUILTIN_TRACKS)
     assert not list(tmp_path.iterdir())
+    assert done.stdout in (ROOT / "docs" / "tracks.md").read_text(encoding="utf-8")
 
 
 def test_a_track_of_ones_own_is_measured_and_drawn(tmp_path: Path) -> None:
