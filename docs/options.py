@@ -29,6 +29,7 @@ import fly  # noqa: E402
 import hil  # noqa: E402
 import plant  # noqa: E402
 import sim_to_real  # noqa: E402
+import tracks  # noqa: E402
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
@@ -46,6 +47,7 @@ OTHERS = (
     plant.PlantConfig,
     sim_to_real.SimToRealConfig,
     doctor.DoctorConfig,
+    tracks.TracksConfig,
 )
 HEAD = """# Options
 

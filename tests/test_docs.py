@@ -3,29 +3,60 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 from dreamer_racing import GYM_ENVIRONMENTS
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
+from dreamer_racing.envs.worlds import RaceOptions
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").glob("*.md")]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
+
+
+def script(name: str) -> ModuleType:
+    """A script beside the pages."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.pop(0)
 
 
 @pytest.fixture(scope="module")
 def options() -> ModuleType:
-    """The generator of the page of options, a script beside it."""
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        return importlib.import_module("options")
-    finally:
-        sys.path.pop(0)
+    """The generator of the page of options."""
+    return script("options")
+
+
+@pytest.fixture(scope="module")
+def site_links() -> ModuleType:
+    """What mkdocs does with links."""
+    return script("site_links")
+
+
+class SiteLoader(yaml.SafeLoader):
+    """Reads mkdocs.yml without what it makes of Python's objects."""
+
+
+SiteLoader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
+
+
+def strings(tree: object) -> list[str]:
+    """The texts in lists and in values of mappings, at any depth."""
+    if isinstance(tree, str):
+        return [tree]
+    inner = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else []
+    return [text for part in inner for text in strings(part)]
 
 
 def anchors(page: Path) -> set[str]:
@@ -71,5 +102,61 @@ def test_names_that_are_chosen_from_are_all_on_their_pages(options):
         assert re.search(rf"\b{name}\b", (ROOT / "README.md").read_text(encoding="utf-8")), name
 
 
+def test_the_page_of_the_environment_has_every_crash_and_every_argument():
+    text = (ROOT / "docs" / "environment.md").read_text(encoding="utf-8")
+    names = {cause.name.lower() for cause in CrashCause if cause}
+    names |= inspect.signature(DroneRacingEnv.__init__).parameters.keys() | RaceOptions.__annotations__.keys()
+    assert {name for name in names if f"`{name}`" not in text} == {"self", "worlds", "backend"}  # the last is for tests
+
+
+def test_the_page_of_learning_names_columns_that_there_are():
+    text = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    run = ROOT / "results" / "default_to_the_end" / "metrics_kidney_seed0.csv"
+    known = set(run.read_text(encoding="utf-8").partition("\n")[0].split(","))
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "dreamer_racing").rglob("*.py"))
+    named = set(re.findall(r"`([a-z_]+/[a-z_]+)`", text))
+    assert len(named) > 15
+    assert not {name for name in named - known if name not in sources}
+
+
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 180
+
+
+def test_every_page_is_in_the_navigation_of_the_site(site_links):
+    nav = strings(yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), SiteLoader)["nav"])
+    assert sorted(nav) == sorted(site_links.place_of(page) for page in PAGES)
+
+
+def test_the_api_names_modules_that_are_there():
+    for page in (ROOT / "docs" / "api").glob("*.md"):
+        named = re.findall(r"^::: (.+)$", page.read_text(encoding="utf-8"), re.M)
+        assert named
+        for name in named:
+            assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
+
+
+@pytest.mark.parametrize(
+    ("page", "text", "expected"),
+    [
+        ("docs/hil.md", "[a](export.md#b) [c](#d) [e](https://f)", "[a](export.md#b) [c](#d) [e](https://f)"),
+        ("docs/hil.md", "![x\ny](../results/pilot.json)", "![x\ny](repository/results/pilot.json)"),
+        ("docs/hil.md", "[a](../README.md) [b](../results) `[c](../LICENSE)`", "[a](index.md) b `[c](../LICENSE)`"),
+        (
+            "docs/hil.md",
+            "```\n[c](../LICENSE)\n```\n[c](../LICENSE)",
+            "```\n[c](../LICENSE)\n```\n[c](repository/LICENSE)",
+        ),
+        ("docs/api/race.md", "[a](../hil.md) [b](../../LICENSE)", "[a](../hil.md) [b](../repository/LICENSE)"),
+        ("README.md", "[a](docs/hil.md#b) [c](LICENSE)", "[a](hil.md#b) [c](repository/LICENSE)"),
+        ("CONTRIBUTING.md", "[a](docs/hil.md) [c](LICENSE)", "[a](../hil.md) [c](LICENSE)"),
+    ],
+)
+def test_links_of_the_site(site_links, page, text, expected):
+    assert site_links.for_site(text, ROOT / page) == expected
+
+
+def test_pages_outside_docs_are_found_again(site_links):
+    for page in PAGES:
+        assert site_links.page_source(site_links.place_of(page)) == page
+    assert ROOT / "results" / "pilot.json" in set(site_links.linked(ROOT / "docs" / "simulation.md"))

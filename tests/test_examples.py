@@ -1,5 +1,6 @@
 """The examples, run as a user runs them, and the page that shows them."""
 
+import json
 import os
 import re
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+NOTEBOOK = ROOT / "examples" / "first_flight.ipynb"
 EXAMPLES = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
 PAGE = (ROOT / "docs" / "library.md").read_text()
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -70,3 +72,32 @@ def test_the_page_shows_the_files() -> None:
 @pytest.mark.parametrize("name", ["td3", "a2c"])
 def test_torchrl_loops_are_short(name: str) -> None:
     assert len(EXAMPLES[name].read_text().splitlines()) < 60
+
+
+def cells(kind: str) -> list[str]:
+    """The notebook's cells of a kind."""
+    found = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    return ["".join(cell["source"]) for cell in found if cell["cell_type"] == kind]
+
+
+@pytest.mark.slow
+def test_the_notebook_flies_and_knows_where_gates_are(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "MPLCONFIGDIR": str(tmp_path)}
+    command = [sys.executable, "-W", "ignore:FigureCanvasAgg is non-interactive", "-c", "\n".join(cells("code"))]
+    folder = NOTEBOOK.parent
+    before = sorted(folder.iterdir())
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(folder.iterdir()) == before
+    assert done.stdout.count("finished           1 (100%)") == 2, "pilot and agent fly three laps"
+    explained = [float(number) for number in re.findall(r"explained (-?\d\.\d\d)$", done.stdout, re.MULTILINE)]
+    assert len(explained) == 7 and min(explained) > 0.8
+
+
+def test_the_notebook_is_kept_without_outputs_and_its_links_lead_somewhere() -> None:
+    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+        assert not cell.get("outputs") and cell.get("execution_count") is None
+    links = re.findall(r"\]\(([^)]+)\)", "\n".join(cells("markdown")))
+    assert links and all((NOTEBOOK.parent / link).is_file() for link in links)

@@ -30,17 +30,17 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
         batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them, T ≥ ``SEEN`` + horizon.
 
     Returns:
-        Scalars on the learner's device:
+        Scalars on the learner's device.
 
         - ``held_out/<name>``: losses and metrics of the world-model loss, for example ``held_out/image_error`` and
-          ``held_out/reward_error``;
+            ``held_out/reward_error``;
         - ``held_out/open_loop_reward_error``: mean absolute error of the reward sum over the horizon, predicted from
-          the context and the actions taken;
+            the context and the actions taken;
         - ``held_out/open_loop_correlation``: of those sums with the real ones;
         - ``imagination/return_correlation`` and ``imagination/return_bias`` (imagined minus real): the return over the
-          horizon plus the discounted value after it, imagined by the present policy, against the one that the world
-          paid. The actions of newest records are those of nearly the same policy. Windows that begin at an episode's
-          last record, or in which time ran out, are left out. Not measured where updates do not imagine.
+            horizon plus the discounted value after it, imagined by the present policy, against the one that the world
+            paid. The actions of newest records are those of nearly the same policy. Windows that begin at an episode's
+            last record, or in which time ran out, are left out. Not measured where updates do not imagine.
 
     Raises:
         ValueError: If the windows are too short.

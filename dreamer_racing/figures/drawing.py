@@ -69,7 +69,7 @@ def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title:
     panels: list[tuple[Axes, tuple[int, int]]] = [(axes, (0, 1))]
     draw_track(axes, track)
     if side is not None:
-        _draw_track_side(side, track)
+        draw_track_side(side, track)
         axes.set_xlabel("")
         panels.append((side, (0, 2)))
     for panel, plane in panels:
@@ -282,8 +282,8 @@ def _number_gate(axes: Axes, track: Track, number: int) -> None:
     axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
 
 
-def _draw_track_side(axes: Axes, track: Track) -> None:
-    """Draw a track from the side, x–z: each gate as the outline of its frame, seen along y."""
+def draw_track_side(axes: Axes, track: Track) -> None:
+    """Draw a track from the side, x–z, with numbers: each gate as the outline of its frame, seen along y."""
     (x_low, _, z_low), (x_high, _, z_high) = track.bounds_low, track.bounds_high
     axes.add_patch(Rectangle((x_low, z_low), x_high - x_low, z_high - z_low, **_BOX))
     outer = track.shape.outer

@@ -115,6 +115,14 @@ class Track:
         """Number of race gates, which is the number of passes in a lap."""
         return len(self.gates)
 
+    @property
+    def gate_distances(self) -> tuple[float, ...]:
+        """Straight distances between the centres of gates that follow each other, of the last to the first last, m."""
+        following = (*self.gates[1:], self.gates[0])
+        return tuple(
+            math.dist(gate.position, next_.position) for gate, next_ in zip(self.gates, following, strict=True)
+        )
+
     def gate_positions(self, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> torch.Tensor:
         """Return the centres of the race gates, (G, 3), m."""
         return _tensor([gate.position for gate in self.gates], device, dtype)

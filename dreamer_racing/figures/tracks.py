@@ -1,0 +1,42 @@
+"""Tracks side by side, as maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.figures.drawing import INK, draw_track, draw_track_side, save
+
+COLUMNS = 3
+CELL = (5.0, 5.6)  # inches of a track, width and height
+
+
+def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
+    """Draw tracks from above and, below that, from the side: gates with their numbers and the direction of flight.
+
+    Args:
+        tracks: which, at least one.
+        path: the file to write; missing folders are made.
+
+    Raises:
+        ValueError: there is no track.
+    """
+    if not tracks:
+        raise ValueError("There is no track to draw: give at least one.")
+    columns = min(len(tracks), COLUMNS)
+    rows = math.ceil(len(tracks) / columns)
+    figure = Figure(figsize=(CELL[0] * columns, CELL[1] * rows), layout="constrained")
+    cells = figure.subfigures(rows, columns, squeeze=False).flat
+    for cell, track in zip(cells, tracks, strict=False):  # the last row may have cells to spare
+        _, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
+        above, side = cell.subplots(2, 1, sharex=True, height_ratios=[depth, height])
+        draw_track(above, track)
+        above.set_xlabel("")
+        draw_track_side(side, track)
+        title = f"{track.name}: {track.num_gates} gates, {sum(track.gate_distances):.1f} m"
+        above.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
+    save(figure, path)
