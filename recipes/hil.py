@@ -16,7 +16,7 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast, get_type_hints
@@ -28,11 +28,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.battery import STALE, BatteryConfig
 from dreamer_racing.hil.betaflight import rate_map
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, Outputs, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
-from dreamer_racing.hil.links import LinkConfig, make_link
+from dreamer_racing.hil.links import HEARING, LinkConfig, make_link
+from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
 from dreamer_racing.hil.pose_sources import PoseConfig, make_poses
@@ -101,7 +103,9 @@ class HilConfig:
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
     reference_voltage: float | None = setting(None, POSITIVE)  # V
-    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now
+    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now; until a link that hears of it says more
+    voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
+    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
 
     limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
     renderer: str = "auto"  # auto | egl | osmesa
@@ -190,6 +194,7 @@ def fly(config: HilConfig) -> int:
         "loop": loop.statistics.summary(),
         "poses": {"rejected": poses.rejected, "out_of_order": chain.clock.out_of_order},
         "commands_dropped": link.dropped,
+        "battery": battery_summary(config, chain, link),
     }
     if config.record:
         (folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -229,7 +234,7 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     """Make the chain of a flyer."""
     given = {name: value for name, value in vars(config.limits).items() if value is not None}
     limits = SafetyLimits.of_track(track, **given)
-    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm)
+    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config))
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
 
@@ -249,6 +254,8 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
     if missing and config.link not in ("simulated", "udp"):
         raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
     thrust = None if missing else ThrustMap(**numbers)
+    if thrust is not None:
+        check_battery(config, thrust)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
     return LinkConfig(
         config.link,
@@ -261,6 +268,29 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
         config.arm_channel,
         rate,
     )
+
+
+def battery_config(config: HilConfig) -> BatteryConfig | None:
+    """Return what is known of the battery; None where nothing more comes to be known."""
+    if config.link not in HEARING or config.voltage is None:
+        return None
+    return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
+
+
+def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
+    """Refuse to believe voltages that the thrust map cannot reckon with: in flight nothing may be refused.
+
+    Raises:
+        ValueError: The message names the setting and the voltage.
+    """
+    battery = battery_config(config)
+    for voltage in () if battery is None else battery.limits:
+        try:
+            replace(thrust, voltage=voltage)
+        except ValueError as error:
+            raise ValueError(
+                f"voltage_tolerance={config.voltage_tolerance:g}: with it {voltage:.4g} V would be believed. {error}"
+            ) from error
 
 
 def pose_config(config: HilConfig) -> PoseConfig:
@@ -288,6 +318,17 @@ def make_operator(config: HilConfig) -> OperatorSource:
     return TimedOperator() if name == "timed" else KeyboardOperator()
 
 
+def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:
+    """Return what the thrust map reckoned with at the end, and what was heard; None where there is no thrust map."""
+    if link.thrust is None:
+        return None
+    summary = {"voltage_set": config.voltage, "voltage": link.thrust.voltage, "rejected": link.rejected}
+    if (battery := chain.battery) is None:
+        return {**summary, "readings": 0}
+    age = battery.age if math.isfinite(battery.age) else None
+    return {**summary, "readings": battery.readings, "implausible": battery.implausible, "last_reading_age_s": age}
+
+
 def lap_times(chain: FlightChain) -> list[float]:
     """Return the times of whole laps from the first gate on, s."""
     firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
@@ -308,6 +349,18 @@ def say(summary: dict[str, Any]) -> None:
         if isinstance(row, dict):
             print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
     print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
+    if summary["battery"] is not None:
+        print(in_words(summary["battery"]))
+
+
+def in_words(battery: dict[str, Any]) -> str:
+    """Say by which voltage thrust became a throttle, and where that came from."""
+    if not battery["readings"]:
+        return f"battery: nothing usable was heard of it; thrust was reckoned by voltage={battery['voltage_set']:g}"
+    age = battery["last_reading_age_s"]
+    old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
+    left_out = f", {battery['implausible']} implausible ones left out" if battery["implausible"] else ""
+    return f"battery: {battery['voltage']:.2f} V at the end, by {battery['readings']} readings{left_out}{old}"
 
 
 def replay(config: HilConfig) -> int:
@@ -328,9 +381,9 @@ def play(flight: Flight, chain: FlightChain) -> int:
     chain.warm_up()
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
-        if differing := [name for name, value in again.items() if not same(value, tick["out"][name])]:
+        if differing := [name for name, value in tick["out"].items() if not same(value, again.get(name))]:
             name = differing[0]
-            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again[name]} now", file=sys.stderr)
+            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again.get(name)} now", file=sys.stderr)
             return 1
     print(f"replayed: {len(flight.ticks)} ticks, every one as it was written{'' if flight.whole else ' (cut off)'}")
     return 0

@@ -7,11 +7,13 @@ import os
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
@@ -103,6 +105,33 @@ def test_a_shipped_agent_flies_by_its_images_and_its_flight_plays_back_bit_for_b
         outputs = again.tick(read_inputs(tick["in"]))
         assert json.loads(json.dumps(describe_outputs(outputs))) == tick["out"]
     again.close()
+
+
+def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
+    class Sagging(Watched):
+        """Speaks of a battery that sinks, and once of a single cell."""
+
+        reckoned: ClassVar[list[float]] = []
+
+        def listen(self):
+            return [Reading(self.now(), 3.9 if 1.0 < self.elapsed < 1.03 else 16.0 - 0.5 * self.elapsed)]
+
+        def reckon_with(self, voltage):
+            self.reckoned.append(voltage)
+
+    def chain():
+        config = ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True, battery=BatteryConfig(voltage=16.0))
+        return make_chain(Hover(), plant.vehicle, config)
+
+    plant = Sagging(CIRCLE)
+    flying = chain()
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        plant.fly(flying, 50.0, 2.0, recorder)
+    assert flying.battery.implausible == 1 and 14.7 < plant.reckoned[-1] < plant.reckoned[0] == 16.0
+    again = chain()
+    ticks = Flight(tmp_path).ticks
+    assert [tick["out"]["voltage"] for tick in ticks] == plant.reckoned
+    assert all(again.tick(read_inputs(tick["in"])).voltage == tick["out"]["voltage"] for tick in ticks)
 
 
 def test_nothing_is_armed_without_leave():

@@ -141,6 +141,32 @@ def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
     assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
 
 
+def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
+    drone = {"mass": 0.6, "full_thrust": 9.0, "reference_voltage": 15.0, "voltage": 15.0}  # 11.25 V lift 5.1 N
+    config = hil.HilConfig(actor="kidney", link="crsf", device="/dev/null", **drone)
+    contract = hil.make_flyer(config)[1]
+    with pytest.raises(ValueError, match=r"voltage_tolerance=0.25: with it 11.25 V would be believed. .*must lift"):
+        hil.link_config(config, contract, 25.0)
+    config.voltage_tolerance = 0.15
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0
+    config.link, config.voltage_tolerance = "sbus", 0.25  # hears nothing
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and hil.battery_config(config) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"readings": 0}, "nothing usable was heard of it; thrust was reckoned by voltage=15.8"),
+        ({}, "15.12 V at the end, by 9 readings"),
+        ({"last_reading_age_s": 3.04}, "15.12 V at the end, by 9 readings, the last one 3.0 s before the end: STALE"),
+        ({"implausible": 2}, "15.12 V at the end, by 9 readings, 2 implausible ones left out"),
+    ],
+)
+def test_what_was_heard_of_the_battery_is_said(changes, words):
+    battery = {"voltage_set": 15.8, "voltage": 15.12, "readings": 9, "implausible": 0, "last_reading_age_s": 0.1}
+    assert hil.in_words(battery | changes) == f"battery: {words}"
+
+
 def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     config = hil.HilConfig(actor="circle", record=True)
     flyer, _ = hil.make_flyer(config)
