@@ -32,8 +32,8 @@ LONGEST = 60.0
 """s after which a flight is given up."""
 
 LIMITS = {"speed_max": 25.0, "velocity_tolerance": 20.0}
-"""m/s, the limits of safety that are not its own: the pilot is faster than a first flight should be, and what is asked is
-how much noise a flyer stands, not safety."""
+"""m/s, the limits of safety that are not its own: the pilot is faster than a first flight should be, and the
+question is how much noise a flyer stands, not safety."""
 
 
 class StudyFlight(NamedTuple):

@@ -234,7 +234,7 @@ def test_both_sides_of_what_velocities_may_differ_from_positions(claimed, state)
 
 
 def test_a_source_that_says_nothing_of_velocities_but_zeros_is_cut_within_its_window():
-    """Half a tick's way is behind it at the first tick, a sixth of the window at 9 m/s, and three sixths at the second."""
+    """Half a tick's way is behind it at the first tick, a sixth of the window at 9 m/s, and then three."""
     verdicts = moving(9.0, 0.0, velocity_tolerance=4.0)
     assert [verdict.state for verdict in verdicts[:2]] == [State.FLYING, State.CUT]
     assert Reason.POSE_CONTRADICTION in verdicts[1].reasons
