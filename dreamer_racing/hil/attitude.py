@@ -1,4 +1,4 @@
-"""Attitudes as quaternions, wxyz, body → world: turned, compared, and as matrices. In numpy, for one vehicle at a time."""
+"""Attitudes as quaternions, wxyz, body → world: turned, compared, and as matrices; in numpy, one at a time."""
 
 from __future__ import annotations
 

@@ -25,6 +25,11 @@ from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import Pose, Setpoint
 
 
+START_RATE = 2.0
+"""rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
+whose memory begins when it is tilted already has never seen such a start. Noise of estimated rates stays below."""
+
+
 class ChainConfig(NamedTuple):
     """What of a flight is more than its flyer and its track.
 
@@ -162,7 +167,8 @@ class FlightChain:
         """Whether the newest pose is one of a vehicle that has left the start."""
         if self._newest is None:
             return False
-        return float(np.linalg.norm(self._newest.linear_velocity)) > self._config.limits.start_speed
+        speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
+        return speed > self._config.limits.start_speed or rate > START_RATE
 
     def _choose(self, pose: Pose | None) -> tuple[Setpoint | None, np.ndarray | None, float, float]:
         """Return setpoint and image, and how long drawing and choosing took, s."""

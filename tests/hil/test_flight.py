@@ -225,6 +225,28 @@ def test_the_actor_forgets_until_the_vehicle_moves():
     assert began * 50 - 5 < flyer.resets < (began + 0.4) * 50
 
 
+@pytest.mark.parametrize("name", ["figure8", "kidney"])
+def test_shipped_agents_fly_a_lap_from_the_stand(name):
+    """They begin with a turn at 9.5 rad/s; one that remembers from 0.2 m/s on only, tilted by then, goes astray."""
+    flyer = ActorFlyer(AGENTS / name)
+    plant = Watched(load_track(name))
+    chain = chain_of(flyer, plant, laps=1)
+    assert plant.fly(chain, flyer.rate, 10.0) == "disarmed: the flight is over"
+    assert plant.vehicle.gates_passed == plant.vehicle.track.num_gates
+    chain.close()
+
+
+@pytest.mark.parametrize(
+    ("velocity", "rates", "left"),
+    [((0.0, 0.0, 0.0), (0.0, 1.9, 0.0), False), ((0.0, 0.0, 0.0), (0.0, 2.1, 0.0), True),
+     ((0.19, 0.0, 0.0), (0.0, 0.0, 0.0), False), ((0.21, 0.0, 0.0), (0.0, 0.0, 0.0), True)],
+)  # fmt: skip
+def test_what_counts_as_having_left_the_start(velocity, rates, left):
+    chain = chain_of(Hover(), Watched(CIRCLE))
+    chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
+    assert chain._moves() is left
+
+
 def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid():
     class Stalls(Watched):
         def send(self, command):
