@@ -24,7 +24,6 @@ from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import Pose, Setpoint
 
-
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
 whose memory begins when it is tilted already has never seen such a start. Noise of estimated rates stays below."""
