@@ -132,7 +132,7 @@ class FlightChain:
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
-        if not self._flying:  # as long as the vehicle stands still, each tick is the first of the flight
+        if not self._flying:  # until the vehicle moves or turns, each tick is the first of the flight
             self._flyer.reset()
             self.progress.reset()
         for received in inputs.received:
