@@ -101,13 +101,18 @@ class UdpTransport:
         return heard
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the datagrams that have come back, with the time now, s (``time.monotonic``)."""
+        """Yield the datagrams that have come back, with the time now, s (``time.monotonic``).
+
+        What an earlier datagram met on its way, the next `write` says.
+        """
         for _ in range(self._MOST):
             try:
                 data = self._socket.recv(self._SIZE)
             except BlockingIOError:
                 return
-            except ConnectionRefusedError:
+            except OSError as error:
+                if error.errno not in _PASSING:
+                    raise
                 self._heard = False
                 return
             yield time.monotonic(), data

@@ -12,6 +12,7 @@ import pytest
 from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig, make_link
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, crc8, encode_crsf
 from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink
+from dreamer_racing.hil.links.mavlink import MavlinkTelemetry
 from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
 from dreamer_racing.hil.links.udp import UdpTransport
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
@@ -185,6 +186,20 @@ def test_mavlink_that_is_damaged_is_counted(autopilot):
     assert autopilot.say_bytes(bytes(data)) == [] and autopilot.link.rejected >= 1
     assert autopilot.say_bytes(b"nonsense") == []
     assert 14.9 in [autopilot.say(autopilot.system(14_900)) for _ in range(20)][-1]
+
+
+def test_mavlink_noise(autopilot):
+    """Nothing is raised by noise, nor by messages with damage or with noise for a payload."""
+    generator = np.random.default_rng(0)
+    telemetry, valid = MavlinkTelemetry(), autopilot.battery(15_300).pack(autopilot.common.MAVLink(None, 1, 1))
+    heard = []
+    for _ in range(3000):
+        noise = generator.bytes(int(generator.integers(0, 80)))
+        damaged = bytearray(valid)
+        damaged[generator.integers(0, len(valid))] ^= 1 << generator.integers(0, 8)
+        for data in (noise, b"\xfd" + noise, bytes(damaged)):
+            heard += telemetry.read(data)
+    assert len(heard) < 10 and telemetry.rejected > 1000
 
 
 def test_strangers_are_not_heard(autopilot):
