@@ -14,12 +14,12 @@ Read docs/hil.md before anything with propellers. Nothing here needs torch, but 
 import json
 import math
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, make_dataclass
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, cast, get_type_hints
+from typing import Any, NamedTuple, cast, get_type_hints
 
 from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
@@ -27,16 +27,19 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import Track, describe_track, load_track
+from dreamer_racing.hil.battery import STALE, BatteryConfig
 from dreamer_racing.hil.betaflight import rate_map
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, Outputs, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
-from dreamer_racing.hil.links import LinkConfig, make_link
+from dreamer_racing.hil.links import HEARING, LinkConfig, make_link
+from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
+from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.pose_sources import PoseConfig, make_poses
-from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import ThrustMap
@@ -101,7 +104,9 @@ class HilConfig:
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
     reference_voltage: float | None = setting(None, POSITIVE)  # V
-    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now
+    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now; until a link that hears of it says more
+    voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
+    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
 
     limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
     renderer: str = "auto"  # auto | egl | osmesa
@@ -116,14 +121,22 @@ ConfigStore.instance().store(name="hil_schema", node=HilConfig)
 def main(config: DictConfig) -> None:
     """Fly, or look at a flight."""
     start_logging()
-    with plain_errors():
+    with plainly():
         settings = cast(HilConfig, OmegaConf.to_object(config))
         check(settings)
+        if settings.actor is None:
+            raise SystemExit(replay(settings) if settings.replay else report(settings))
+    raise SystemExit(fly(settings))
+
+
+@contextmanager
+def plainly() -> Iterator[None]:
+    """Say errors that a person can mend in a paragraph, a missing package among them."""
+    with plain_errors():
         try:
-            status = replay(settings) if settings.replay else report(settings) if settings.report else fly(settings)
+            yield
         except ImportError as error:
             raise ValueError(str(error)) from error
-    raise SystemExit(status)
 
 
 def check(config: HilConfig) -> None:
@@ -159,46 +172,82 @@ OPERATORS = ("keyboard", "udp", "timed")
 
 def fly(config: HilConfig) -> int:
     """Fly one flight; return the exit status: 0 if it was flown to its end."""
+    with ExitStack() as opened:
+        with plainly():
+            flight = prepare(config, opened)
+        ended = flight.loop.run(config.duration, config.patience)  # what breaks in flight is a defect: it shows as one
+        with plainly():
+            opened.close()
+            summary = conclude(config, flight, ended)
+    say(summary)
+    return 0 if config.laps is None or len(summary["passes"]) >= config.laps * flight.track.num_gates else 1
+
+
+class Prepared(NamedTuple):
+    """A flight that can begin."""
+
+    folder: Path
+    track: Track
+    chain: FlightChain
+    poses: PoseSource
+    link: TransportLink
+    loop: FlightLoop
+
+
+def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
+    """Make and open all that a flight needs; ``opened`` closes it.
+
+    Raises:
+        ValueError, OSError, ImportError: Something does not fit, cannot be used, or is not installed.
+    """
     config.stamping = stamping_of(config)
     flyer, contract = make_flyer(config)
     track = load_track(config.track or contract["source"]["track"])
     chain = make_chain(config, flyer, track)
+    opened.callback(chain.close)
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
-    with ExitStack() as opened:
-        opened.callback(chain.close)
-        link = opened.enter_context(closing(make_link(link_config(config, contract, flyer.rate))))
-        poses = opened.enter_context(closing(make_poses(pose_config(config))))
-        operator = opened.enter_context(closing(make_operator(config)))
-        recorder = None
-        if config.record:
-            about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
-            recorder = opened.enter_context(FlightRecorder(folder / FILE, about))
-        watchers: list[Callable[[Outputs], None]] = []
-        if config.view is not None:
-            view = opened.enter_context(closing(LiveView(config.view)))
-            print(f"view: {view.address}")
-            watchers.append(view.show)
-        print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
-        print(f"poses: {config.pose}, stamped by {config.stamping.value}")
-        loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
-        ended = loop.run(config.duration, config.patience)
-    passes = chain.progress.passes
+    link = opened.enter_context(closing(make_link(link_config(config, contract, flyer.rate))))
+    poses = opened.enter_context(closing(make_poses(pose_config(config))))
+    operator = opened.enter_context(closing(make_operator(config)))
+    recorder = None
+    if config.record:
+        about = {"config": as_json(config), "track": track.name, "rate": flyer.rate, "contract": contract}
+        recorder = opened.enter_context(FlightRecorder(folder / FILE, {**about, TRACK: describe_track(track)}))
+    watchers: list[Callable[[Outputs], None]] = []
+    if config.view is not None:
+        view = opened.enter_context(closing(LiveView(config.view)))
+        print(f"view: {view.address}")
+        watchers.append(view.show)
+    print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
+    print(f"poses: {config.pose}, stamped by {config.stamping.value}")
+    loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
+    return Prepared(folder, track, chain, poses, link, loop)
+
+
+def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
+    """Return what came of a flight, and write it beside its recording."""
+    chain = flight.chain
     summary = {
         "ended": ended,
-        "passes": [list(passed) for passed in passes],
+        "passes": [list(passed) for passed in chain.progress.passes],
         "laps": lap_times(chain),
-        "loop": loop.statistics.summary(),
-        "poses": {"rejected": poses.rejected, "out_of_order": chain.clock.out_of_order},
-        "commands_dropped": link.dropped,
+        "loop": flight.loop.statistics.summary(),
+        "poses": {"rejected": flight.poses.rejected, "out_of_order": chain.clock.out_of_order},
+        "commands_dropped": flight.link.dropped,
+        "battery": battery_summary(config, chain, flight.link),
     }
     if config.record:
-        (folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    say(summary)
-    return 0 if config.laps is None or len(passes) >= config.laps * track.num_gates else 1
+        (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    return summary
 
 
-def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
-    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands."""
+def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
+    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
+
+    Args:
+        config: Says who.
+        track: That a pilot is to fly; None: the one of its name.
+    """
     assert config.actor is not None, "checked"
     if config.actor == PILOT:
         from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
@@ -206,7 +255,7 @@ def make_flyer(config: HilConfig) -> tuple[Flyer, dict[str, Any]]:
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
-        return PilotFlyer(load_track(config.track), config.preset, rate), pilot_contract(config.track)
+        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config.track)
     path = agent_path(config.actor)
     flyer = ActorFlyer(path)
     check_contract(flyer.contract, config.track or flyer.contract["source"]["track"], config.rate)
@@ -229,7 +278,7 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     """Make the chain of a flyer."""
     given = {name: value for name, value in vars(config.limits).items() if value is not None}
     limits = SafetyLimits.of_track(track, **given)
-    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm)
+    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config))
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
 
@@ -249,6 +298,8 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
     if missing and config.link not in ("simulated", "udp"):
         raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
     thrust = None if missing else ThrustMap(**numbers)
+    if thrust is not None:
+        check_battery(config, thrust)
     port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
     return LinkConfig(
         config.link,
@@ -261,6 +312,29 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
         config.arm_channel,
         rate,
     )
+
+
+def battery_config(config: HilConfig) -> BatteryConfig | None:
+    """Return what is known of the battery; None where nothing more comes to be known."""
+    if config.link not in HEARING or config.voltage is None:
+        return None
+    return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
+
+
+def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
+    """Refuse to believe voltages that the thrust map cannot reckon with: in flight nothing may be refused.
+
+    Raises:
+        ValueError: The message names the setting and the voltage.
+    """
+    battery = battery_config(config)
+    for voltage in () if battery is None else battery.limits:
+        try:
+            replace(thrust, voltage=voltage)
+        except ValueError as error:
+            raise ValueError(
+                f"voltage_tolerance={config.voltage_tolerance:g}: with it {voltage:.4g} V would be believed. {error}"
+            ) from error
 
 
 def pose_config(config: HilConfig) -> PoseConfig:
@@ -288,6 +362,17 @@ def make_operator(config: HilConfig) -> OperatorSource:
     return TimedOperator() if name == "timed" else KeyboardOperator()
 
 
+def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:
+    """Return what the thrust map reckoned with at the end, and what was heard; None where there is no thrust map."""
+    if link.thrust is None:
+        return None
+    summary = {"voltage_set": config.voltage, "voltage": link.thrust.voltage, "rejected": link.rejected}
+    if (battery := chain.battery) is None:
+        return {**summary, "readings": 0}
+    age = battery.age if math.isfinite(battery.age) else None
+    return {**summary, "readings": battery.readings, "implausible": battery.implausible, "last_reading_age_s": age}
+
+
 def lap_times(chain: FlightChain) -> list[float]:
     """Return the times of whole laps from the first gate on, s."""
     firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
@@ -308,6 +393,18 @@ def say(summary: dict[str, Any]) -> None:
         if isinstance(row, dict):
             print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
     print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
+    if summary["battery"] is not None:
+        print(in_words(summary["battery"]))
+
+
+def in_words(battery: dict[str, Any]) -> str:
+    """Say by which voltage thrust became a throttle, and where that came from."""
+    if not battery["readings"]:
+        return f"battery: nothing usable was heard of it; thrust was reckoned by voltage={battery['voltage_set']:g}"
+    age = battery["last_reading_age_s"]
+    old = f", the last one {age:.1f} s before the end: STALE" if age > STALE else ""
+    left_out = f", {battery['implausible']} implausible ones left out" if battery["implausible"] else ""
+    return f"battery: {battery['voltage']:.2f} V at the end, by {battery['readings']} readings{left_out}{old}"
 
 
 def replay(config: HilConfig) -> int:
@@ -316,8 +413,10 @@ def replay(config: HilConfig) -> int:
     flight = Flight(Path(config.replay))
     flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
     settings = cast(HilConfig, flown)
-    flyer, contract = make_flyer(settings)
-    track = load_track(settings.track or contract["source"]["track"])
+    if not flight.holds_track:
+        print("note: the recording does not hold its track: it is taken as it is now")
+    track = flight.track()
+    flyer, _ = make_flyer(settings, track)
     settings.renderer = config.renderer
     with closing(make_chain(settings, flyer, track)) as chain:
         return play(flight, chain)
@@ -328,9 +427,9 @@ def play(flight: Flight, chain: FlightChain) -> int:
     chain.warm_up()
     for index, tick in enumerate(flight.ticks):
         again = json.loads(json.dumps(describe_outputs(chain.tick(read_inputs(tick["in"])))))
-        if differing := [name for name, value in again.items() if not same(value, tick["out"][name])]:
+        if differing := [name for name, value in tick["out"].items() if not same(value, again.get(name))]:
             name = differing[0]
-            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again[name]} now", file=sys.stderr)
+            print(f"tick {index}: {name} was {tick['out'][name]}, and is {again.get(name)} now", file=sys.stderr)
             return 1
     print(f"replayed: {len(flight.ticks)} ticks, every one as it was written{'' if flight.whole else ' (cut off)'}")
     return 0

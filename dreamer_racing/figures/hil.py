@@ -124,6 +124,8 @@ def _make_report(flight: FlownFlight, passes: list[GatePass], response: dict[str
     config, ticks = flight.about.get("config") or {}, flight.time[flight.flown]
     began = float(ticks[0]) if len(ticks) else 0.0
     problems = [] if flight.whole else ["the file was not finished: the loop was killed, or it flies still"]
+    if not flight.holds_track:
+        problems.append(f"the recording does not hold its track: {flight.track.name} is taken as it is now")
     counted = int(flight.passes.max())
     if counted != len(passes):
         problems.append(f"the loop counted {counted} gates, and the recorded poses give {len(passes)}")

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import Track, TrackError
 from dreamer_racing.hil.chain import Inputs, read_inputs
 from dreamer_racing.hil.loop import percentiles
 from dreamer_racing.hil.progress import GatePass, GateProgress
@@ -49,6 +49,8 @@ class FlownFlight:
     """With what it was begun."""
     whole: bool
     """Whether its file was finished."""
+    holds_track: bool
+    """Whether its file holds the track; if not, `track` is that of its name as it is now."""
     track: Track
     time: np.ndarray
     """(T,) s, by the loop's clock, when each tick began."""
@@ -112,13 +114,17 @@ def read_flown(path: Path) -> FlownFlight:
         raise ValueError(f"{path}: the flight has no ticks: its loop ended before the first one.")
     try:
         config = flight.about.get("config") or {}
-        name = config.get("track") or flight.about["track"]
+        track = flight.track()
         clock = PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)))
         arrays = _read_ticks(flight.ticks, clock)
+    except TrackError as error:
+        raise ValueError(f"{path}: {error}") from error
     except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}"
         raise ValueError(f"{path}: its content is not what recipes/hil.py writes ({what}).") from error
-    return FlownFlight(path, flight.about, flight.whole, load_track(name), out_of_order=clock.out_of_order, **arrays)
+    return FlownFlight(
+        path, flight.about, flight.whole, flight.holds_track, track, out_of_order=clock.out_of_order, **arrays
+    )
 
 
 def latencies(flight: FlownFlight) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, open_scene, require_library
 from dreamer_racing.envs.simulator.scene import Camera, build_scene
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.hil.stamping import rotation_matrix
+from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.vehicle import Pose
 
 

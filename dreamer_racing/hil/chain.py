@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.battery import Battery, BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.operator import Operator
@@ -21,6 +23,10 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import Pose, Setpoint
+
+START_RATE = 2.0
+"""rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
+whose memory begins when it is tilted already has never seen such a start. Noise of estimated rates stays below."""
 
 
 class ChainConfig(NamedTuple):
@@ -32,6 +38,7 @@ class ChainConfig(NamedTuple):
         latency: s, from a pose's measurement to its arrival at the least.
         laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
         arm: Whether it may arm at all.
+        battery: What is known of it, where its voltage comes back and counts; None: nobody asks for it.
     """
 
     limits: SafetyLimits
@@ -39,6 +46,7 @@ class ChainConfig(NamedTuple):
     latency: float = 0.0
     laps: int | None = None
     arm: bool = False
+    battery: BatteryConfig | None = None
 
 
 class Inputs(NamedTuple):
@@ -49,12 +57,14 @@ class Inputs(NamedTuple):
         received: Pose packets since the last tick, oldest first.
         operator: What the operator wants.
         overrun: Whether the tick before took longer than its period.
+        voltages: Of the battery since the last tick, oldest first.
     """
 
     time: float
     received: list[Received]
     operator: Operator
     overrun: bool
+    voltages: Sequence[Reading] = ()
 
 
 class Outputs(NamedTuple):
@@ -70,6 +80,7 @@ class Outputs(NamedTuple):
         passes: Gates passed in this flight.
         render_s: s that drawing the image took.
         act_s: s that the flyer took.
+        voltage: V, by which the link is to turn thrust into a throttle; None: as it is set.
     """
 
     verdict: Verdict
@@ -81,6 +92,7 @@ class Outputs(NamedTuple):
     passes: int
     render_s: float
     act_s: float
+    voltage: float | None = None
 
 
 class FlightChain:
@@ -96,12 +108,14 @@ class FlightChain:
         progress: Which gates were passed.
         clock: Of the poses.
         safety: Has the last word.
+        battery: Its voltage; None if nobody asks for it.
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
         self.progress = GateProgress(track)
         self.clock = PoseClock(config.stamping, config.latency)
         self.safety = Safety(config.limits)
+        self.battery = None if config.battery is None else Battery(config.battery)
         self._flyer, self._camera, self._config = flyer, camera, config
         drawn = None if camera is None else camera.camera
         self._mismatch = None if flyer.camera in (None, drawn) else f"it sees by {flyer.camera}, drawn is {drawn}"
@@ -118,7 +132,7 @@ class FlightChain:
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
-        if not self._flying:  # as long as the vehicle stands still, each tick is the first of the flight
+        if not self._flying:  # until the vehicle moves or turns, each tick is the first of the flight
             self._flyer.reset()
             self.progress.reset()
         for received in inputs.received:
@@ -145,13 +159,15 @@ class FlightChain:
         self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
-        return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s)
+        voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
+        return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s, voltage)
 
     def _moves(self) -> bool:
         """Whether the newest pose is one of a vehicle that has left the start."""
         if self._newest is None:
             return False
-        return float(np.linalg.norm(self._newest.linear_velocity)) > self._config.limits.start_speed
+        speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
+        return speed > self._config.limits.start_speed or rate > START_RATE
 
     def _choose(self, pose: Pose | None) -> tuple[Setpoint | None, np.ndarray | None, float, float]:
         """Return setpoint and image, and how long drawing and choosing took, s."""
@@ -176,17 +192,19 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "received": [[received.time, *_numbers(received.packet)] for received in inputs.received],
         "operator": list(inputs.operator),
         "overrun": inputs.overrun,
+        "voltages": [list(reading) for reading in inputs.voltages],
     }
 
 
 def read_inputs(message: dict[str, Any]) -> Inputs:
-    """Return what came in from what `describe_inputs` made of it."""
+    """Return what came in from what `describe_inputs` made of it; flights of old say nothing of voltages."""
     received = []
     for arrived, sequence, stamp, *numbers in message["received"]:
         values = np.array(numbers)
         packet = PosePacket(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
         received.append(Received(arrived, packet))
-    return Inputs(message["time"], received, Operator(*message["operator"]), message["overrun"])
+    voltages = [Reading(*reading) for reading in message.get("voltages", ())]
+    return Inputs(message["time"], received, Operator(*message["operator"]), message["overrun"], voltages)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:
@@ -200,6 +218,7 @@ def describe_outputs(outputs: Outputs) -> dict[str, Any]:
         "pose": None if outputs.pose is None else [number for part in outputs.pose[1:] for number in part.tolist()],
         "target_gate": outputs.target_gate,
         "passes": outputs.passes,
+        "voltage": outputs.voltage,
     }
 
 

@@ -184,8 +184,10 @@ class FlightLoop:
 
     def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
-        inputs = Inputs(start, self._poses.poll(), self._operator.poll(armed), overrun)
+        inputs = Inputs(start, self._poses.poll(), self._operator.poll(armed), overrun, self._link.listen())
         outputs = self._chain.tick(inputs)
+        if outputs.voltage is not None:
+            self._link.reckon_with(outputs.voltage)
         sent = self._link.send(outputs.verdict.command)
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)

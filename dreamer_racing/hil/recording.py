@@ -16,8 +16,12 @@ from typing import Any, Self
 
 import numpy as np
 
+from dreamer_racing.envs.tracks import Track, load_track, read_track
+
 FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
+TRACK = "track_as_flown"
+"""Of what a flight is begun with: the content of its track's file, as `describe_track` writes it."""
 FORMAT_VERSION = 1
 
 
@@ -26,7 +30,7 @@ class FlightRecorder:
 
     Args:
         path: The file; there must be none yet.
-        about: JSON values with which the flight is begun.
+        about: JSON values with which the flight is begun, the track under `TRACK`.
 
     Raises:
         FileExistsError: There is one: a flight is never overwritten.
@@ -84,6 +88,7 @@ class Flight:
     Attributes:
         about: With what it was begun.
         ticks: What happened, a dictionary each.
+        holds_track: Whether the track is in the file; it is since flights keep it.
         whole: Whether the file was finished; if not, the loop was killed.
 
     Raises:
@@ -102,6 +107,20 @@ class Flight:
         if (version := self.about.get("format_version")) != FORMAT_VERSION:
             raise ValueError(f"{path}: a flight of version {version!r}; this release reads version {FORMAT_VERSION}.")
         self.ticks = [message for topic, message in messages if topic == TICK]
+        self.holds_track = TRACK in self.about
+        self._path = path
+
+    def track(self) -> Track:
+        """Return the track that was flown; of a flight that does not hold it, the track of its name as it is now.
+
+        Raises:
+            TrackError: The file's is damaged, or there is no such track any more.
+            KeyError: The file names none.
+        """
+        if self.holds_track:
+            return read_track(self.about[TRACK], f"{self._path}: {TRACK}")
+        config = self.about.get("config") or {}
+        return load_track(config.get("track") or self.about["track"])
 
     def _read(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         reader, exceptions = _import_mcap("stream_reader"), _import_mcap("exceptions")

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dreamer_racing.hil.odometer import Odometer
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, is_within, to_number, to_numbers
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, at_rest, hover
@@ -46,6 +47,7 @@ class Reason(enum.Enum):
     OVERRUNS = "overruns"
     NOT_FINITE = "pose not finite"
     POSE_JUMP = "pose jump"
+    POSE_CONTRADICTION = "pose contradiction"
     POSE_STALE = "pose stale"
     POSE_LOST = "pose lost"
     GEOFENCE = "geofence"
@@ -123,7 +125,12 @@ class _Seen(NamedTuple):
     time: float
     position: Vector
     attitude: Vector
-    speed: float
+    velocity: Vector
+
+    @property
+    def speed(self) -> float:
+        """m/s."""
+        return math.hypot(*self.velocity)
 
     @property
     def tilt_degrees(self) -> float:
@@ -233,6 +240,7 @@ class Safety:
     def _forget(self) -> None:
         """Drop whatever was measured by a clock that cannot be trusted, or that has only begun."""
         self._seen: _Seen | None = None
+        self._odometer = Odometer(self.limits.velocity_window)
         self._measured_at = -math.inf
         self._overruns.clear()
         self._released_at: float | None = None
@@ -298,12 +306,24 @@ class Safety:
         age = to_number(tick.pose_age)
         self._seen = seen
         self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
+        return self._check_motion(seen, last)
+
+    def _check_motion(self, seen: _Seen, last: _Seen | None) -> Findings:
+        """Refuse poses that no vehicle went through: one after the other, and by the velocities that they claim."""
+        limits = self.limits
+        mismatch = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
+        findings: Findings = {}
         if last is not None:
             moved = math.dist(seen.position, last.position)
             allowed = limits.speed_max * (seen.time - last.time) + limits.jump_tolerance
             if not moved <= allowed:
-                return {Reason.POSE_JUMP: f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"}
-        return {}
+                findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"
+        if mismatch is not None and not mismatch <= limits.velocity_tolerance:
+            findings[Reason.POSE_CONTRADICTION] = (
+                f"velocities and positions of poses differ by {mismatch:.3g} m/s (allowed: "
+                f"{limits.velocity_tolerance:g})"
+            )
+        return findings
 
     def _check_flight(self) -> Findings:
         limits, seen = self.limits, self._seen
@@ -373,7 +393,7 @@ def _read_pose(pose: Pose) -> _Seen | None:
     length = math.hypot(*attitude)
     if not 0.9 < length < 1.1:
         return None
-    return _Seen(time, position, tuple(value / length for value in attitude), math.hypot(*velocity))
+    return _Seen(time, position, tuple(value / length for value in attitude), velocity)
 
 
 def _read_setpoint(setpoint: Setpoint | None) -> Vector | None:

@@ -44,6 +44,8 @@ class SafetyLimits:
         overrun_window: s.
         speed_max: m/s; the shipped agents fly at up to 11.5 in simulation.
         jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
+        velocity_tolerance: m/s by which the velocities that poses claim may differ from those of their positions.
+        velocity_window: s over which they are compared, see `hil.odometer`.
         tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
         tilt_time: s.
         still_time: s without more than `start_speed` after which what has flown counts as crashed: racers never hover.
@@ -72,6 +74,8 @@ class SafetyLimits:
     overrun_window: float = setting(1.0, Range(0, 60, open_below=True))
     speed_max: float = setting(15.0, _MOST)
     jump_tolerance: float = setting(0.1, _TOLERANCE)
+    velocity_tolerance: float = setting(4.0, _MOST)
+    velocity_window: float = setting(0.075, _SECONDS)
     tilt_max_degrees: float = setting(100.0, _DEGREES)
     tilt_time: float = setting(0.2, _TOLERANCE)
     still_time: float = setting(1.0, Range(0, 3600, open_below=True))

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import deque
 from enum import Enum
 
-import numpy as np
-
+from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.pose import Received
 from dreamer_racing.hil.vehicle import Pose
 
@@ -87,34 +86,4 @@ def extrapolate(pose: Pose, time: float) -> Pose:
         time=time,
         position=pose.position + elapsed * pose.linear_velocity,
         attitude=turn(pose.attitude, elapsed * pose.body_rates),
-    )
-
-
-def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Turn an attitude (4,) wxyz by a rotation vector (3,) in rad, in the body frame."""
-    angle = float(np.linalg.norm(rotation))
-    half = 0.5 * angle
-    scale = 0.5 if angle < 1e-9 else np.sin(half) / angle
-    w, (x, y, z) = np.cos(half), scale * rotation
-    a, b, c, d = attitude
-    turned = np.array(
-        (
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        )
-    )
-    return turned / np.linalg.norm(turned)
-
-
-def rotation_matrix(attitude: np.ndarray) -> np.ndarray:
-    """Return the rotation body → world (3, 3) of an attitude (4,) wxyz; its columns are forward, left and up."""
-    w, x, y, z = attitude
-    return np.array(
-        (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        )
     )

@@ -105,7 +105,7 @@ class ThrustMap:
         mass: kg, with battery.
         full_thrust: N, of all motors at full command and the reference voltage, as measured on a stand.
         reference_voltage: V, the battery's under that load.
-        voltage: V, the battery's now; `dataclasses.replace` keeps it up to date.
+        voltage: V, the battery's now; `dataclasses.replace` keeps it up to date, see `hil.battery`.
         idle: Motor command at throttle 0: Betaflight's motor_idle (dshot_idle_value).
         min_check: µs, the channel's value up to which the throttle counts as 0.
 

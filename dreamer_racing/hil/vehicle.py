@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.battery import Reading
 
 
 class Pose(NamedTuple):
@@ -66,10 +67,18 @@ def at_rest() -> Command:
 
 
 class Link(Protocol):
-    """Carries commands to a vehicle."""
+    """Carries commands to a vehicle, and back what it says of its battery."""
 
     def send(self, command: Command) -> bytes:
         """Send a command now, without waiting; return the bytes that went out, for the record."""
+        ...
+
+    def listen(self) -> list[Reading]:
+        """Return the battery's voltages that have come back since the last call, oldest first, without waiting."""
+        ...
+
+    def reckon_with(self, voltage: float) -> None:
+        """Turn thrust into a throttle by a voltage, V, from now on; nothing where thrust is sent as it is."""
         ...
 
     def close(self) -> None:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dreamer_racing.hil.attitude import rotation_between
+
 GAP = 0.1
 """s between two poses beyond which the difference says nothing about now [choice]."""
 
@@ -80,22 +82,3 @@ class VelocityEstimator:
             return measured
         gain = -math.expm1(-elapsed / self._time_constant)  # exact for an input that is constant meanwhile
         return Velocity(*(old + gain * (new - old) for old, new in zip(self._velocity, measured, strict=True)))
-
-
-def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the rotation vector (3,), rad, body frame, that turns one attitude into another, the short way round.
-
-    The inverse of `stamping.turn`: the logarithm of first⁻¹ second. It is the same for q and −q.
-
-    Args:
-        first: (4,) wxyz, unit length.
-        second: (4,) wxyz, unit length.
-    """
-    a, b, c, d = first
-    w, x, y, z = second
-    cosine = a * w + b * x + c * y + d * z  # of half the angle
-    axis = np.array((a * x - b * w - c * z + d * y, a * y + b * z - c * w - d * x, a * z - b * y + c * x - d * w))
-    sine = float(np.linalg.norm(axis))
-    half = math.atan2(sine, abs(cosine))
-    scale = 2.0 if sine < 1e-9 else 2.0 * half / sine
-    return math.copysign(scale, cosine) * axis

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.pose import PosePacket, encode_pose
-from dreamer_racing.hil.stamping import turn
 from dreamer_racing.hil.vehicle import Pose
 from dreamer_racing.settings import NOT_NEGATIVE, SHARE, Range, setting
 

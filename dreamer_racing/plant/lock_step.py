@@ -5,6 +5,7 @@ Packets are those of the real thing, and so is everything that reads them; only 
 
 from __future__ import annotations
 
+from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import Flyer
@@ -65,6 +66,13 @@ class LockStep:
         data = encode_command(CommandPacket(self._sequence, self.now(), command))
         self.plant.take(data)
         return data
+
+    def listen(self) -> list[Reading]:
+        """Return nothing: this vehicle does not speak of its battery."""
+        return []
+
+    def reckon_with(self, voltage: float) -> None:
+        """Do nothing: thrust is sent as it is."""
 
     def close(self) -> None:
         """Do nothing: there is nothing to give back."""

@@ -31,8 +31,9 @@ USUAL = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.00
 LONGEST = 60.0
 """s after which a flight is given up."""
 
-SPEED_MAX = 25.0
-"""m/s, the only limit of safety that is not its own: the pilot is faster than a first flight should be."""
+LIMITS = {"speed_max": 25.0, "velocity_tolerance": 20.0}
+"""m/s, the limits of safety that are not its own: the pilot is faster than a first flight should be, and the
+question is how much noise a flyer stands, not safety."""
 
 
 class StudyFlight(NamedTuple):
@@ -104,7 +105,7 @@ def fly(flyer: Flyer, track: str, preset: str, sweep: str, value: float, seed: i
             setattr(changed, sweep, value)
     vehicle = PlantVehicle(track, preset, mismatch)
     laps = vehicle.track.laps
-    limits = SafetyLimits.of_track(vehicle.track, speed_max=SPEED_MAX)
+    limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
     chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=laps, arm=True))
     plant = _Fastest(vehicle, delivery)
     try:

@@ -13,14 +13,14 @@ import pytest
 import torch
 from PIL import Image
 
-from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.tracks import describe_track, load_track
 from dreamer_racing.evaluation.trajectory import Trajectory, write_trajectory
 from dreamer_racing.figures.hil import LATENCY, REPORT, TRACKING, TRAJECTORY, trajectory_of, write_report
 from dreamer_racing.figures.hil_numbers import Response, read_flown, tracking_error
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, Inputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
-from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
@@ -64,13 +64,14 @@ class Flown:
     stamping: Stamping = Stamping.receive
     offset: float = 0.0  # s, of the sender's clock
     kill_at: float = math.inf
+    about: dict[str, Any] = field(default_factory=lambda: {"track": "circle", TRACK: describe_track(CIRCLE)})
     sent: list[tuple[float, np.ndarray]] = field(default_factory=list)
 
     def fly(self, ticks: int = 600) -> Path:
         limits = SafetyLimits.of_track(CIRCLE, **ACCUSTOMED)
         chain = FlightChain(Wobble(), CIRCLE, ChainConfig(limits, self.stamping, WIRE, self.laps, self.arm), None)
         settings = {"actor": "wobble", "track": None, "stamping": self.stamping.value, "latency": WIRE}
-        about = {"config": settings, "track": "circle", "rate": 1.0 / PERIOD, "contract": {"camera": {"width_px": 64}}}
+        about = {"config": settings, "rate": 1.0 / PERIOD, "contract": {"camera": {"width_px": 64}}, **self.about}
         random = np.random.default_rng(0)
         with FlightRecorder(self.folder / FILE, about) as recorder:
             flew = False
@@ -117,6 +118,23 @@ def flown(tmp_path_factory) -> Path:
 def report(flown) -> dict[str, Any]:
     write_report(flown)
     return json.loads((flown / REPORT).read_text(encoding="utf-8"))
+
+
+def test_a_report_is_of_the_track_that_was_flown(tmp_path):
+    """Its name is that of another now; without the track in the file, as in old ones, the report says what it took."""
+    for name, kept in (("kept", {TRACK: describe_track(CIRCLE)}), ("old", {})):
+        Flown(tmp_path / name, about={"track": "kidney", **kept}).fly()
+        write_report(tmp_path / name)
+    kept, old = (json.loads((tmp_path / name / REPORT).read_text(encoding="utf-8")) for name in ("kept", "old"))
+    assert kept["track"] == "circle" and len(kept["gates"]) == 8 and kept["problems"] == []
+    assert old["track"] == "kidney" and len(old["gates"]) != 8
+    assert "the recording does not hold its track: kidney is taken as it is now" in old["problems"]
+
+
+def test_a_track_that_is_damaged_in_the_recording_is_refused(tmp_path):
+    Flown(tmp_path, about={"track": "circle", TRACK: {"gates": [1, 2]}}).fly()
+    with pytest.raises(ValueError, match=r"flight.mcap: track_as_flown: gates\[0\] is 1, but must be a mapping"):
+        write_report(tmp_path)
 
 
 # --- numbers ---

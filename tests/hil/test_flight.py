@@ -7,11 +7,13 @@ import os
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
@@ -105,6 +107,33 @@ def test_a_shipped_agent_flies_by_its_images_and_its_flight_plays_back_bit_for_b
     again.close()
 
 
+def test_the_battery_is_heard_in_flight_reckoned_with_and_played_back(tmp_path):
+    class Sagging(Watched):
+        """Speaks of a battery that sinks, and once of a single cell."""
+
+        reckoned: ClassVar[list[float]] = []
+
+        def listen(self):
+            return [Reading(self.now(), 3.9 if 1.0 < self.elapsed < 1.03 else 16.0 - 0.5 * self.elapsed)]
+
+        def reckon_with(self, voltage):
+            self.reckoned.append(voltage)
+
+    def chain():
+        config = ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True, battery=BatteryConfig(voltage=16.0))
+        return make_chain(Hover(), plant.vehicle, config)
+
+    plant = Sagging(CIRCLE)
+    flying = chain()
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        plant.fly(flying, 50.0, 2.0, recorder)
+    assert flying.battery.implausible == 1 and 14.7 < plant.reckoned[-1] < plant.reckoned[0] == 16.0
+    again = chain()
+    ticks = Flight(tmp_path).ticks
+    assert [tick["out"]["voltage"] for tick in ticks] == plant.reckoned
+    assert all(again.tick(read_inputs(tick["in"])).voltage == tick["out"]["voltage"] for tick in ticks)
+
+
 def test_nothing_is_armed_without_leave():
     plant = Watched(CIRCLE)
     ended = plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 2.0)
@@ -194,6 +223,28 @@ def test_the_actor_forgets_until_the_vehicle_moves():
     assert chain.safety.state is State.CUT and "fence" in ended
     began = next(moment for moment, command in plant.sent if command.setpoint.collective_thrust > 13.0)
     assert began * 50 - 5 < flyer.resets < (began + 0.4) * 50
+
+
+@pytest.mark.parametrize("name", ["figure8", "kidney"])
+def test_shipped_agents_fly_a_lap_from_the_stand(name):
+    """They begin with a turn at 9.5 rad/s; one that remembers from 0.2 m/s on only, tilted by then, goes astray."""
+    flyer = ActorFlyer(AGENTS / name)
+    plant = Watched(load_track(name))
+    chain = chain_of(flyer, plant, laps=1)
+    assert plant.fly(chain, flyer.rate, 10.0) == "disarmed: the flight is over"
+    assert plant.vehicle.gates_passed == plant.vehicle.track.num_gates
+    chain.close()
+
+
+@pytest.mark.parametrize(
+    ("velocity", "rates", "left"),
+    [((0.0, 0.0, 0.0), (0.0, 1.9, 0.0), False), ((0.0, 0.0, 0.0), (0.0, 2.1, 0.0), True),
+     ((0.19, 0.0, 0.0), (0.0, 0.0, 0.0), False), ((0.21, 0.0, 0.0), (0.0, 0.0, 0.0), True)],
+)  # fmt: skip
+def test_what_counts_as_having_left_the_start(velocity, rates, left):
+    chain = chain_of(Hover(), Watched(CIRCLE))
+    chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
+    assert chain._moves() is left
 
 
 def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid():

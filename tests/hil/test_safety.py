@@ -15,7 +15,12 @@ from dreamer_racing.hil.safety import Reason, Safety, SafetyLimits, State, Tick
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
 PERIOD = 1 / 32  # s: exact in binary, as are the times below
-LIMITS = SafetyLimits(fence_low=(-4, -4, -1), fence_high=(4, 4, 4), start_position=(1, 0, 0))
+LIMITS = SafetyLimits(
+    fence_low=(-4, -4, -1),
+    fence_high=(4, 4, 4),
+    start_position=(1, 0, 0),
+    velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities
+)
 OFF, ON, KILL = Operator(False, False), Operator(True, False), Operator(True, True)
 SETPOINT = Setpoint(12.0, np.array([1.0, -2.0, 0.5]))
 
@@ -208,6 +213,37 @@ def test_it_cuts_in_the_same_tick(changes, reason):
 )
 def test_it_flies_on_the_near_side_of_each_threshold(changes):
     assert Flight().flying().tick(**changes).state is State.FLYING
+
+
+def moving(went, claimed, count=6, **limits):
+    """The verdicts of ticks in which poses go at one velocity and claim another, m/s; their window is three ticks."""
+    flight = Flight(velocity_window=3 * PERIOD, jump_tolerance=1.0, **limits).flying()
+    return [
+        flight.tick(pose={"position": (1.0 + went * PERIOD * (step - 0.5), 0.0, 0.0), "velocity": (claimed, 0.0, 0.0)})
+        for step in range(1, count)
+    ]
+
+
+@pytest.mark.parametrize(("claimed", "state"), [(5.0, State.FLYING), (8.9, State.FLYING), (1.1, State.FLYING),
+                                                (9.1, State.CUT), (0.9, State.CUT), (-5.0, State.CUT)])  # fmt: skip
+def test_both_sides_of_what_velocities_may_differ_from_positions(claimed, state):
+    verdict = moving(5.0, claimed, velocity_tolerance=4.0)[-1]
+    assert verdict.state is state and verdict.command.armed == (state is State.FLYING)
+    differ = f"{abs(claimed - 5.0):.3g} m/s (allowed: 4)"
+    assert state is State.FLYING or verdict.words[0].endswith(differ), verdict.words
+
+
+def test_a_source_that_says_nothing_of_velocities_but_zeros_is_cut_within_its_window():
+    """Half a tick's way is behind it at the first tick, a sixth of the window at 9 m/s, and then three."""
+    verdicts = moving(9.0, 0.0, velocity_tolerance=4.0)
+    assert [verdict.state for verdict in verdicts[:2]] == [State.FLYING, State.CUT]
+    assert Reason.POSE_CONTRADICTION in verdicts[1].reasons
+
+
+def test_what_contradicts_itself_does_not_arm():
+    flight = Flight(velocity_tolerance=4.0, jump_tolerance=1.0, start_box=3.0).ready()
+    verdict = flight.tick(pose={"position": (1.5, 0.0, 0.0)})
+    assert verdict.state is State.DISARMED and verdict.reasons == (Reason.POSE_CONTRADICTION,)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.pose import Received, make_packet
-from dreamer_racing.hil.stamping import WINDOW, PoseClock, Stamping, extrapolate, rotation_matrix, turn
+from dreamer_racing.hil.stamping import WINDOW, PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import Pose
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -69,25 +70,3 @@ def test_extrapolation_flies_on():
     assert later.time == 1.5 and later.position == pytest.approx([4.0, 0.0, -0.5])
     assert rotation_matrix(later.attitude)[:, 0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)  # a quarter to the left
     assert extrapolate(pose(1.0, velocity=(8, 0, 0)), 0.9).position.tolist() == [0.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("axis", "turned", "towards"),
-    [
-        (0, 1, (0, 0, 1)),  # rolling right lifts the left side
-        (1, 0, (0, 0, -1)),  # pitching by +y puts the nose down
-        (2, 0, (0, 1, 0)),  # yawing by +z turns the nose left
-    ],
-)
-def test_the_sign_of_every_axis(axis, turned, towards):
-    rotation = np.zeros(3)
-    rotation[axis] = math.pi / 2
-    assert rotation_matrix(turn(LEVEL, rotation))[:, turned] == pytest.approx(towards, abs=1e-12)
-
-
-def test_small_turns_add_up():
-    attitude, rates = LEVEL, np.array([0.3, -0.7, 1.1])
-    for _ in range(1000):
-        attitude = turn(attitude, 1e-3 * rates)
-    assert rotation_matrix(attitude) == pytest.approx(rotation_matrix(turn(LEVEL, rates)), abs=1e-9)
-    assert turn(LEVEL, np.zeros(3)).tolist() == LEVEL.tolist()

@@ -11,15 +11,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Self
 
 import pytest
 
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.chain import describe_inputs, describe_outputs
+from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
-from tests.running_recipes import ROOT, recipe_module
+from tests.running_recipes import ROOT, recipe, recipe_module
 
 hil = recipe_module("hil")
 
@@ -120,16 +122,17 @@ def test_what_does_not_go_together_is_refused(changes, message):
 def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, tmp_path):
     config = hil.HilConfig(run_dir=str(tmp_path), **changes)
     hil.check(config)
-    with pytest.raises((ValueError, OSError), match=message):
-        hil.fly(config)
+    with ExitStack() as opened, pytest.raises((ValueError, OSError), match=message):
+        hil.prepare(config, opened)
 
 
 def test_a_port_in_use_is_said_and_nothing_else_happens(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
-            hil.fly(hil.HilConfig(actor="circle", pose_port=port, run_dir=str(tmp_path / "run")))
+        config = hil.HilConfig(actor="circle", pose_port=port, run_dir=str(tmp_path / "run"))
+        with ExitStack() as opened, pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
+            hil.prepare(config, opened)
     assert not (tmp_path / "run").exists()
 
 
@@ -141,13 +144,94 @@ def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
     assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
 
 
+def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
+    drone = {"mass": 0.6, "full_thrust": 9.0, "reference_voltage": 15.0, "voltage": 15.0}  # 11.25 V lift 5.1 N
+    config = hil.HilConfig(actor="kidney", link="crsf", device="/dev/null", **drone)
+    contract = hil.make_flyer(config)[1]
+    with pytest.raises(ValueError, match=r"voltage_tolerance=0.25: with it 11.25 V would be believed. .*must lift"):
+        hil.link_config(config, contract, 25.0)
+    config.voltage_tolerance = 0.15
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0
+    config.link, config.voltage_tolerance = "sbus", 0.25  # hears nothing
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and hil.battery_config(config) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"readings": 0}, "nothing usable was heard of it; thrust was reckoned by voltage=15.8"),
+        ({}, "15.12 V at the end, by 9 readings"),
+        ({"last_reading_age_s": 3.04}, "15.12 V at the end, by 9 readings, the last one 3.0 s before the end: STALE"),
+        ({"implausible": 2}, "15.12 V at the end, by 9 readings, 2 implausible ones left out"),
+    ],
+)
+def test_what_was_heard_of_the_battery_is_said(changes, words):
+    battery = {"voltage_set": 15.8, "voltage": 15.12, "readings": 9, "implausible": 0, "last_reading_age_s": 0.1}
+    assert hil.in_words(battery | changes) == f"battery: {words}"
+
+
+BROKEN = """
+from dreamer_racing.hil.chain import FlightChain
+tick, ticks = FlightChain.tick, []
+def broken(self, inputs):
+    ticks.append(inputs)
+    if len(ticks) > 5:
+        raise ValueError("planted")
+    return tick(self, inputs)
+FlightChain.tick = broken
+"""
+
+
+def test_a_defect_in_flight_shows_as_one_and_the_vehicle_is_disarmed_all_the_same(tmp_path):
+    """Of the same kind as errors that a person can mend: those before the flight are a paragraph."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", 0))
+        vehicle.settimeout(1.0)
+        ports = f"link_port={vehicle.getsockname()[1]}", f"pose_port={free_port()}"
+        ended = recipe("hil", "actor=circle", f"run_dir={tmp_path / 'run'}", *ports, cwd=tmp_path, before=BROKEN)
+        heard = [decode_command(vehicle.recv(200)) for _ in range(5 + 50)]
+    assert ended.returncode == 1 and "Traceback" in ended.stderr and "ValueError: planted" in ended.stderr
+    assert "error:" not in ended.stderr
+    assert not any(packet.command.armed for packet in heard)  # five ticks, and a second of disarm frames
+    flown = Flight(tmp_path / "run")
+    assert flown.whole and len(flown.ticks) == 5
+
+
+def test_what_a_person_can_mend_is_said_in_a_paragraph(tmp_path):
+    ended = recipe("hil", "actor=circle", "link=crsf", "operator=keyboard", cwd=tmp_path)
+    assert ended.returncode == 2 and ended.stderr.startswith("error: mass= is missing: link=crsf"), ended.stderr
+
+
+def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
+    path = tmp_path / "mine.yaml"
+    path.write_text((ROOT / "dreamer_racing/envs/tracks/circle.yaml").read_text())
+    config = hil.HilConfig(actor="pilot", track=str(path), run_dir=str(tmp_path / "run"), pose_port=free_port())
+    with ExitStack() as opened:
+        flight = hil.prepare(config, opened)
+        pose = [10.0, 0, 0.0, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]
+        for tick in range(3):
+            inputs = hil.read_inputs(
+                {"time": 10.0 + 0.02 * tick, "received": [pose][tick:], "operator": [False] * 2, "overrun": False}
+            )
+            message = {"in": describe_inputs(inputs), "out": describe_outputs(flight.chain.tick(inputs))}
+            flight.loop._recorder.tick(inputs.time, message)
+    path.write_text(path.read_text().replace("4.0", "5.0"))
+    assert load_track(str(path)) != flight.track
+    assert Flight(tmp_path / "run").track() == flight.track
+    assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
+    path.unlink()
+    assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
+    assert "does not hold its track" not in capsys.readouterr().out
+
+
 def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     config = hil.HilConfig(actor="circle", record=True)
     flyer, _ = hil.make_flyer(config)
     chain = hil.make_chain(config, flyer, hil.load_track("circle"))
+    about = {"config": hil.as_json(config), "track": "circle"}  # as releases wrote it that did not keep the track
     with (
-        FlightRecorder(tmp_path / "right" / FILE, {"config": hil.as_json(config)}) as right,
-        FlightRecorder(tmp_path / "wrong" / FILE, {"config": hil.as_json(config)}) as wrong,
+        FlightRecorder(tmp_path / "right" / FILE, about) as right,
+        FlightRecorder(tmp_path / "wrong" / FILE, about) as wrong,
     ):
         for index in range(5):
             inputs = hil.read_inputs(
@@ -164,7 +248,8 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
             wrong.tick(inputs.time, message | {"out": out | ({"target_gate": 3} if index == 3 else {})})
     chain.close()
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "right"))) == 0
-    assert "replayed: 5 ticks, every one as it was written" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "replayed: 5 ticks, every one as it was written" in said and "taken as it is now" in said
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
     assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
 

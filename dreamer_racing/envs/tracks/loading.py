@@ -1,7 +1,8 @@
-"""Read a track from YAML, and refuse a bad file with the file, the field, its value and what is allowed."""
+"""Read a track from YAML, and refuse a bad file with the file, the field, its value and what is allowed; write one."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Collection, Hashable
 from pathlib import Path
@@ -40,9 +41,47 @@ def load_track(name_or_path: str | Path | Track) -> Track:
         validate_track(name_or_path, source=f"Track({name_or_path.name!r})")
         return name_or_path
     path = _find(name_or_path)
-    track = _TrackReader(path).read()
-    validate_track(track, source=str(path))
+    return read_track(_parse(path), str(path), name=path.stem)
+
+
+def read_track(content: Any, source: str, name: str = "track") -> Track:
+    """Return the checked track that a file's content, or what `describe_track` returned, stands for.
+
+    Args:
+        content: Python objects as YAML or JSON gives them.
+        source: where they are from, for messages.
+        name: of the track, unless the content gives one.
+
+    Raises:
+        TrackError: a field is wrong, or the track cannot be flown.
+    """
+    track = _TrackReader(source, name).read(content)
+    validate_track(track, source=source)
     return track
+
+
+def describe_track(track: Track) -> dict[str, Any]:
+    """Return the content of a file that is this track, with nothing left to defaults; `read_track` gives it back.
+
+    Example:
+        >>> track = load_track("kidney")
+        >>> read_track(describe_track(track), "a copy") == track
+        True
+    """
+    return {
+        "name": track.name,
+        "laps": track.laps,
+        "shape": dataclasses.asdict(track.shape),
+        "start": {"position": list(track.start_position), "yaw_degrees": track.start_yaw_degrees},
+        "bounds": {"low": list(track.bounds_low), "high": list(track.bounds_high)},
+        "gates": [_describe_gate(gate) for gate in track.gates],
+        "decoys": [_describe_gate(gate) for gate in track.decoys],
+    }
+
+
+def _describe_gate(gate: Gate) -> dict[str, Any]:
+    color = {} if gate.color is None else {"color": list(gate.color)}
+    return {"position": list(gate.position), "yaw_degrees": gate.yaw_degrees, **color}
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -94,16 +133,34 @@ class _PlainLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
+def _parse(path: Path) -> Any:
+    """Return a file's content as Python objects."""
+    try:
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise TrackError(f"{path}: the track file has {size:,} bytes, but must have no more than {MAX_BYTES:,}.")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrackError(f"{path}: the track file cannot be read: {error}.") from error
+    try:
+        return yaml.load(text, Loader=_PlainLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "somewhere"
+        raise TrackError(f"{path}: not valid YAML at {where}: {error.problem}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise TrackError(f"{path}: not valid YAML: {error}.") from error
+
+
 class _TrackReader:
-    """Turns one YAML file into a ``Track``; every method names the field that it refuses."""
+    """Turns a file's content into a ``Track``; every method names the field that it refuses."""
 
-    def __init__(self, path: Path):
-        self._path = path
+    def __init__(self, source: str, name: str):
+        self._source, self._name = source, name
 
-    def read(self) -> Track:
-        """Read the file, check the form of every field and fill in the defaults."""
+    def read(self, content: Any) -> Track:
+        """Check the form of every field and fill in the defaults."""
         content = self._mapping(
-            self._parse(),
+            content,
             "the file",
             required={"gates"},
             optional={"name", "laps", "decoys", "shape", "start", "bounds"},
@@ -114,7 +171,7 @@ class _TrackReader:
         start_position, start_yaw_degrees = self._start(content.get("start", {}))
         bounds_low, bounds_high = self._bounds(content["bounds"]) if "bounds" in content else (None, None)
         return make_track(
-            self._text(content.get("name", self._path.stem), "name"),
+            self._text(content.get("name", self._name), "name"),
             gates,
             decoys=self._gates(content.get("decoys", []), "decoys", "decoy"),
             shape=self._shape(content.get("shape", {})),
@@ -124,25 +181,6 @@ class _TrackReader:
             bounds_high=bounds_high,
             laps=self._count(content.get("laps", 3), "laps"),
         )
-
-    def _parse(self) -> Any:
-        """Return the file's content as Python objects."""
-        try:
-            if (size := self._path.stat().st_size) > MAX_BYTES:
-                raise TrackError(
-                    f"{self._path}: the track file has {size:,} bytes, but must have no more than {MAX_BYTES:,}."
-                )
-            text = self._path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise TrackError(f"{self._path}: the track file cannot be read: {error}.") from error
-        try:
-            return yaml.load(text, Loader=_PlainLoader)
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark
-            where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "somewhere"
-            raise TrackError(f"{self._path}: not valid YAML at {where}: {error.problem}.") from error
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            raise TrackError(f"{self._path}: not valid YAML: {error}.") from error
 
     def _gates(self, value: Any, where: str, kind: Literal["race", "decoy"]) -> list[Gate]:
         """Read a list of gates that are all of one kind."""
@@ -195,7 +233,7 @@ class _TrackReader:
         for key in value:
             if key not in allowed:
                 raise TrackError(
-                    f"{self._path}: {prefix}{shortened(str(key))} is an unknown field (its value is "
+                    f"{self._source}: {prefix}{shortened(str(key))} is an unknown field (its value is "
                     f"{quoted(value[key])}){suggestion(key, allowed)}; the allowed fields of {where} are "
                     f"{', '.join(allowed)}."
                 )
@@ -203,7 +241,7 @@ class _TrackReader:
             if key not in value:
                 there = shortened(", ".join(map(str, value))) or "no field"
                 raise TrackError(
-                    f"{self._path}: {prefix}{key} is missing; {where} has {there} "
+                    f"{self._source}: {prefix}{key} is missing; {where} has {there} "
                     f"and needs {', '.join(sorted(required))}."
                 )
         return value
@@ -247,4 +285,4 @@ class _TrackReader:
 
     def _error(self, where: str, value: Any, allowed: str) -> TrackError:
         """Return the refusal of one field."""
-        return TrackError(f"{self._path}: {where} is {quoted(value)}, but must be {allowed}.")
+        return TrackError(f"{self._source}: {where} is {quoted(value)}, but must be {allowed}.")

@@ -1,13 +1,13 @@
 """Links to vehicles, by name.
 
-| name | goes over | says | needs |
-|---|---|---|---|
-| ``udp``, ``simulated`` | UDP | setpoints in SI units | port |
-| ``betaflight_sitl`` | UDP | channels | rates, thrust |
-| ``crsf`` | serial port | channels | device, rates, thrust |
-| ``sbus`` | serial port | channels | device, rates, thrust |
-| ``msp`` | serial port | channels | device, rates, thrust |
-| ``mavlink`` | UDP, or serial port | body rates, normalised thrust | port or device, thrust |
+| name | goes over | says | needs | hears the battery by |
+|---|---|---|---|---|
+| ``udp``, ``simulated`` | UDP | setpoints in SI units | port | |
+| ``betaflight_sitl`` | UDP | channels | rates, thrust | |
+| ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR |
+| ``sbus`` | serial port | channels | device, rates, thrust | |
+| ``msp`` | serial port | channels | device, rates, thrust | BATTERY_STATE, which it asks for |
+| ``mavlink`` | UDP, or serial port | body rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS |
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from dreamer_racing.hil.links.crsf import encode_crsf
+from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
-from dreamer_racing.hil.links.msp import encode_msp
+from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
 from dreamer_racing.hil.links.sbus import encode_sbus
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
 from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
+from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
 from dreamer_racing.hil.vehicle import at_rest
@@ -108,12 +109,16 @@ def _betaflight_sitl(config: LinkConfig) -> TransportLink:
     return ChannelLink(_datagrams(config, RC_PORT), encode_sitl, rates, thrust, config.arm_channel)
 
 
-def _radio(encode: Callable[[Sequence[float]], bytes]) -> Callable[[LinkConfig], TransportLink]:
+def _radio(
+    encode: Callable[[Sequence[float]], bytes],
+    telemetry: Callable[[], Telemetry | None] = lambda: None,
+    request: bytes = b"",
+) -> Callable[[LinkConfig], TransportLink]:
     """Return what makes the link of a radio's receiver at a serial port."""
 
     def make(config: LinkConfig) -> TransportLink:
         rates, thrust = _maps(config)
-        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel)
+        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel, telemetry(), request)
 
     return make
 
@@ -127,12 +132,15 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "udp": _udp,
     "simulated": _udp,
     "betaflight_sitl": _betaflight_sitl,
-    "crsf": _radio(encode_crsf),
+    "crsf": _radio(encode_crsf, CrsfTelemetry),
     "sbus": _radio(encode_sbus),
-    "msp": _radio(encode_msp),
+    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST),
     "mavlink": _mavlink,
 }
 """What makes a link, by its name."""
+
+HEARING = ("crsf", "msp", "mavlink")
+"""Links that hear of the battery."""
 
 
 def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:

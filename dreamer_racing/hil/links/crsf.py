@@ -1,11 +1,15 @@
-"""CRSF (Crossfire, ExpressLRS): the frame RC_CHANNELS_PACKED.
+"""CRSF (Crossfire, ExpressLRS): the frame RC_CHANNELS_PACKED out, and BATTERY_SENSOR back.
 
 26 bytes: address of the flight controller C8, length 18 of what follows, kind 16, 22 bytes of `packed` channels, and a
 CRC-8 over kind and channels.
 
 Betaflight reads 1811 − 172 ticks as 2012 − 988 µs exactly, which is up to 1 µs more than meant, and 0.8 µs at centre.
 
-Reference: github.com/crsf-wg/crsf, wiki, Message-Format and CRSF_FRAMETYPE_RC_CHANNELS_PACKED.
+What comes back, big endian: address, length 0A, kind 08, voltage u16 (0.1 V), current u16 (0.1 A), used capacity u24
+(mAh), remaining u8 (%), and the CRC-8. With Betaflight's ``report_cell_voltage`` it is the voltage of one cell.
+
+Reference: github.com/crsf-wg/crsf, wiki, Message-Format, CRSF_FRAMETYPE_RC_CHANNELS_PACKED and
+CRSF_FRAMETYPE_BATTERY_SENSOR; Betaflight, src/main/telemetry/crsf.c (crsfFrameBatterySensor).
 """
 
 from __future__ import annotations
@@ -13,10 +17,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dreamer_racing.hil.links import packed
+from dreamer_racing.hil.links.telemetry import FrameTelemetry
 
 HEADER = b"\xc8\x18\x16"
 FRAME_SIZE = len(HEADER) + packed.SIZE + 1
 """Bytes of a frame: 26."""
+ADDRESSES = (0xC8, 0xEA, 0xEC, 0xEE)
+"""With which frames begin: of the flight controller, the handset, the receiver and the transmitter's module."""
+BATTERY_SENSOR, _BATTERY_PAYLOAD = 0x08, 8
+_SHORTEST, _LONGEST = 2, 62  # lengths that a frame may give
 _POLYNOMIAL = 0xD5  # DVB-S2
 
 
@@ -31,6 +40,31 @@ def decode_crsf(frame: bytes) -> tuple[float, ...] | None:
     if len(frame) != FRAME_SIZE or not frame.startswith(HEADER) or crc8(frame[2:-1]) != frame[-1]:
         return None
     return packed.unpack(frame[len(HEADER) : -1])
+
+
+class CrsfTelemetry(FrameTelemetry):
+    """Reads BATTERY_SENSOR."""
+
+    def frame_size(self, data: bytes) -> int | None:
+        """Return the size of the frame that begins the data; see `FrameTelemetry`."""
+        if data[0] not in ADDRESSES:
+            return None
+        if len(data) < 2:
+            return 0
+        return data[1] + 2 if _SHORTEST <= data[1] <= _LONGEST else None
+
+    def is_whole(self, frame: bytes) -> bool:
+        """Whether the CRC of a frame is right."""
+        return crc8(frame[2:-1]) == frame[-1]
+
+    def is_battery(self, frame: bytes) -> bool:
+        """Whether a frame is a BATTERY_SENSOR."""
+        return frame[2] == BATTERY_SENSOR
+
+    def voltage(self, frame: bytes) -> float | None:
+        """Return the voltage, V, in steps of 0.1 V."""
+        payload = frame[3:-1]
+        return None if len(payload) < _BATTERY_PAYLOAD else int.from_bytes(payload[:2], "big") / 10
 
 
 def crc8(data: bytes) -> int:

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
+from dreamer_racing.hil.battery import Reading
+from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, channels
 from dreamer_racing.hil.vehicle import Command, at_rest
 
+ASK_EVERY = 5
+"""Commands from one request for telemetry to the next, where a link has to ask [choice]: 5 to 10 a second."""
+
 
 class Transport(Protocol):
-    """Takes bytes to where they are heard."""
+    """Takes bytes to where they are heard, and gives those that come back."""
 
     def write(self, data: bytes) -> bool:
         """Hand over bytes without waiting; return whether they were taken, all of them.
 
         Raises:
             OSError: The device is gone; what may pass by itself is not raised.
+        """
+        ...
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield what has come back, as `Inlet.read` does.
+
+        Raises:
+            OSError: The device is gone.
         """
         ...
 
@@ -33,14 +47,41 @@ class TransportLink(ABC):
 
     Args:
         transport: Takes the bytes; closed with the link.
+        thrust: What motors and battery make of their command; None where thrust is sent as it is.
+        telemetry: Reads what comes back; None if nothing does.
 
     Attributes:
         dropped: Commands so far that did not go out, because a buffer was full or nobody listened.
+        thrust: As given, with the voltage of now.
     """
 
-    def __init__(self, transport: Transport) -> None:
+    def __init__(
+        self, transport: Transport, thrust: ThrustMap | None = None, telemetry: Telemetry | None = None
+    ) -> None:
         self.dropped = 0
-        self._transport = transport
+        self.thrust = thrust
+        self._transport, self._telemetry = transport, telemetry
+
+    @property
+    def rejected(self) -> int:
+        """What has come back so far and was not understood, see `Telemetry`."""
+        return 0 if self._telemetry is None else self._telemetry.rejected
+
+    def listen(self) -> list[Reading]:
+        """Return the battery's voltages that have come back since the last call, oldest first, without waiting.
+
+        Raises:
+            OSError: The device is gone.
+        """
+        if self._telemetry is None:
+            return []
+        arrived = self._transport.read()
+        return [Reading(time, voltage) for time, data in arrived for voltage in self._telemetry.read(data)]
+
+    def reckon_with(self, voltage: float) -> None:
+        """Let the thrust map reckon with a voltage, V, for which it can be (`ThrustMap.check`)."""
+        if self.thrust is not None and self.thrust.voltage != voltage:
+            self.thrust = replace(self.thrust, voltage=voltage)
 
     @abstractmethod
     def encode(self, command: Command) -> bytes:
@@ -76,10 +117,11 @@ class ChannelLink(TransportLink):
         rates: What the flight controller makes of the sticks.
         thrust: What it makes of the throttle.
         arm_channel: Index of the switch that arms, see `channels`.
-
-    Attributes:
-        thrust: May be replaced in flight, as the battery's voltage sinks.
+        telemetry: See `TransportLink`.
+        request: Asks for telemetry; goes out with the first of every `ASK_EVERY` commands.
     """
+
+    thrust: ThrustMap
 
     def __init__(
         self,
@@ -88,11 +130,16 @@ class ChannelLink(TransportLink):
         rates: RateMap,
         thrust: ThrustMap,
         arm_channel: int = FIRST_SWITCH,
+        telemetry: Telemetry | None = None,
+        request: bytes = b"",
     ) -> None:
-        super().__init__(transport)
-        self.thrust = thrust
+        super().__init__(transport, thrust, telemetry)
         self._encode_channels, self._rates, self._arm_channel = encode_channels, rates, arm_channel
+        self._request, self._encoded = request, 0
 
     def encode(self, command: Command) -> bytes:
-        """Return the frame of a command."""
-        return self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
+        """Return the frame of a command, and the request where that is due."""
+        frame = self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
+        due = self._encoded % ASK_EVERY == 0
+        self._encoded += 1
+        return frame + self._request if due else frame

@@ -5,15 +5,20 @@ radio. Disarming is forced: it stops the motors in the air too, as the arm switc
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
 
+The battery's voltage comes back in BATTERY_STATUS (``id`` 0; mV of each cell, 65535 for those that are not there; a
+voltage that is only known as a whole stands in the first) or in SYS_STATUS (mV; 65535: not known).
+
 Reference: mavlink.io/en/messages/common.html.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from dreamer_racing.hil.links.link import Transport, TransportLink
+from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.mavlink_messages import import_messages
 from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.vehicle import Command
@@ -22,6 +27,8 @@ IGNORE_ATTITUDE = 128
 """ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
 FORCE = 21196.0
 """Second number of COMPONENT_ARM_DISARM: disarm wherever the vehicle is."""
+UNKNOWN = 65535
+"""mV, of a voltage that is not known."""
 ARM_TRIES = 5
 """Messages that arm, from when a command is armed first: one may be lost, but a vehicle that has disarmed itself later
 must not be armed again [choice]."""
@@ -36,16 +43,14 @@ class MavlinkLink(TransportLink):
         system: Number of the vehicle.
         component: Number of its autopilot.
 
-    Attributes:
-        thrust: May be replaced in flight, as the battery's voltage sinks.
-
     Raises:
         ImportError: pymavlink is not installed.
     """
 
+    thrust: ThrustMap
+
     def __init__(self, transport: Transport, thrust: ThrustMap, system: int = 1, component: int = 1) -> None:
-        super().__init__(transport)
-        self.thrust = thrust
+        super().__init__(transport, thrust, MavlinkTelemetry(system))
         self._common = import_messages("The link mavlink")
         self._target = system, component
         self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
@@ -82,3 +87,54 @@ class MavlinkLink(TransportLink):
         data = bytes(message.pack(self._sender))
         self._sender.seq = (self._sender.seq + 1) % 256
         return data
+
+
+class MavlinkTelemetry(Telemetry):
+    """Reads BATTERY_STATUS, of the first battery, and SYS_STATUS, by pymavlink.
+
+    Args:
+        system: Number of the vehicle: what others say is passed over.
+
+    Raises:
+        ImportError: pymavlink is not installed.
+    """
+
+    def __init__(self, system: int = 1) -> None:
+        super().__init__()
+        self._system = system
+        self._parser = import_messages("The link mavlink").MAVLink(None)
+        self._parser.robust_parsing = True  # damaged messages come out as BAD_DATA
+
+    def read(self, data: bytes) -> list[float]:
+        """Take in bytes; return the voltages in them, V, oldest first."""
+        voltages = []
+        for message in self._parser.parse_buffer(data) or []:
+            kind = message.get_type()
+            if kind == "BAD_DATA":
+                self.rejected += 1
+            elif message.get_srcSystem() == self._system and kind in VOLTAGES and not _is_another(message):
+                voltage = VOLTAGES[kind](message)
+                self.rejected += voltage is None
+                voltages += [] if voltage is None else [voltage]
+        return voltages
+
+
+def _is_another(message: Any) -> bool:
+    """Whether a message is of a battery that is not the first."""
+    return message.get_type() == "BATTERY_STATUS" and message.id != 0
+
+
+def _of_battery_status(message: Any) -> float | None:
+    cells = [cell for cell in (*message.voltages, *message.voltages_ext) if 0 < cell < UNKNOWN]
+    return sum(cells) / 1000 if cells else None
+
+
+def _of_sys_status(message: Any) -> float | None:
+    return None if message.voltage_battery == UNKNOWN else message.voltage_battery / 1000
+
+
+VOLTAGES: dict[str, Callable[[Any], float | None]] = {
+    "BATTERY_STATUS": _of_battery_status,
+    "SYS_STATUS": _of_sys_status,
+}
+"""What reads the voltage, V, of a message by its name; None: it says nothing of it."""

@@ -13,6 +13,7 @@ import socket
 import struct
 import time
 import zlib
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +66,7 @@ def decode_command(data: bytes) -> CommandPacket | None:
 
 
 class UdpTransport:
-    """Sends datagrams to one address.
+    """Sends datagrams to one address, and takes in what that address sends back to the port they come from.
 
     Args:
         host: Name or address.
@@ -75,7 +76,11 @@ class UdpTransport:
         OSError: There is no such host; the message names it.
     """
 
+    _MOST = 64  # datagrams taken in at a time: a flood must not stop the loop
+    _SIZE = 2048  # bytes; more than an Ethernet frame holds
+
     def __init__(self, host: str, port: int) -> None:
+        self._heard = True  # whether the last datagram found somebody, as far as is known
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -86,13 +91,31 @@ class UdpTransport:
 
     def write(self, data: bytes) -> bool:
         """Send a datagram; return whether it went out: not so if buffers are full or the last one found nobody."""
+        heard, self._heard = self._heard, True
         try:
             self._socket.send(data)
         except OSError as error:
             if error.errno not in _PASSING:
                 raise
             return False
-        return True
+        return heard
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield the datagrams that have come back, with the time now, s (``time.monotonic``).
+
+        What an earlier datagram met on its way, the next `write` says.
+        """
+        for _ in range(self._MOST):
+            try:
+                data = self._socket.recv(self._SIZE)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if error.errno not in _PASSING:
+                    raise
+                self._heard = False
+                return
+            yield time.monotonic(), data
 
     def close(self) -> None:
         """Close the socket."""

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dreamer_racing.hil.attitude import rotation_matrix
 from dreamer_racing.hil.pose import PosePacket, Received, make_packet
-from dreamer_racing.hil.stamping import SILENCE, rotation_matrix
+from dreamer_racing.hil.stamping import SILENCE
 from dreamer_racing.hil.velocity import VelocityEstimator
 
 LARGEST = 1e6

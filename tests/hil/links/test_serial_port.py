@@ -16,8 +16,8 @@ import pytest
 serial = pytest.importorskip("serial")
 
 from dreamer_racing.hil.links import LinkConfig, make_link  # noqa: E402
-from dreamer_racing.hil.links.crsf import decode_crsf  # noqa: E402
-from dreamer_racing.hil.links.msp import decode_msp  # noqa: E402
+from dreamer_racing.hil.links.crsf import crc8, decode_crsf  # noqa: E402
+from dreamer_racing.hil.links.msp import BATTERY_REQUEST, decode_msp  # noqa: E402
 from dreamer_racing.hil.links.sbus import decode_sbus  # noqa: E402
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings  # noqa: E402
 from dreamer_racing.hil.sticks import RateMap, ThrustMap  # noqa: E402
@@ -47,7 +47,12 @@ def read(descriptor: int, size: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "decode"), [("crsf", decode_crsf), ("sbus", lambda data: decode_sbus(data).channels), ("msp", decode_msp)]
+    ("name", "decode"),
+    [
+        ("crsf", decode_crsf),
+        ("sbus", lambda data: decode_sbus(data).channels),
+        ("msp", lambda data: decode_msp(data.removesuffix(BATTERY_REQUEST))),
+    ],
 )
 def test_frames_arrive(wire, name, decode):
     far, path = wire
@@ -55,6 +60,18 @@ def test_frames_arrive(wire, name, decode):
     sent = link.send(at_rest())
     assert read(far, len(sent)) == sent and decode(sent) == pytest.approx(RESTING)
     link.close()
+    link.close()
+
+
+def test_the_battery_is_heard_on_the_same_wire(wire):
+    far, path = wire
+    link = make_link(LinkConfig("crsf", device=path, rates=RATES, thrust=THRUST))
+    assert link.listen() == []
+    os.write(far, bytes.fromhex("c80a0800fc00bd00089764") + bytes([crc8(bytes.fromhex("0800fc00bd00089764"))]))
+    heard, deadline = link.listen(), time.monotonic() + 5.0
+    while not heard and time.monotonic() < deadline:
+        heard = link.listen()
+    assert [reading.voltage for reading in heard] == [25.2]
     link.close()
 
 

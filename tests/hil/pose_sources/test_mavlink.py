@@ -14,10 +14,11 @@ import pytest
 
 mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
 
+from dreamer_racing.hil.attitude import rotation_matrix  # noqa: E402
 from dreamer_racing.hil.inlet import UdpInlet  # noqa: E402
 from dreamer_racing.hil.pose_sources import PoseConfig, make_poses  # noqa: E402
 from dreamer_racing.hil.pose_sources.mavlink import MESSAGES, MavlinkPose  # noqa: E402
-from dreamer_racing.hil.stamping import PoseClock, Stamping, rotation_matrix  # noqa: E402
+from dreamer_racing.hil.stamping import PoseClock, Stamping  # noqa: E402
 
 HALF = math.sqrt(0.5)
 LEVEL, YAW_RIGHT, ROLL_RIGHT, NOSE_UP = (1, 0, 0, 0), (HALF, 0, 0, HALF), (HALF, HALF, 0, 0), (HALF, 0, HALF, 0)

@@ -1,0 +1,100 @@
+"""Milliseconds per step of exported actors in onnxruntime, one thread: those that ship, and sizes with initial weights.
+
+    python benchmarks/actor_latency.py --actors circle kidney figure8 --sizes paper_large --json actor_latency.json
+    python benchmarks/actor_latency.py --sizes paper_large --keep exports
+    python recipes/hil.py actor=exports/paper_large arm=false patience=60     # beside recipes/plant.py track=circle
+
+Sizes are exported as recipes/export.py does it, parity check included, of networks with initial weights: how long a
+step takes does not depend on what was learned, nor on what is seen, which is noise here. With --keep an export stays in
+a folder of its size's name, and flies like any other, if badly: with arm=false the loop sees, chooses and sends at each
+tick, and never arms.
+"""
+
+import argparse
+import logging
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from measuring import print_table, write_json
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.actor_step import export_actor, make_step
+from dreamer_racing.export.contract import make_contract
+from dreamer_racing.export.onnx_actor import OnnxActor, measure_latency
+from dreamer_racing.export.parity import MIN_STEPS, episode_steps, record_flight
+from dreamer_racing.modules import SIZES, Interface, get_size
+from dreamer_racing.modules.agent import Agent
+
+AGENTS = Path(__file__).parents[1] / "agents"
+ACTOR, PRESET = "actor.onnx", "easy"
+COLUMNS = ("actor", "parameters", "threads", "steps", "p50_ms", "p99_ms", "max_ms", "file_mb")
+
+
+def main() -> None:
+    """Measure every actor asked for, one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--actors", nargs="*", default=[], help="agents that ship by their names, or .onnx files")
+    parser.add_argument("--sizes", nargs="*", default=[], choices=SIZES, metavar="SIZE", help=f"of {', '.join(SIZES)}")
+    parser.add_argument("--track", default="circle", help="that contracts of sizes name")
+    parser.add_argument("--rate", type=float, default=50.0, help="Hz, that contracts of sizes name")
+    parser.add_argument("--steps", type=int, default=2000, help="timed")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--keep", help="folder in which exports of sizes stay")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    if not arguments.actors and not arguments.sizes:
+        parser.error("nothing to measure: give --actors or --sizes")
+    torch.set_num_threads(1)
+    # Its exporter says four times that torchvision is not installed, which nothing here needs.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    paths = {name: AGENTS / name / ACTOR if (AGENTS / name).is_dir() else Path(name) for name in arguments.actors}
+    with tempfile.TemporaryDirectory() as folder:
+        for size in arguments.sizes:
+            paths[size] = export_initial(size, arguments.track, arguments.rate, Path(arguments.keep or folder) / size)
+        records = [measure(name, path, arguments.steps, arguments.threads) for name, path in paths.items()]
+    print_table(records, COLUMNS)
+    write_json(records, arguments.json)
+
+
+def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:
+    """Export an actor with initial weights; return its .onnx file."""
+    torch.manual_seed(0)
+    env = DroneRacingEnv(
+        track, 1, seed=0, preset=PRESET, control_rate=rate, episode_steps=episode_steps(MIN_STEPS), num_threads=1
+    )
+    try:
+        agent = Agent(get_size(size), Interface.of(env), decode=False).requires_grad_(False)
+        step, flight = make_step(agent, "mode"), record_flight(env, agent, MIN_STEPS)
+    finally:
+        env.close()
+    source = {"checkpoint": "initial weights", "env_steps": 0, "weights": "initial", "track": track, "preset": PRESET}
+    contract = make_contract(step, env.worlds.parameters, env.worlds.camera, **source)
+    folder.mkdir(parents=True, exist_ok=True)
+    export_actor(step, contract, flight, folder / ACTOR)
+    return folder / ACTOR
+
+
+def measure(name: str, path: Path, steps: int, threads: int) -> dict[str, Any]:
+    """Time single steps of an actor."""
+    actor = OnnxActor(path, threads=threads)
+    entry = actor.contract["inputs"][0]
+    seen = np.random.default_rng(0).integers(0, 256, (steps, *entry["shape"][1:])).astype(entry["type"])
+    latency = measure_latency(actor.step, seen)
+    return {
+        "benchmark": "actor_latency", "actor": name, "size": actor.contract["model"]["name"],
+        "parameters": actor.contract["model"]["parameters"], "runtime": "onnxruntime", "threads": threads,
+        "steps": steps, "p50_ms": latency.p50, "p99_ms": latency.p99, "max_ms": latency.max,
+        "file_mb": sum(file.stat().st_size for file in weights_of(path)) / 1e6,
+    }  # fmt: skip
+
+
+def weights_of(path: Path) -> list[Path]:
+    """The .onnx file, and the one of its weights where they lie apart."""
+    return [path, *path.parent.glob("*.safetensors")]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Attitudes as quaternions, wxyz, body → world: turned, compared, and as matrices; in numpy, one at a time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Turn an attitude (4,) wxyz by a rotation vector (3,) in rad, in the body frame."""
+    angle = float(np.linalg.norm(rotation))
+    half = 0.5 * angle
+    scale = 0.5 if angle < 1e-9 else np.sin(half) / angle
+    w, (x, y, z) = np.cos(half), scale * rotation
+    a, b, c, d = attitude
+    turned = np.array(
+        (
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        )
+    )
+    return turned / np.linalg.norm(turned)
+
+
+def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the rotation vector (3,), rad, body frame, that turns one attitude into another, the short way round.
+
+    The inverse of `turn`: the logarithm of first⁻¹ second. It is the same for q and −q.
+
+    Args:
+        first: (4,) wxyz, unit length.
+        second: (4,) wxyz, unit length.
+    """
+    a, b, c, d = first
+    w, x, y, z = second
+    cosine = a * w + b * x + c * y + d * z  # of half the angle
+    axis = np.array((a * x - b * w - c * z + d * y, a * y + b * z - c * w - d * x, a * z - b * y + c * x - d * w))
+    sine = float(np.linalg.norm(axis))
+    half = math.atan2(sine, abs(cosine))
+    scale = 2.0 if sine < 1e-9 else 2.0 * half / sine
+    return math.copysign(scale, cosine) * axis
+
+
+def rotation_matrix(attitude: np.ndarray) -> np.ndarray:
+    """Return the rotation body → world (3, 3) of an attitude (4,) wxyz; its columns are forward, left and up."""
+    w, x, y, z = attitude
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )

@@ -1,0 +1,70 @@
+"""What comes back from a vehicle, as far as it is read: the voltage of its battery."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+
+class Telemetry(ABC):
+    """Finds battery voltages in bytes that arrive in pieces. Frames of other kinds are passed over.
+
+    Attributes:
+        rejected: Frames so far that were damaged or say no voltage, and stretches of bytes that were no frame.
+    """
+
+    def __init__(self) -> None:
+        self.rejected = 0
+
+    @abstractmethod
+    def read(self, data: bytes) -> list[float]:
+        """Take in bytes; return the voltages in them, V, oldest first. It never raises."""
+
+
+class FrameTelemetry(Telemetry):
+    """Cuts a stream of bytes into frames; a subclass says what a frame is, and what it says.
+
+    What is damaged is skipped up to the next frame that is whole.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._buffer = bytearray()
+        self._lost = False  # whether the last byte was skipped: those in a row count once
+
+    @abstractmethod
+    def frame_size(self, data: bytes) -> int | None:
+        """Return the size of the frame that begins the data; 0 if that takes more bytes to tell; None: none begins."""
+
+    @abstractmethod
+    def is_whole(self, frame: bytes) -> bool:
+        """Whether the checksum of a frame is right."""
+
+    @abstractmethod
+    def is_battery(self, frame: bytes) -> bool:
+        """Whether a whole frame speaks of the battery."""
+
+    @abstractmethod
+    def voltage(self, frame: bytes) -> float | None:
+        """Return what a frame that speaks of the battery says, V; None if it is too short, or there is no battery."""
+
+    def read(self, data: bytes) -> list[float]:
+        """Take in bytes; return the voltages in them, V, oldest first."""
+        self._buffer += data
+        voltages = []
+        while self._buffer:
+            size = self.frame_size(bytes(self._buffer[:8]))
+            if size is not None and not 0 < size <= len(self._buffer):
+                break  # the rest is on its way
+            frame = bytes(self._buffer[: size or 0])
+            if size is None or not self.is_whole(frame):
+                self.rejected += size is not None or not self._lost
+                self._lost = True
+                del self._buffer[0]
+                continue
+            del self._buffer[:size]
+            self._lost = False
+            if self.is_battery(frame):
+                voltage = self.voltage(frame)
+                self.rejected += voltage is None
+                voltages += [] if voltage is None else [voltage]
+        return voltages

@@ -1,0 +1,224 @@
+"""What comes back from flight controllers: golden vectors by hand, streams cut anywhere, and noise."""
+
+from __future__ import annotations
+
+import socket
+from functools import reduce
+from operator import xor
+
+import numpy as np
+import pytest
+
+from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig, make_link
+from dreamer_racing.hil.links.crsf import CrsfTelemetry, crc8, encode_crsf
+from dreamer_racing.hil.links.link import ASK_EVERY, ChannelLink
+from dreamer_racing.hil.links.mavlink import MavlinkTelemetry
+from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
+from dreamer_racing.hil.links.udp import UdpTransport
+from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.hil.vehicle import at_rest
+
+RATES = RateMap(roll=10.0, pitch=10.0, yaw=4.0)
+THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
+
+
+def crsf(payload: str, kind: int = 0x08, address: int = 0xC8) -> bytes:
+    body = bytes([kind]) + bytes.fromhex(payload)
+    return bytes([address, len(body) + 1]) + body + bytes([crc8(body)])
+
+
+def msp(payload: str, code: int = 130, answer: bytes = b">") -> bytes:
+    data = bytes.fromhex(payload)
+    body = bytes([len(data), code]) + data
+    return b"$M" + answer + body + bytes([reduce(xor, body)])
+
+
+CRSF_252 = crsf("00fc 00bd 000897 64")  # the examples of the wiki: 25.2 V, 18.9 A, 2199 mAh, 100 %
+MSP_1523 = msp("04 dc05 98 6400 d007 00 f305")  # 4 cells, 1500 mAh, 15.2 V, 100 mAh, 20 A, no alert, 15.23 V
+FRAMES = {"crsf": (CrsfTelemetry, CRSF_252, 25.2), "msp": (MspTelemetry, MSP_1523, 15.23)}
+
+
+def test_frames_by_hand():
+    """The CRC by long division is that of `test_channel_codecs`; the XOR: 0B^82=89, ^04=8D, ^DC^05=54, ^98=CC, ^64=A8,
+    ^D0^07=7F, ^F3^05=89."""
+    assert CRSF_252[:-1] == bytes.fromhex("c80a0800fc00bd00089764") and len(CRSF_252) == 12
+    assert b"$M>" + bytes.fromhex("0b82 04dc0598 6400 d007 00 f305 89") == MSP_1523
+    assert b"$M<" + bytes.fromhex("008282") == BATTERY_REQUEST
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_golden_vectors(name):
+    make, frame, voltage = FRAMES[name]
+    telemetry = make()
+    assert telemetry.read(frame) == [voltage] and telemetry.rejected == 0
+
+
+@pytest.mark.parametrize("address", [0xC8, 0xEA, 0xEC, 0xEE])
+def test_crsf_comes_with_the_address_of_whom_it_is_for(address):
+    assert CrsfTelemetry().read(crsf("0094 0000 000000 32", address=address)) == [14.8]
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_stream_may_be_cut_anywhere(name):
+    make, frame, voltage = FRAMES[name]
+    telemetry = make()
+    heard = [value for byte in 3 * frame for value in telemetry.read(bytes([byte]))]
+    assert heard == 3 * [voltage] and telemetry.rejected == 0
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_after_garbage_and_half_a_frame_the_next_one_is_heard(name):
+    make, frame, voltage = FRAMES[name]
+    telemetry = make()
+    telemetry.read(b"\x00\xff$" + frame[:-3])
+    heard = telemetry.read(40 * frame)
+    assert len(heard) >= 39 and set(heard) == {voltage} and 1 <= telemetry.rejected <= 8
+
+
+@pytest.mark.parametrize(
+    ("make", "frame"),
+    [
+        (CrsfTelemetry, encode_crsf((1500.0,) * 16)),  # our own, on a line with one wire
+        (CrsfTelemetry, crsf("0102030405060708090a", kind=0x14)),  # link statistics
+        (MspTelemetry, msp("", code=200)),  # SET_RAW_RC was taken
+        (MspTelemetry, msp("01", code=110)),
+    ],
+)
+def test_other_frames_are_passed_over(make, frame):
+    telemetry = make()
+    assert telemetry.read(frame) == [] and telemetry.rejected == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "frame"),
+    [
+        (CrsfTelemetry, crsf("00fc")),  # too short
+        (CrsfTelemetry, crsf("")),
+        (MspTelemetry, msp("04 dc05 98 6400 d007 00")),  # of a release before 4.0
+        (MspTelemetry, msp("00 dc05 98 6400 d007 00 f305")),  # no battery
+        (MspTelemetry, msp("", answer=b"!")),  # the flight controller does not know the question
+        (CrsfTelemetry, CRSF_252[:-1] + b"\x00"),
+        (MspTelemetry, MSP_1523[:-1] + b"\x00"),
+    ],
+)
+def test_frames_that_say_no_voltage_are_counted(make, frame):
+    telemetry = make()
+    assert telemetry.read(frame) == [] and telemetry.rejected >= 1
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_noise_and_damage(name):
+    """Nothing is raised, buffers stay small, and damaged frames are counted and silent, but for 1 checksum in 256."""
+    make, frame, _ = FRAMES[name]
+    generator, telemetry = np.random.default_rng(0), make()
+    for _ in range(2000):
+        telemetry.read(generator.bytes(int(generator.integers(0, 64))))
+        assert len(telemetry._buffer) < 262
+    assert telemetry.rejected > 0
+    telemetry, heard = make(), []
+    for _ in range(1000):
+        damaged = bytearray(frame)
+        damaged[generator.integers(3, len(frame))] ^= 1 << generator.integers(0, 8)
+        heard += telemetry.read(bytes(damaged))
+    assert len(heard) < 10 and telemetry.rejected >= 900
+
+
+def test_msp_asks_with_the_first_command_and_every_fifth():
+    link = ChannelLink(None, encode_msp, RATES, THRUST, telemetry=MspTelemetry(), request=BATTERY_REQUEST)
+    asked = [link.encode(at_rest()).endswith(BATTERY_REQUEST) for _ in range(2 * ASK_EVERY)]
+    assert asked == [True, *[False] * 4] * 2
+
+
+class Autopilot:
+    """Sends MAVLink to a link over loopback."""
+
+    def __init__(self) -> None:
+        self.common = pytest.importorskip("pymavlink.dialects.v20.common")
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(5.0)
+        self.link = make_link(LinkConfig("mavlink", port=self.socket.getsockname()[1], thrust=THRUST))
+        self.link.send(at_rest())
+        self.address = self.socket.recvfrom(2048)[1]
+
+    def battery(self, *cells: int, id: int = 0, ext: tuple[int, ...] = (0, 0, 0, 0)) -> object:
+        voltages = [*cells, *[65535] * (10 - len(cells))]
+        return self.common.MAVLink_battery_status_message(id, 0, 0, 0, voltages, 0, 0, 0, 0, 0, 0, ext)
+
+    def system(self, millivolts: int) -> object:
+        return self.common.MAVLink_sys_status_message(0, 0, 0, 0, millivolts, 0, 0, 0, 0, 0, 0, 0, 0)
+
+    def say(self, message: object, system: int = 1) -> list[float]:
+        return self.say_bytes(message.pack(self.common.MAVLink(None, system, 1)))
+
+    def say_bytes(self, data: bytes) -> list[float]:
+        self.socket.sendto(data, self.address)
+        return [reading.voltage for reading in self.link.listen()]
+
+
+@pytest.fixture
+def autopilot():
+    pilot = Autopilot()
+    yield pilot
+    pilot.link.close()
+    pilot.socket.close()
+
+
+def test_mavlink_over_loopback(autopilot):
+    assert autopilot.say(autopilot.battery(3810, 3800, 3790, 3800)) == [15.2]
+    assert autopilot.say(autopilot.battery(15_300)) == [15.3]  # only known as a whole
+    assert autopilot.say(autopilot.battery(*[3700] * 10, ext=(3700, 3700, 0, 0))) == [pytest.approx(44.4)]
+    assert autopilot.say(autopilot.system(14_900)) == [14.9]
+    assert autopilot.link.rejected == 0
+
+
+def test_mavlink_that_is_not_of_this_battery(autopilot):
+    assert autopilot.say(autopilot.battery(15_300), system=2) == []
+    assert autopilot.say(autopilot.battery(5_000, id=1)) == []
+    assert autopilot.link.rejected == 0
+    assert autopilot.say(autopilot.battery()) == [] and autopilot.say(autopilot.system(65535)) == []
+    assert autopilot.link.rejected == 2
+
+
+def test_mavlink_that_is_damaged_is_counted(autopilot):
+    data = bytearray(autopilot.system(14_900).pack(autopilot.common.MAVLink(None, 1, 1)))
+    data[12] ^= 1
+    assert autopilot.say_bytes(bytes(data)) == [] and autopilot.link.rejected >= 1
+    assert autopilot.say_bytes(b"nonsense") == []
+    assert 14.9 in [autopilot.say(autopilot.system(14_900)) for _ in range(20)][-1]
+
+
+def test_mavlink_noise(autopilot):
+    """Nothing is raised by noise, nor by messages with damage or with noise for a payload."""
+    generator = np.random.default_rng(0)
+    telemetry, valid = MavlinkTelemetry(), autopilot.battery(15_300).pack(autopilot.common.MAVLink(None, 1, 1))
+    heard = []
+    for _ in range(3000):
+        noise = generator.bytes(int(generator.integers(0, 80)))
+        damaged = bytearray(valid)
+        damaged[generator.integers(0, len(valid))] ^= 1 << generator.integers(0, 8)
+        for data in (noise, b"\xfd" + noise, bytes(damaged)):
+            heard += telemetry.read(data)
+    assert len(heard) < 10 and telemetry.rejected > 1000
+
+
+def test_strangers_are_not_heard(autopilot):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(("127.0.0.1", 0))
+        stranger.sendto(autopilot.system(14_900).pack(autopilot.common.MAVLink(None, 1, 1)), autopilot.address)
+    assert autopilot.link.listen() == []
+
+
+def test_nobody_there_is_still_counted_when_it_was_reading_that_found_out():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        address = gone.getsockname()
+    transport = UdpTransport(*address)
+    assert transport.write(b"one")
+    assert list(transport.read()) == []
+    assert not transport.write(b"two")
+    transport.close()
+
+
+def test_which_links_hear():
+    assert set(HEARING) < set(LINKS)
