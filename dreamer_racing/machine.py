@@ -98,13 +98,19 @@ def provenance() -> dict[str, Any]:
 
 
 def git_commit(folder: Path) -> str | None:
-    """Name the commit that a folder is at, ``-dirty`` if files have changed since; None outside a repository."""
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+    """Name the commit that a folder is at, ``-dirty`` if files have changed since; None if no repository has its files.
+
+    An installed package may well lie below a repository, of somebody else's work.
+    """
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, check=False)
+        return _git(folder, "describe", "--always", "--dirty") if _git(folder, "ls-files", ".") else None
     except OSError:  # no git here
         return None
-    return answer.stdout.strip() or None
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(folder), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or None
 
 
 def command_line() -> str:

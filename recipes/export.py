@@ -24,6 +24,7 @@ from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
+from composing.usage import command
 from omegaconf import DictConfig, OmegaConf
 from torch import set_num_threads
 
@@ -204,7 +205,7 @@ def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
     if path is None:
         return None
     overrides = [text for text in map(str, OmegaConf.load(path)) if override_key(text) not in OF_A_MACHINE]
-    return shlex.join(["python", f"recipes/{trained.algorithm}.py", *overrides])
+    return f"{command(trained.algorithm)} {shlex.join(overrides)}"
 
 
 def read_evaluation(
@@ -217,7 +218,7 @@ def read_evaluation(
         ValueError: it is of other weights or another track; the message says how to make one.
     """
     path = Path(config.evaluation or RunDirectory(results_of(checkpoint)).evaluation / "evaluation.json")
-    how = f"Make it with: python recipes/evaluate.py checkpoint={shlex.quote(config.checkpoint)} episodes=100"
+    how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
     written = json.loads(path.read_text())

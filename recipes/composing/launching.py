@@ -16,6 +16,7 @@ from composing.checks import check_overrides
 from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import RunConfig, is_race
+from composing.usage import command
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
@@ -115,8 +116,8 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
     place, longer = shlex.quote(os.path.relpath(directory.path)), 2 * config.total_env_steps
     lines = [
         f"{place}: {', '.join(sorted(path.name for path in directory.path.iterdir() if path.name[0] != '.'))}",
-        f"evaluate it:  python recipes/evaluate.py checkpoint={place} episodes=100",
-        f"watch it fly: python recipes/fly.py agent={place}" if is_race(config) else "",
-        f"go on:        python recipes/{config.algorithm}.py resume={place} total_env_steps={longer}",
+        f"evaluate it:  {command('evaluate')} checkpoint={place} episodes=100",
+        f"watch it fly: {command('fly')} agent={place}" if is_race(config) else "",
+        f"go on:        {command(config.algorithm)} resume={place} total_env_steps={longer}",
     ]
     return "\n".join(filter(None, lines))

@@ -35,10 +35,16 @@ def answer_help() -> None:
         raise SystemExit(0)
 
 
+def command(recipe: str) -> str:
+    """The words that start a recipe: from a clone its file, from an installed package, which holds it, the package."""
+    installed = (RECIPES.parent / "__main__.py").is_file()
+    return f"python -m dreamer_racing {recipe}" if installed else f"python recipes/{recipe}.py"
+
+
 def usage(recipe: str) -> Iterator[str]:
     """Yield the lines of a recipe's help."""
     said = ast.get_docstring(ast.parse((RECIPES / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
-    yield from (f"usage: python recipes/{recipe}.py [NAME=VALUE ...]", "", *said.splitlines(), "")
+    yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *said.splitlines(), "")
     if found := groups(recipe):
         yield "Groups: settings that go together (GROUP=CHOICE)"
         for name, choices in found.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
 
 import torch
 from PIL import Image
@@ -126,6 +127,15 @@ def test_provenance(tmp_path, monkeypatch):
     facts = provenance()
     assert {"machine", "gpu", "python", "torch", "torchrl", "mujoco", "commit"} <= set(facts)
     assert git_commit(tmp_path) is None  # no repository
+    for command in (
+        ["init", "--quiet"],
+        ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-q", "--allow-empty", "-m", "a"],
+    ):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    assert git_commit(tmp_path) is None  # another's repository: nothing here is in it
+    (tmp_path / "file").write_text("text")
+    subprocess.run(["git", "add", "file"], cwd=tmp_path, check=True)
+    assert git_commit(tmp_path).endswith("-dirty")
     monkeypatch.setattr("sys.argv", ["recipes/evaluate.py", "run_dir=a b"])
     assert command_line() == "python recipes/evaluate.py 'run_dir=a b'"
     monkeypatch.setenv("PATH", str(tmp_path))  # no git

@@ -1,0 +1,68 @@
+"""`python -m dreamer_racing RECIPE`: from a clone, and from what a wheel holds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
+
+
+def start(*arguments: str, path: Path = ROOT, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(path), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "dreamer_racing", *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a wheel holds, as setup.py builds it."""
+    folder = tmp_path_factory.mktemp("installed")
+    source = tmp_path_factory.mktemp("source")
+    unwanted = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    for name in ("dreamer_racing", "recipes", "agents"):
+        shutil.copytree(ROOT / name, source / name, ignore=unwanted)
+    (source / "docs").mkdir()
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "docs/options.md"):
+        shutil.copy(ROOT / name, source / name)
+    command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", str(folder)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_help_names_every_recipe(tmp_path: Path) -> None:
+    done = start("--help", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ")] == RECIPES
+
+
+def test_an_unknown_recipe_is_refused(tmp_path: Path) -> None:
+    done = start("dreamerv3", "track=kidney", cwd=tmp_path)
+    assert done.returncode == 2 and "dreamerv3: no such recipe (did you mean dreamer_v3?)" in done.stderr
+
+
+def test_from_a_clone_it_is_the_recipe_s_own_file(tmp_path: Path) -> None:
+    done = start("fly", "--help", cwd=tmp_path)
+    assert done.stdout.startswith("usage: python recipes/fly.py"), done.stderr
+    done = start("fly", "pilto=hover", cwd=tmp_path)
+    assert done.returncode == 2 and "did you mean pilot?" in done.stderr
+
+
+def test_a_wheel_holds_what_its_recipes_need(installed: Path, tmp_path: Path) -> None:
+    assert [path.name for path in installed.iterdir()] == ["dreamer_racing"], "nothing else at the top"
+    package = installed / "dreamer_racing"
+    for name in ("recipes/config", "agents"):
+        there = {path.relative_to(package) for path in (package / name).rglob("*")}
+        unwanted = {path for path in (ROOT / name).rglob("*") if "__pycache__" in path.parts}
+        assert there == {path.relative_to(ROOT) for path in set((ROOT / name).rglob("*")) - unwanted}
+    done = start("fly", "--help", path=installed, cwd=tmp_path)
+    assert done.stdout.startswith("usage: python -m dreamer_racing fly"), done.stderr
+    done = start("fly", "agent=nobody", path=installed, cwd=tmp_path)
+    assert done.returncode == 2 and "Agents that ship, to be given by name: circle, figure8, kidney" in done.stderr
