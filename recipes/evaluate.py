@@ -24,10 +24,10 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
-from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import onboard_beside_map, write_video
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
+from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import RunDirectory
 

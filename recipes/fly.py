@@ -32,8 +32,8 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.protocol import fly as fly_races
-from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import onboard_beside_map, write_gif, write_video
+from dreamer_racing.figures.top_down import plot_top_down
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second

@@ -16,8 +16,8 @@ from dreamer_racing.evaluation.course import Course, act, with_memory
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
 from dreamer_racing.evaluation.trajectory import write_trajectory
-from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import side_by_side, write_video
+from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer
 from dreamer_racing.training.directory import RunDirectory
