@@ -1,7 +1,7 @@
 """A training run: collect, learn, log, evaluate, save, end.
 
-The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`,
-`logger.every`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
+The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
+`logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
 """
 
 import signal
@@ -24,6 +24,7 @@ from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.loggers import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.replay_ratio import ReplayRatio
@@ -116,6 +117,8 @@ class Run:
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
             metrics = self.report.make(self.counters["env_steps"], self.config.evaluation.stochastic)
+            if self.config.logger.media:
+                log_evaluation(self.metrics.loggers, self.directory, self.counters["env_steps"])
         self.metrics.push(metrics)
         self.evaluated = self.counters["updates"]
         # Gates first, return where the gates are the same: a return lies far below a million.
