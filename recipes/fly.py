@@ -32,7 +32,8 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.protocol import fly as fly_races
-from dreamer_racing.figures.film import onboard_beside_map, write_gif, write_video
+from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
+from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.top_down import plot_top_down
 
 GIF_SIZE = 256  # pixels, least side of either picture
@@ -160,18 +161,21 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
     if trajectory.pixels is None:
         print(f"{'files':<18} {directory}: evaluation.json, top_down.png (there is no video: the agent sees numbers)")
         return
-    write_video(directory / "onboard.mp4", trajectory.pixels, fps=1 / trajectory.control_dt)
-    frames = onboard_beside_map(track, second_lap(trajectory), GIF_SIZE)[::GIF_STRIDE]
-    size = write_gif(directory / "onboard.gif", frames, fps=1 / (GIF_STRIDE * trajectory.control_dt))
+    words = race_words(track, trajectory)
+    film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
+    write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
+    gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
+    size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
     print(f"{'files':<18} {directory}: evaluation.json, top_down.png, onboard.mp4, onboard.gif ({size / 1e6:.2f} MB)")
 
 
-def second_lap(trajectory: Trajectory) -> Trajectory:
-    """Cut out the second lap, which begins and ends at racing speed; the beginning of the flight if there is none."""
+def second_lap(trajectory: Trajectory) -> tuple[int, int]:
+    """Find the ends of the second lap, which is flown at racing speed; of the beginning of the flight without one."""
     gate = trajectory.target_gate
     ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
-    first, last = ends[:2] if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
-    return trajectory.part(first, last)
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
 
 
 def watch(config: FlyConfig) -> None:

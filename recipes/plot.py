@@ -24,8 +24,9 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
-from dreamer_racing.figures.film import dream_video, write_gif, write_video
+from dreamer_racing.figures.film import write_gif, write_video
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
 from dreamer_racing.figures.profiles import PROFILE_AXES
 from dreamer_racing.figures.runs import (

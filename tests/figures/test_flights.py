@@ -17,8 +17,9 @@ from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, STRI
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.evaluation.trajectory import read_trajectory, write_trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, left_out_of, speed_scale
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.profiles import MISSED_COLOR, Crossing, crossings, draw_altitude, profile_axis
 
 
@@ -158,7 +159,7 @@ def test_dreams_of_three_stages(tmp_path, figures):
     labels = [text.get_text() for text in panels[0].get_xticklabels()]
     assert labels[:3] == ["-0.08 s", "+0.00 s", "+0.08 s"] and labels[-1] == "+0.80 s"
     video = dream_video([("early", flat_dream(frames=5)), ("late", flat_dream())], scale=2)
-    assert video.shape == (13, 2 * (20 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)
+    assert video.shape == (13, 2 * (15 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)  # a strip of words above each
 
 
 # --- figures ---
