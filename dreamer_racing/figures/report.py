@@ -110,7 +110,7 @@ class EvaluationReport:
             frames = dream_beside_flight(self._learner, trajectory, painter, count).numpy()
             right = dream_words(count, SEEN_STEPS, trajectory.control_dt, SEEN_STEPS + DREAMT_STEPS)
         slower = slow_motion(count * trajectory.control_dt)
-        slowed = f"  {slower}× slower" if slower > 1 else ""
+        slowed = f"  {slower}x slower" if slower > 1 else ""
         left = [words + slowed for words in race_words(self._course.base.track, trajectory)[:count]]
         write_video(path, caption(frames, left, right), fps=1 / (slower * trajectory.control_dt), scale=1)
 

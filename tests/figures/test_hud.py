@@ -49,7 +49,7 @@ def test_words_stand_above_the_picture():
 
 @pytest.mark.parametrize(("width", "right"), [(256, []), (528, [SEEN])])
 def test_a_line_fits_into_its_strip(width, right):
-    words = "12.34 s  12.3 m/s  gate 10/12  lap 3/3  8× slower"
+    words = "12.34 s  12.3 m/s  gate 10/12  lap 3/3  8x slower"
     film = caption(np.zeros((1, 4, width, 3), np.uint8), [words], right)
     strip = film[0, : film.shape[1] - 4, : width // 2 if right else width]
     written = (strip != STRIP_COLOR).any((0, 2))
