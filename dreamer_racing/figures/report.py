@@ -4,6 +4,7 @@ Shapes: K control steps of a recorded episode.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ class EvaluationReport:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
+        self.on_episode: Callable[[int, int], None] | None = None
         self._learner = learner
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
@@ -76,7 +78,7 @@ class EvaluationReport:
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        return self._course.evaluate(self.episodes, deterministic)
+        return self._course.evaluate(self.episodes, deterministic, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
@@ -136,6 +138,7 @@ class ReturnReport:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
+        self.on_episode: Callable[[int, int], None] | None = None
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
@@ -175,6 +178,8 @@ class ReturnReport:
             total, length = total + step["next", "reward"].view(-1), length + 1
             done = step["next", "done"].view(-1)
             counted = done & (left > 0)
+            if self.on_episode and counted.any():
+                self.on_episode(self.episodes - int(left.sum() - counted.sum()), self.episodes)
             returns.append(total[counted])
             lengths.append(length[counted])
             left, total, length = left - counted.long(), total.masked_fill(done, 0), length.masked_fill(done, 0)

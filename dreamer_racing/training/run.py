@@ -6,7 +6,7 @@ The configuration that a run reads is a recipe's: any object with the fields `to
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -33,6 +33,9 @@ from dreamer_racing.training.signals import GracefulExit
 
 class Report(Protocol):
     """Evaluates a learner's policy."""
+
+    on_episode: Callable[[int, int], None] | None
+    """Is told how many episodes have ended, and of how many."""
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate, write what there is to look at, return metrics."""
@@ -198,6 +201,7 @@ def train(run: Run) -> None:
         GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
         Progress(config.total_env_steps, counters["env_steps"]) as progress,
     ):
+        run.report.on_episode = progress.evaluating
         if run.directory.finished_env_steps() >= config.total_env_steps:
             progress.say(
                 f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"
