@@ -24,10 +24,11 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
-from dreamer_racing.figures.drawing import plot_top_down
 from dreamer_racing.figures.film import onboard_beside_map, write_video
+from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
+from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import RunDirectory
 
@@ -130,7 +131,8 @@ def write_flight(directory: Path, result: Result, video_steps: int) -> None:
     plot_top_down(result.track, trajectory, RunDirectory(directory).plots / f"{result.name}.png")
     if trajectory.pixels is not None and result.mode == "deterministic":
         frames = onboard_beside_map(result.track, trajectory.part(0, min(video_steps, len(trajectory.action))))
-        write_video(RunDirectory(directory).videos / f"{result.name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+        film = caption(frames, race_words(result.track, trajectory)[: len(frames)])
+        write_video(RunDirectory(directory).videos / f"{result.name}.mp4", film, fps=round(1 / trajectory.control_dt))
 
 
 def describe(results: list[Result], preset: str) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
     python recipes/fly.py track=kidney preset=easy pilot=scripted run_dir=runs/fly
     python recipes/fly.py agent=kidney
+    python recipes/fly.py track=figure8 pilot=keyboard
 
 A scripted pilot sees the true state, not images: it shows what a track asks for, and what lap times are in reach. An
-agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path. For
-pilots, `viewer=true` opens dm_control's interactive viewer instead, which needs a display.
+agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path.
+`pilot=keyboard` and `pilot=gamepad` are you, by what the camera sees in a window (arrows: roll and pitch; A, D: yaw;
+W, S: throttle). For scripted pilots, `viewer=true` opens dm_control's interactive viewer. Windows need a display.
 """
 
 import sys
@@ -30,10 +32,12 @@ from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandPolicy, PygameSticks, check_by_hand
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.protocol import fly as fly_races
-from dreamer_racing.figures.drawing import plot_top_down
-from dreamer_racing.figures.film import onboard_beside_map, write_gif, write_video
+from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
+from dreamer_racing.figures.hud import caption, race_words
+from dreamer_racing.figures.top_down import plot_top_down
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
@@ -48,7 +52,7 @@ class FlyConfig:
     """`recipes/fly.py`."""
 
     agent: str | None = None  # name of one in agents/, or path to an agent, a run directory or a checkpoint
-    pilot: str | None = None  # scripted | hover; null: scripted, if there is no agent
+    pilot: str | None = None  # scripted | hover | keyboard | gamepad; null: scripted, if there is no agent
     track: str | None = None  # built-in track, or path to a YAML file; null: kidney, or what the agent was trained on
     preset: str | None = None  # physics: easy | faithful; null: easy, or what the agent was trained on
     run_dir: str = "runs/fly"
@@ -98,8 +102,12 @@ def check(config: FlyConfig) -> None:
     if config.agent is not None and (config.pilot is not None or config.viewer):
         other = f"pilot={config.pilot}" if config.pilot is not None else "viewer=true, which shows pilots,"
         raise ValueError(f"{other} and agent={config.agent}: give one of them.")
-    if config.pilot not in (None, *PILOTS):
-        raise ValueError(f"pilot={config.pilot}: there are {', '.join(PILOTS)}.")
+    if config.pilot not in (None, *PILOTS, *KINDS):
+        raise ValueError(f"pilot={config.pilot}: there are {', '.join((*PILOTS, *KINDS))}.")
+    if config.pilot in KINDS:
+        if config.viewer:
+            raise ValueError(f"viewer=true and pilot={config.pilot}, which has a window of its own: give one of them.")
+        check_by_hand(config.pilot)
     for name in ("image_size", "control_rate"):
         value = getattr(config, name)
         if value is not None and value < 1:
@@ -130,9 +138,26 @@ def fly_pilot(config: FlyConfig) -> tuple[Track, Evaluation]:
     with plain_errors():
         env = DroneRacingEnv(config.track or TRACK, 1, preset=preset, seed=config.seed, **worlds)
     print(f"{pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {preset}")
-    result = evaluate(env, PILOTS[pilot](env.track, env.worlds.parameters), episodes=1)
+    if pilot in KINDS:
+        result = fly_by_hand(pilot, env)
+    else:
+        result = evaluate(env, PILOTS[pilot](env.track, env.worlds.parameters), episodes=1)
     env.close()
     return env.track, result
+
+
+def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
+    """Let the one at this machine fly, in a window; nothing is written of a flight that is abandoned."""
+    parameters = env.worlds.parameters
+    with plain_errors():
+        sticks = PygameSticks(kind, parameters.control_dt)
+    try:
+        return evaluate(env, HandPolicy(sticks, parameters.hover_action), episodes=1)
+    except FlightAbandonedError:
+        print("flight abandoned: nothing is written")
+        raise SystemExit(0) from None
+    finally:
+        sticks.close()
 
 
 def fly_agent(config: FlyConfig) -> tuple[Track, Evaluation]:
@@ -160,18 +185,21 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
     if trajectory.pixels is None:
         print(f"{'files':<18} {directory}: evaluation.json, top_down.png (there is no video: the agent sees numbers)")
         return
-    write_video(directory / "onboard.mp4", trajectory.pixels, fps=1 / trajectory.control_dt)
-    frames = onboard_beside_map(track, second_lap(trajectory), GIF_SIZE)[::GIF_STRIDE]
-    size = write_gif(directory / "onboard.gif", frames, fps=1 / (GIF_STRIDE * trajectory.control_dt))
+    words = race_words(track, trajectory)
+    film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
+    write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
+    gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
+    size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
     print(f"{'files':<18} {directory}: evaluation.json, top_down.png, onboard.mp4, onboard.gif ({size / 1e6:.2f} MB)")
 
 
-def second_lap(trajectory: Trajectory) -> Trajectory:
-    """Cut out the second lap, which begins and ends at racing speed; the beginning of the flight if there is none."""
+def second_lap(trajectory: Trajectory) -> tuple[int, int]:
+    """Find the ends of the second lap, which is flown at racing speed; of the beginning of the flight without one."""
     gate = trajectory.target_gate
     ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
-    first, last = ends[:2] if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
-    return trajectory.part(first, last)
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
 
 
 def watch(config: FlyConfig) -> None:

@@ -3,10 +3,11 @@
     python recipes/plot.py runs=runs/my_experiment
     python recipes/plot.py runs='runs/*_kidney_*' figure=learning_curves quantities=[return,success_rate] aggregate=iqm
 
-Runs of one algorithm, track and variant become one curve if they differ in their seeds alone; others are refused with
-the settings in which they differ. Runs and files that cannot be read are left out, and named in the figure. With
-`figure=all` one that cannot be drawn is named, and does not cost the others. `learning_curves.csv` beside a figure
-holds what it shows, and `runs=learning_curves.csv` draws it again.
+Runs of one algorithm, track and variant become one curve if they differ in their seeds alone; where other settings
+differ, too, there is a curve for each way to set them, and the legend says which. Runs and files that cannot be read
+are left out, and named in `<figure>_left_out.txt` beside the figure. With `figure=all` one that cannot be drawn is
+named, and does not cost the others. `learning_curves.csv` beside a figure holds what it shows, and
+`runs=learning_curves.csv` draws it again.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,9 +24,11 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
-from dreamer_racing.figures.film import dream_video, write_gif, write_video
-from dreamer_racing.figures.flights import PROFILE_AXES, NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.film import write_gif, write_video
+from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.hud import dream_video
 from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
+from dreamer_racing.figures.profiles import PROFILE_AXES
 from dreamer_racing.figures.runs import (
     RunData,
     evaluation_files,
@@ -33,6 +36,7 @@ from dreamer_racing.figures.runs import (
     find_runs,
     first_of_each_curve,
     first_readable,
+    group_runs,
     read_runs,
 )
 from dreamer_racing.settings import check_settings
@@ -237,7 +241,7 @@ def stage_name(file: str | Path) -> str:
 
 def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
-    if len({run.key for run in runs}) < 2:
+    if len(group_runs(runs)) < 2:
         return Drawn([], [])
     comparison = compare_variants(runs, problems)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")

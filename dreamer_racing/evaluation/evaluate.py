@@ -222,6 +222,7 @@ def evaluate(
     num_trajectories: int = 1,
     max_recorded_steps: int = 1000,
     record_pixels: bool = True,
+    on_episode: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Fly exactly this many whole episodes.
 
@@ -237,6 +238,7 @@ def evaluate(
         num_trajectories: the first episode of this many environments is recorded.
         max_recorded_steps: a recording stops here, K at most.
         record_pixels: whether recordings keep images, 12 KB a step.
+        on_episode: is told after each step in which one ended how many have, and of how many.
 
     Returns:
         The episodes and the recordings.
@@ -265,9 +267,12 @@ def evaluate(
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))
             action, action_before = _as_flown(tensordict["action"]), action
             steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))
+            before = sum(map(len, flown))
             for index, (log, step) in enumerate(zip(logs, steps, strict=True)):
                 if len(flown[index]) < shares[index]:
                     flown[index] += log.add(step)
+            if on_episode and (ended := sum(map(len, flown))) > before:
+                on_episode(ended, episodes)
             recorder.add(tensordict, [_outcome(step) for step in steps])
             tensordict = following
     waves = range(max(shares))

@@ -35,11 +35,18 @@ class Sight:
     """(M,) between the camera's axis and the direction from the camera to the thing, degrees; NaN where it is none."""
     in_view: Tensor
     """(M,) bool: its centre was in the image."""
+    flight: Tensor
+    """(M,) int64: in which flight; observations of one flight are no independent samples."""
 
     @property
     def share_in_view(self) -> float:
         """Share of observations, and so of time, in which it was in view."""
         return float(self.in_view.float().mean())
+
+    @property
+    def shares_by_flight(self) -> list[float]:
+        """Share of each flight's observations in which it was in view."""
+        return [float(self.in_view[self.flight == index].float().mean()) for index in self.flight.unique()]
 
     def histogram(self) -> Tensor:
         """Return the share of its observations in each bin of 5° from 0° to 180°, (36,)."""
@@ -82,8 +89,12 @@ def measure_sight(
         torch.cat([getattr(trajectory, name) for trajectory in trajectories])
         for name in ("position", "attitude", "target_gate")
     )
+    flight = torch.repeat_interleave(
+        torch.arange(len(trajectories)), torch.tensor([len(trajectory.position) for trajectory in trajectories])
+    )
     known = position.isfinite().all(-1) & attitude.isfinite().all(-1)
     position, attitude, target_gate = position[known].double(), attitude[known].double(), target_gate[known]
+    flight = flight[known]
     gates = points_in_camera(position, attitude, track.gate_positions(dtype=torch.float64), camera)  # (M, G, 3)
     row = torch.arange(len(gates))
     angle, in_view = angles(gates), is_in_view(gates, camera)  # (M, G)
@@ -91,15 +102,17 @@ def measure_sight(
     nearest = distance.argmin(-1)
     any_gate = in_view.any(-1)
     sights = {
-        NEXT_GATE: Sight(angle[row, target_gate], in_view[row, target_gate]),
-        NEAREST_VISIBLE_GATE: Sight(angle[row, nearest].masked_fill(~any_gate, math.nan), any_gate),
+        NEXT_GATE: Sight(angle[row, target_gate], in_view[row, target_gate], flight),
+        NEAREST_VISIBLE_GATE: Sight(angle[row, nearest].masked_fill(~any_gate, math.nan), any_gate, flight),
     }
     if decoys:
         places = torch.tensor([gate.position for gate in decoys], dtype=torch.float64)
         points = points_in_camera(position, attitude, places, camera)  # (M, L, 3)
         angle, in_view = angles(points), is_in_view(points, camera)
-        sights |= {f"decoy {number + 1}": Sight(angle[:, number], in_view[:, number]) for number in range(len(decoys))}
-        sights["any decoy"] = Sight(angle.amin(-1), in_view.any(-1))
+        sights |= {
+            f"decoy {number + 1}": Sight(angle[:, number], in_view[:, number], flight) for number in range(len(decoys))
+        }
+        sights["any decoy"] = Sight(angle.amin(-1), in_view.any(-1), flight)
     return sights
 
 

@@ -46,8 +46,9 @@ class VariantResult:
 
     @property
     def name(self) -> str:
-        """Of the variant."""
-        return (self.key.variant or REFERENCE).replace("_", " ")
+        """Of the variant; settings in it are spelt as one gives them."""
+        name = self.key.variant or REFERENCE
+        return name if "=" in name else name.replace("_", " ")
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,9 @@ class Quantity:
     comparable: bool = False
     """Whether the same value means the same on every track, so that tracks may be pooled: a rate from 0 to 1."""
     counted: bool = False
-    """Whether it is never negative."""
+    """Whether it is a number of things, which a bar or an axis may begin with: 0."""
+    positive: bool = False
+    """Whether it is never negative, and its axis does not go below 0."""
 
 
 QUANTITIES = {
@@ -50,9 +52,9 @@ QUANTITIES = {
         "Gates per episode (stochastic)", "evaluation_stochastic/gates_per_episode", counted=True
     ),
     "training_gates": Quantity("Gates (training episodes)", "episode/gates_passed", counted=True),
-    "lap_time": Quantity("Mean lap time (s, deterministic)", "evaluation/lap_time_mean"),
-    "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best"),
-    "image_error": Quantity("Image error (held out)", "held_out/image_error"),
+    "lap_time": Quantity("Mean lap time (s, deterministic)", "evaluation/lap_time_mean", positive=True),
+    "lap_time_best": Quantity("Best lap time (s, deterministic)", "evaluation/lap_time_best", positive=True),
+    "image_error": Quantity("Image error (held out)", "held_out/image_error", positive=True),
 }
 """Those of evaluations are of the deterministic or of the sampling (stochastic) policy, both paid at b₂ = 0."""
 PRESENCE = ("num_episodes", "return_mean")

@@ -7,7 +7,6 @@ Shapes: K control steps of an episode.
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
@@ -34,52 +32,28 @@ GATE_COLOR = "#e8590c"
 DECOY_COLOR = "#c2255c"
 INK, MUTED, FAINT = "#212529", "#868e96", "#dee2e6"
 CRASH_COLOR = "#e03131"
+CRASH: dict[str, Any] = {"marker": "x", "markersize": 11, "color": CRASH_COLOR, "markeredgewidth": 2.6}
+"""Of a crash: two strokes behind the path, so that the end of a short flight is seen between them."""
+START: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 9,
+    "color": "white",
+    "markeredgecolor": "#212529",
+    "markeredgewidth": 1.8,
+}
+"""Of a start: a ring behind the path."""
 SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
     "speed", ["#3b1f6b", "#2f5fb3", "#1fa2a6", "#7bc043", "#f2b705"]
 )
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
-MAX_WARNINGS = 8  # above a figure
 NOTE_LETTERS = 14  # of a note beside a figure, an inch of its width
-HEIGHT_SPREAD = 0.5  # m between gates, above which a side view is worth its space
 
 DEFAULT_PANELS: dict[str, tuple[str, ...]] = {
     "Return": ("episode/return", "evaluation/return_mean"),
     "Gates per episode": ("episode/gates_passed", "evaluation/gates_per_episode"),
     "Losses": ("loss", "loss_*", "loss/*"),
 }
-
-
-def plot_top_down(track: Track, trajectory: Trajectory, path: str | Path, title: str | None = None) -> None:
-    """Draw a track and the path of one episode from above, and from the side if the gates differ in height.
-
-    Gates are bars with an arrow in the direction of flight and their number in the order of flight; black arrows along
-    the path are the camera's direction, as in the paper's figure of perception-aware flight.
-
-    Args:
-        track: the track.
-        trajectory: the path, coloured by speed.
-        path: the file to write; missing folders are made.
-        title: above the picture; None for the track's name, and the episode's time and outcome.
-    """
-    heights = [gate.position[2] for gate in track.gates]
-    side_view = max(heights) - min(heights) > HEIGHT_SPREAD
-    figure, axes, side = _layout(track, side_view)
-    speed = speed_scale([trajectory])
-    panels: list[tuple[Axes, tuple[int, int]]] = [(axes, (0, 1))]
-    draw_track(axes, track)
-    if side is not None:
-        draw_track_side(side, track)
-        axes.set_xlabel("")
-        panels.append((side, (0, 2)))
-    for panel, plane in panels:
-        draw_flight(panel, trajectory, speed, plane)
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), cax=axes.inset_axes((1.015, 0.0, 0.022, 1.0)))
-    bar.set_label("speed (m/s)")
-    bar.outline.set_visible(False)
-    axes.set_title(title or _title(track, trajectory), loc="left", fontsize=11, color=INK, pad=8)
-    _add_legend(figure, track, trajectory)
-    save(figure, path)
 
 
 def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
@@ -118,7 +92,7 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
         labels: whether gates are numbered and axes labelled.
     """
     (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
-    axes.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, **_BOX))
+    axes.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, **BOX))
     for gate in track.decoys:
         _draw_gate(axes, gate, track.shape.outer, DECOY_COLOR)
     for number, gate in enumerate(track.gates, start=1):
@@ -127,7 +101,7 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
             _number_gate(axes, track, number)
     margin = 0.02 * max(x_high - x_low, y_high - y_low)
     axes.set(xlim=(x_low - margin, x_high + margin), ylim=(y_low - margin, y_high + margin))
-    _dress_map(axes, "y (m)" if labels else None)
+    dress_map(axes, "y (m)" if labels else None)
     if labels:
         axes.set_xlabel("x (m)")
 
@@ -161,39 +135,33 @@ def plot_curve(
     stack = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, matches) in zip(stack, panels.items(), strict=True):
         _draw_curves(axes, name, {column: table[column] for column in matches})
-    stack[-1].set_xlabel("env_steps")
+    stack[-1].set(xlabel="env_steps", xlim=(0.0, max(steps[-1] for steps, _ in table.values()) or 1.0))
     stack[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
     if title:
         figure.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)
     save(figure, path)
 
 
-def save(figure: Figure, path: str | Path, warnings: Sequence[str] = ()) -> None:
-    """Write a figure.
+def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None:
+    """Write a figure, and beside it what is not in it.
 
     Args:
         figure: which.
         path: the file; missing folders are made.
-        warnings: what a reader must know, a line each; they are written above the figure, which grows by them.
+        left_out: what a reader must know, a line each; it is written to `left_out_of(path)`. Without any, what an
+            earlier figure of this name left out is removed.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    width, height = figure.get_size_inches()
-    if lines := _warning_lines(warnings, width):
-        figure.set_size_inches(width, height + 0.16 * len(lines) + 0.1)
-        style: dict[str, Any] = {"fontsize": 8, "color": CRASH_COLOR, "linespacing": 1.35}
-        figure.suptitle("\n".join(lines), x=0.08 / width, ha="left", **style)
     figure.savefig(path, dpi=150, facecolor="white")
+    if left_out:
+        left_out_of(path).write_text("".join(f"{line}\n" for line in left_out), encoding="utf-8")
+    else:
+        left_out_of(path).unlink(missing_ok=True)
 
 
-def _warning_lines(warnings: Sequence[str], width: float) -> list[str]:
-    shown = list(warnings[:MAX_WARNINGS])
-    if len(warnings) > len(shown):
-        shown.append(f"and {len(warnings) - len(shown)} more")
-    return [
-        line
-        for warning in shown
-        for line in textwrap.wrap(f"! {warning}", int(NOTE_LETTERS * width), subsequent_indent="   ")
-    ]
+def left_out_of(path: str | Path) -> Path:
+    """Return the file that names, a line each, what was left out of the figure ``path``."""
+    return Path(path).with_name(f"{Path(path).stem}_left_out.txt")
 
 
 def dress(axes: Axes) -> None:
@@ -202,6 +170,14 @@ def dress(axes: Axes) -> None:
     axes.grid(color=FAINT, linewidth=0.6)
     axes.tick_params(colors=MUTED, labelsize=8, length=0)
     axes.spines[:].set_visible(False)
+
+
+def from_zero(axes: Axes, least: float = 1.0) -> None:
+    """Let the vertical axis of what is never negative begin at 0 and end no lower than ``least``.
+
+    Left alone, the axis of a single 0, or of nothing but zeros, shows as much below 0 as above.
+    """
+    axes.set_ylim(0.0, max(least, axes.get_ylim()[1]))
 
 
 def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:
@@ -219,13 +195,13 @@ def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torc
     return rotate(attitude, axis.expand(*attitude.shape[:-1], 3))
 
 
-_BADGE: dict[str, Any] = {
+BADGE: dict[str, Any] = {
     "boxstyle": "circle,pad=0.22",
     "facecolor": "white",
     "edgecolor": GATE_COLOR,
     "linewidth": 1.0,
 }
-_BOX: dict[str, Any] = {
+BOX: dict[str, Any] = {
     "facecolor": "#f8f9fa",
     "edgecolor": MUTED,
     "linewidth": 1.0,
@@ -234,19 +210,8 @@ _BOX: dict[str, Any] = {
 }
 
 
-def _layout(track: Track, side_view: bool) -> tuple[Figure, Axes, Axes | None]:
-    """Make a figure whose panels have the track's proportions: 9 inches wide, as high as that needs."""
-    width, depth, height = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
-    scale = 7.6 / width  # inches per metre
-    if not side_view:
-        figure = Figure(figsize=(9.0, depth * scale + 1.5), layout="constrained")
-        return figure, figure.subplots(), None
-    figure = Figure(figsize=(9.0, (depth + height) * scale + 2.0), layout="constrained")
-    axes, side = figure.subplots(2, 1, sharex=True, height_ratios=[depth, height])
-    return figure, axes, side
-
-
-def _dress_map(axes: Axes, y_label: str | None) -> None:
+def dress_map(axes: Axes, y_label: str | None) -> None:
+    """Give a map equal scales, a faint grid every 2 m and, if there is one, the label of its vertical axis."""
     axes.set_aspect("equal")
     axes.xaxis.set_major_locator(MultipleLocator(2.0))
     axes.yaxis.set_major_locator(MultipleLocator(2.0))
@@ -279,26 +244,7 @@ def _number_gate(axes: Axes, track: Track, number: int) -> None:
     above = [other for other in track.gates[: number - 1] if math.dist(other.position[:2], gate.position[:2]) < 0.5]
     side = -outwards if above else outwards  # one above the other: a number at either end
     place = centre + side * left * (track.shape.outer / 2 + 0.45)
-    axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
-
-
-def draw_track_side(axes: Axes, track: Track) -> None:
-    """Draw a track from the side, x–z, with numbers: each gate as the outline of its frame, seen along y."""
-    (x_low, _, z_low), (x_high, _, z_high) = track.bounds_low, track.bounds_high
-    axes.add_patch(Rectangle((x_low, z_low), x_high - x_low, z_high - z_low, **_BOX))
-    outer = track.shape.outer
-    labels: list[tuple[float, float]] = []
-    for number, gate in enumerate(track.gates, start=1):
-        width = max(outer * abs(gate.left[0]), 0.15)
-        x, _, z = gate.position
-        corner = (x - width / 2, z - outer / 2)
-        axes.add_patch(Rectangle(corner, width, outer, fill=False, edgecolor=GATE_COLOR, linewidth=2.0, zorder=4))
-        while any(math.dist((x, z), label) < 0.6 for label in labels):
-            z += 0.3  # above the number of a gate that is hidden behind this one
-        labels.append((x, z))
-        axes.text(x, z, str(number), ha="center", va="center", fontsize=9, color=INK, bbox=_BADGE, zorder=7)
-    axes.set(xlabel="x (m)", ylim=(min(z_low, 0.0) - 0.2, z_high + 0.2))
-    _dress_map(axes, "z (m)")
+    axes.text(place[0], place[1], str(number), ha="center", va="center", fontsize=9, color=INK, bbox=BADGE, zorder=7)
 
 
 def _draw_path(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], speed: Normalize) -> None:
@@ -333,37 +279,9 @@ def _draw_cameras(axes: Axes, trajectory: Trajectory, plane: tuple[int, int], ti
 
 def _draw_ends(axes: Axes, trajectory: Trajectory, plane: tuple[int, int]) -> None:
     start, end = trajectory.position[0, list(plane)].tolist(), trajectory.position[-1, list(plane)].tolist()
-    axes.plot(*start, **_START, zorder=8)
+    axes.plot(*start, **START, zorder=4.5)
     if trajectory.crashed:
-        axes.plot(*end, **_CRASH, zorder=9)
-
-
-_START: dict[str, Any] = {
-    "marker": "o",
-    "markersize": 8,
-    "color": "white",
-    "markeredgecolor": INK,
-    "markeredgewidth": 1.8,
-}
-_CRASH: dict[str, Any] = {
-    "marker": "X",
-    "markersize": 12,
-    "color": CRASH_COLOR,
-    "markeredgecolor": "white",
-    "markeredgewidth": 1.2,
-}
-
-
-def _title(track: Track, trajectory: Trajectory) -> str:
-    seconds = (len(trajectory.position) - 1) * trajectory.control_dt
-    top = float(np.nanmax(trajectory.speed.numpy()))
-    outcome = (trajectory.outcome or "recording stopped").replace("_", " ")
-    return f"{track.name}: {seconds:.2f} s, up to {top:.1f} m/s ({outcome})"
-
-
-def _add_legend(figure: Figure, track: Track, trajectory: Trajectory) -> None:
-    handles = flight_legend(bool(track.decoys), trajectory.crashed)
-    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles), frameon=False, fontsize=9)
+        axes.plot(*end, **CRASH, zorder=4.6)
 
 
 def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
@@ -372,9 +290,9 @@ def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
     handles = [Line2D([], [], color=GATE_COLOR, label="gate", **bar)]
     if decoys:
         handles.append(Line2D([], [], color=DECOY_COLOR, label="decoy", **bar))
-    handles.append(Line2D([], [], linestyle="", label="start", **_START))
+    handles.append(Line2D([], [], linestyle="", label="start", **START))
     if crash:
-        handles.append(Line2D([], [], linestyle="", label="crash", **_CRASH))
+        handles.append(Line2D([], [], linestyle="", label="crash", **CRASH))
     handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
     handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
     return handles
@@ -399,6 +317,8 @@ def _draw_curves(axes: Axes, title: str, curves: Mapping[str, tuple[np.ndarray, 
         sizes = [np.median(np.abs(values)) for _, values in curves.values()]
         if max(sizes) > 50 * min(sizes):
             axes.set_yscale("log" if values.min() > 0 else "symlog")
+    if values.min() >= 0 > axes.get_ylim()[0]:
+        from_zero(axes, least=0.0 if values.any() else 1.0)
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     dress(axes)
 

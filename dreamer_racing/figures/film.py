@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
@@ -147,6 +147,11 @@ def side_by_side(
 def enlarge(pixels: np.ndarray, scale: int) -> np.ndarray:
     """Repeat every pixel of (..., H, W, 3)."""
     return pixels if scale == 1 else pixels.repeat(scale, axis=-3).repeat(scale, axis=-2)
+
+
+def enlarge_to_watch(pixels: np.ndarray) -> np.ndarray:
+    """Repeat every pixel of (T, H, W, 3) as often as `write_video` would by itself."""
+    return enlarge(pixels, math.ceil(VIDEO_HEIGHT / pixels.shape[1]))
 
 
 def add_border(panel: np.ndarray, color: np.ndarray, border: int) -> np.ndarray:
@@ -294,29 +299,3 @@ def film_strip(dream: Dream, frames: Sequence[int], scale: int = 2, border: int 
         for images, color in zip((dream.real, dream.reconstructed, dream.imagined), colors, strict=True)
     ]
     return np.concatenate(rows)
-
-
-def dream_video(dreams: Sequence[tuple[str, Dream]], scale: int = 2) -> np.ndarray:
-    """Compose the stages of training under each other, each real | imagined under its name, as long as the longest.
-
-    Args:
-        dreams: the stages, each with its name; their windows follow one another.
-        scale: whole factor by which pixels are enlarged, without blurring.
-
-    Returns:
-        (frames, height, width, 3) uint8.
-    """
-    films = [_film(name, dream, scale) for name, dream in dreams]
-    length = max(map(len, films))
-    held = [np.concatenate((film, film[-1:].repeat(length - len(film), axis=0))) for film in films]
-    return np.concatenate(held, axis=1)
-
-
-def _film(name: str, dream: Dream, scale: int) -> np.ndarray:
-    pairs = zip(dream.real, dream.imagined, strict=True)
-    frames = np.concatenate([side_by_side(*pair, context=dream.context, scale=scale) for pair in pairs])
-    banner = Image.new("RGB", (frames.shape[2], 10 * scale), "white")
-    font = ImageFont.load_default(size=7 * scale)
-    ImageDraw.Draw(banner).text((4, scale), name, fill="black", font=font)
-    head = np.broadcast_to(np.asarray(banner), (len(frames), *np.asarray(banner).shape))
-    return np.concatenate((head, frames), axis=1)

@@ -14,32 +14,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.figures.drawing import (
-    CRASH_COLOR,
     INK,
-    MUTED,
     SPEED_COLORS,
     draw_flight,
     draw_track,
-    dress,
     flight_legend,
     save,
     speed_scale,
 )
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
+from dreamer_racing.figures.profiles import PROFILE_AXES, altitude_legend, draw_altitude, draw_speed
 
 TITLE_ROOM = 0.35  # inches above the panels
-PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
+PROFILE_HEIGHT = 1.3  # inches of a profile below a map
 
 
 class NamedFlight(NamedTuple):
@@ -57,14 +53,14 @@ def plot_flights(
     columns: int = 3,
     problems: Sequence[str] = (),
 ) -> None:
-    """Draw flights from above, side by side, with the camera's direction, and the speed of each below it.
+    """Draw flights from above, side by side on one scale, with the camera's direction; altitude and speed below.
 
     Reference: paper, Figs. "emergent" (with decoys and without) and "real world" (simulated and real).
 
     Args:
         flights: which.
         path: the file to write; missing folders are made.
-        over: axis of the speed profile: ``distance`` flown (m) or ``time`` (s).
+        over: axis of the profiles: ``distance`` flown (m) or ``time`` (s).
         columns: flights in a row at most.
         problems: what was left out, a line each.
 
@@ -77,37 +73,51 @@ def plot_flights(
         raise ValueError(f"over={over}: there are {', '.join(PROFILE_AXES)}.")
     columns = min(columns, len(flights))
     rows = math.ceil(len(flights) / columns)
-    top = max(4.6 * _proportion(flight.track) for flight in flights)  # inches
-    width, height = 4.6 * columns + 0.7, rows * (top + 1.9) + 0.4 + TITLE_ROOM
+    half = [max(size) / 2 for size in zip(*(_hall(flight.track) for flight in flights), strict=True)]  # m
+    top = 4.4 * half[1] / half[0]  # inches
+    width, height = 4.6 * columns + 0.7, rows * (top + 2 * PROFILE_HEIGHT + 0.9) + 0.5 + TITLE_ROOM
     figure = Figure(figsize=(width, height))
     # The layout forgets the titles of panels whose sides have a fixed proportion.
     figure.set_layout_engine(ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - TITLE_ROOM / height)))
-    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[top, 1.5] * rows)
+    grid = figure.add_gridspec(3 * rows, columns, height_ratios=[top, PROFILE_HEIGHT, PROFILE_HEIGHT] * rows)
     speed = speed_scale([flight.trajectory for flight in flights])
-    above, below = [], []
+    panels: list[Axes] = []
     for index, flight in enumerate(flights):
         row, column = divmod(index, columns)
-        above.append(axes := figure.add_subplot(grid[2 * row, column]))
-        draw_track(axes, flight.track)
-        draw_flight(axes, flight.trajectory, speed)
-        axes.set_title(f"{flight.title}\n{_outcome(flight)}", loc="left", fontsize=9, color=INK)
-        below.append(profile := figure.add_subplot(grid[2 * row + 1, column]))
-        _draw_speed(profile, flight.trajectory, speed, over)
-        for panel in (axes, profile) if column else ():
-            panel.set_ylabel("")
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=above + below, shrink=0.6, aspect=35, pad=0.01)
+        own = [figure.add_subplot(grid[3 * row + place, column]) for place in range(3)]
+        _draw_flight_and_profiles(own, flight, speed, half, over)
+        for axes in own if column else ():
+            axes.set_ylabel("")
+        panels += own
+    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=panels, shrink=0.6, aspect=35, pad=0.01)
     bar.set_label("speed (m/s)")
     bar.outline.set_visible(False)
     decoys, crash = any(f.track.decoys for f in flights), any(f.trajectory.crashed for f in flights)
-    handles = flight_legend(decoys, crash)
-    figure.legend(handles=handles, loc="outside lower left", ncols=3 if columns == 1 else 6, frameon=False, fontsize=9)
+    handles = flight_legend(decoys, crash) + altitude_legend([flight[1:] for flight in flights])
+    figure.legend(handles=handles, loc="outside lower left", ncols=3 if columns == 1 else 8, frameon=False, fontsize=9)
     save(figure, path, problems)
 
 
-def _proportion(track: Track) -> float:
-    """Depth of the hall over its width."""
-    width, depth, _ = (high - low for low, high in zip(track.bounds_low, track.bounds_high, strict=True))
-    return depth / width
+def _draw_flight_and_profiles(
+    panels: Sequence[Axes], flight: NamedFlight, speed: Normalize, half: Sequence[float], over: str
+) -> None:
+    """Draw a map that shows so many metres to each side of the hall's middle; below it altitude and speed."""
+    axes, altitude, profile = panels
+    draw_track(axes, flight.track)
+    draw_flight(axes, flight.trajectory, speed)
+    middle = [(low + high) / 2 for low, high in zip(flight.track.bounds_low, flight.track.bounds_high, strict=True)]
+    axes.set_xlim(middle[0] - 1.03 * half[0], middle[0] + 1.03 * half[0])
+    axes.set_ylim(middle[1] - 1.03 * half[1], middle[1] + 1.03 * half[1])
+    axes.set_title(f"{flight.title}\n{_outcome(flight)}", loc="left", fontsize=9, color=INK)
+    draw_altitude(altitude, flight.track, flight.trajectory, speed, over, numbers=False)
+    draw_speed(profile, flight.trajectory, speed, over)
+    altitude.set_xlabel("")
+
+
+def _hall(track: Track) -> tuple[float, float]:
+    """Width and depth, m."""
+    (x_low, y_low, _), (x_high, y_high, _) = track.bounds_low, track.bounds_high
+    return x_high - x_low, y_high - y_low
 
 
 def _outcome(flight: NamedFlight) -> str:
@@ -115,37 +125,6 @@ def _outcome(flight: NamedFlight) -> str:
     gates = int((np.diff(flight.trajectory.target_gate) != 0).sum())
     outcome = (flight.trajectory.outcome or "recording stopped").replace("_", " ")
     return f"{flight.track.name}: {gates} gates in {seconds:.2f} s ({outcome})"
-
-
-def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
-    """Where the rows of a trajectory lie on the axis of the speed profile, (K + 1,), m or s."""
-    if over == "time":
-        return np.arange(len(trajectory.position)) * trajectory.control_dt
-    steps = np.nan_to_num(np.linalg.norm(np.diff(trajectory.position.numpy(), axis=0), axis=1))  # (K,) m
-    return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-def _draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str) -> None:
-    """Draw the speed, coloured by itself, and a numbered line at every gate passed."""
-    along, values = profile_axis(trajectory, over), trajectory.speed.numpy()
-    points = np.stack((along, values), axis=1)
-    lines = LineCollection(list(np.stack((points[:-1], points[1:]), axis=1)), cmap=SPEED_COLORS, norm=speed)
-    lines.set(array=values[1:], linewidth=2.4, capstyle="round", zorder=3)
-    axes.add_collection(lines)
-    for row in np.flatnonzero(np.diff(trajectory.target_gate)):
-        axes.axvline(along[row + 1], color=MUTED, linewidth=0.8, linestyle=(0, (2, 2)), zorder=2)
-        number = str(int(trajectory.target_gate[row]) + 1)
-        axes.text(
-            along[row + 1], 1.02, number, transform=axes.get_xaxis_transform(), ha="center", fontsize=7, color=MUTED
-        )
-    if trajectory.crashed and np.isfinite(points[-1]).all():
-        axes.plot(
-            *points[-1], marker="X", color=CRASH_COLOR, markersize=9, markeredgecolor="white", zorder=4, clip_on=False
-        )
-    axes.set(xlim=(0.0, max(along[-1], 1e-6)), ylim=(0.0, 1.05 * float(speed.vmax or 1.0)), xlabel=PROFILE_AXES[over])
-    axes.set_ylabel("speed (m/s)")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
-    dress(axes)
 
 
 def plot_dreams(

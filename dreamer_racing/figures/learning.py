@@ -30,6 +30,7 @@ TRACKS = ("circle", "kidney", "figure8")  # columns of the paper, in its order; 
 VARIANT_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
 VARIANT_SHADES = (0.0, -0.55, 0.5, -0.28)  # of an algorithm's colour: darker below 0, lighter above
 MANY_VARIANTS = 4  # of an algorithm: with more of them the reference is thick, the others thin and without a band
+SHORTEST_LINE = 0.03  # of an axis: what is shorter, because it was measured once say, is a dot
 LETTER = 0.072  # width of one in the legend, inches
 BANDS = {
     "mean": ("mean", "sample standard deviation (n − 1)"),
@@ -37,14 +38,17 @@ BANDS = {
 }
 DRAWN = ("gates", "evaluation_return")  # panels of the comparison
 Styles = dict[CurveKey, dict[str, Any]]
+COUNT_ROOM = 0.12  # of an axis: right of the longest bar, for its n
 SMALL: dict[str, Any] = {"fontsize": 8, "color": MUTED}
-OTHER_COLOR = "#74c0fc"  # of a variant that is not the reference
+ERROR: dict[str, Any] = {"ecolor": INK, "elinewidth": 1.4, "capsize": 3.0}
+REFERENCE_COLOR = "#1971c2"  # light enough for its error bar to be seen
+OTHER_COLOR = "#a5d8ff"  # of a variant that is not the reference
 
 
 def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     """Draw a column a track and a row a quantity, as the curves come; a colour an algorithm and a line style a variant.
 
-    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is named above.
+    Ticks at the bottom are where the curriculum raised b₂, of every seed. What was left out is in a file beside it.
 
     Reference: paper, Fig. "Reward evolution".
 
@@ -59,7 +63,6 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     quantities = list(dict.fromkeys(curve.quantity for curve in curves.curves))
     keys = sorted({curve.key._replace(track="") for curve in curves.curves}, key=_rank)
     styles = line_styles(keys)
-    longest = max(curve.env_steps[-1] for curve in curves.curves)
     width = max(7.0, 0.6 + 3.9 * len(tracks))
     labels = {key: f"{_label(key)} ({_seed_count(curves, key)})" for key in keys}
     columns = max(1, int((width - 0.8) / (0.6 + LETTER * max(map(len, labels.values())))))
@@ -79,7 +82,7 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
             if track == ALL_TRACKS and not shown:
                 axes.set_axis_off()  # the tracks have no common scale
                 continue
-            _draw_panel(axes, shown, styles, longest)
+            _draw_panel(axes, shown, styles, _end(curves, track))
             _draw_raises(axes, curves, track, styles)
             if column == 0:
                 axes.set_ylabel(QUANTITIES[quantity].label.replace(" (", "\n("), color=INK)
@@ -93,18 +96,28 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
     save(figure, path, curves.problems)
 
 
-def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, longest: float) -> None:
+def _end(curves: LearningCurves, track: str) -> float:
+    """Return the env_steps up to which there are values on a track, of any quantity: panels of a column share it."""
+    own = [curve for curve in curves.curves if curve.key.track == track and curve.seeds.any()]
+    return max((float(curve.env_steps[curve.seeds > 0].max()) for curve in own), default=0.0) or 1.0
+
+
+def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float) -> None:
     for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
         line = styles[curve.key._replace(track="")]
         if curve.key.is_reference or not _crowded(curve.key, styles):
             axes.fill_between(curve.env_steps, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
         axes.plot(curve.env_steps, curve.centre, **line)
+        drawn = np.isfinite(curve.centre)
+        if drawn.any() and np.ptp(curve.env_steps[drawn]) < SHORTEST_LINE * end:
+            last = np.flatnonzero(drawn)[-1:]
+            axes.plot(curve.env_steps[last], curve.centre[last], "o", color=line["color"], clip_on=False)
     if not curves:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=MUTED)
         axes.set_yticks([])
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlim(0.0, longest)
+    axes.set_xlim(0.0, end)
     if curves:
         axes.set_ylim(*_limits(curves[0].quantity, axes.get_ylim()))
     dress(axes)
@@ -116,6 +129,8 @@ def _limits(quantity: str, limits: tuple[float, float]) -> tuple[float, float]:
         return -0.02, 1.04
     if QUANTITIES[quantity].counted:
         return 0.0, max(1.0, limits[1])
+    if QUANTITIES[quantity].positive:
+        return max(0.0, limits[0]), limits[1]
     return limits
 
 
@@ -233,7 +248,7 @@ def _track_title(track: str) -> str:
 
 
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
-    """Draw a bar a variant, its standard deviation over seeds, and a dot a seed; the reference is a dashed line.
+    """Draw a bar a variant, its standard deviation over n seeds, and a dot a seed; the reference is a dashed line.
 
     Where values may be negative there is a diamond instead of the bar.
 
@@ -252,7 +267,8 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
             if result.key.is_reference and not several and len(result.values.get(name, ())):
                 axes.axvline(result.values[name].mean(), color=INK, linestyle=(0, (4, 3)), linewidth=0.9)
         axes.set_title(QUANTITIES[name].label, loc="left", fontsize=10, color=INK)
-        axes.set_xlim(*_limits(name, axes.get_xlim()))
+        low, high = _limits(name, axes.get_xlim())
+        axes.set_xlim(low, high + COUNT_ROOM * (high - low))
         dress(axes)
         axes.grid(axis="y", visible=False)
     names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]
@@ -270,13 +286,12 @@ def _draw_bar(axes: Axes, place: int, result: VariantResult, name: str) -> None:
         axes.annotate("no values", (0.0, place), xytext=(4, 0), textcoords="offset points", va="center", **SMALL)
         return
     error = values.std(ddof=1) if len(values) > 1 else None
-    color = INK if result.key.is_reference else OTHER_COLOR
+    color = REFERENCE_COLOR if result.key.is_reference else OTHER_COLOR
     if QUANTITIES[name].counted or QUANTITIES[name].comparable:
-        axes.barh(place, values.mean(), xerr=error, color=color, ecolor=MUTED, height=0.65)
+        axes.barh(place, values.mean(), xerr=error, color=color, error_kw=ERROR, height=0.65)
     else:  # a bar from zero would make the worst of what is negative look the largest
-        axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, ecolor=MUTED)
+        axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, **ERROR)
     axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4)
-    if len(values) != result.seeds:
-        right = max(values.max(), values.mean() + (error or 0.0))
-        count = f"n = {len(values)}"
-        axes.annotate(count, (right, place), xytext=(6, 0), textcoords="offset points", va="center", **SMALL)
+    right = max(values.max(), values.mean() + (error or 0.0))
+    count = f"n = {len(values)}"
+    axes.annotate(count, (right, place), xytext=(6, 0), textcoords="offset points", va="center", **SMALL)

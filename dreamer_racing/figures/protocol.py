@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,16 +14,60 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.evaluate import CRASHES, Evaluation, Trajectory
+from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Evaluation, Trajectory
 from dreamer_racing.evaluation.protocol import MODES, Result
 from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight
-from dreamer_racing.figures.drawing import FAINT, INK, MUTED, SPEED_COLORS, draw_flight, draw_track, save, speed_scale
+from dreamer_racing.figures.drawing import (
+    FAINT,
+    INK,
+    MUTED,
+    SPEED_COLORS,
+    draw_flight,
+    draw_track,
+    from_zero,
+    save,
+    speed_scale,
+)
+from dreamer_racing.figures.profiles import draw_altitude
 
-MODE_COLORS = {"deterministic": "#2f5fb3", "stochastic": "#f2b705"}
+MODE_COLORS = {"deterministic": "#6f9be0", "stochastic": "#f2b705"}
 CAUSE_COLORS = dict(
     zip(CRASHES, ("#e8590c", "#c2255c", "#7950f2", "#1fa2a6", "#495057", "#adb5bd", "#a0522d"), strict=True)
 )
-SIGHT_COLORS = ("#2f5fb3", "#7bc043", "#c2255c")
+Z95 = 1.96  # standard deviations to either side of which 95 % of a normal distribution lie
+SIGHT_COLORS = ("#6f9be0", "#7bc043", "#c2255c")
+
+
+class Bar(NamedTuple):
+    """A mean, its 95 % interval, and over how many samples: of a single one a mean has no interval but itself."""
+
+    height: float
+    low: float
+    high: float
+    n: int
+
+
+def share_bar(happened: Sequence[bool]) -> Bar:
+    """Return the share of what happened with Wilson's interval, which does not shrink to nothing at 0 and 1.
+
+    Reference: Wilson, Probable inference, the law of succession, and statistical inference, 1927.
+    """
+    n, share = len(happened), float(np.mean(happened))
+    middle = (share + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
+    half = Z95 / (1 + Z95**2 / n) * np.sqrt(share * (1 - share) / n + Z95**2 / (4 * n**2))
+    return Bar(share, float(np.clip(middle - half, 0.0, share)), float(np.clip(middle + half, share, 1.0)), n)
+
+
+def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:
+    """Return the mean of what is never negative with the normal interval of a mean.
+
+    Args:
+        values: independent samples.
+        height: of the bar, if it is not just their mean: of samples of different length, say.
+    """
+    n, mean = len(values), float(np.mean(values)) if height is None else height
+    half = Z95 * float(np.std(values, ddof=1)) / np.sqrt(n) if n > 1 else 0.0
+    return Bar(mean, max(0.0, mean - half), mean + half, n)
 
 
 def plot_conditions(results: Sequence[Result], path: str | Path, title: str | None = None) -> None:
@@ -34,24 +79,32 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
         title: above the picture.
     """
     places = list(dict.fromkeys((result.preset, result.condition) for result in results))
-    figure = Figure(figsize=(9.0, 5.6), layout="constrained")
+    figure = Figure(figsize=(max(9.0, 1.2 * len(places)), 6.4), layout="constrained")
     success, gates = figure.subplots(2, 1, sharex=True)
-    panels = (
-        (success, "Success", "success_rate", "{:.0%}"),
-        (gates, "Gates per episode", "gates_per_episode", "{:.2f}"),
-    )
-    for axes, name, value, form in panels:
+    panels = ((success, "Success", _success, "{:.0%}"), (gates, "Gates per episode", _gates, "{:.2f}"))
+    for axes, name, measure, form in panels:
         for index, mode in enumerate(MODES):
-            own = {(r.preset, r.condition): getattr(r.evaluation, value) for r in results if r.mode == mode}
-            heights = [own.get(place, np.nan) for place in places]
-            _draw_bars(axes, np.arange(len(places)) + (index - 0.5) * 0.4, heights, MODE_COLORS[mode], mode, form=form)
+            bars = {(r.preset, r.condition): measure(r.evaluation) for r in results if r.mode == mode}
+            at = [number + (index - 0.5) * 0.4 for number, place in enumerate(places) if place in bars]
+            shown = [bars[place] for place in places if place in bars]
+            _draw_bars(axes, np.array(at), shown, MODE_COLORS[mode], mode, form=form)
         _dress(axes, name)
-    success.set_ylim(0.0, 1.05)
-    success.yaxis.set_major_formatter(PercentFormatter(1.0))
+    _share_axis(success)
+    from_zero(gates)
+    gates.set_ylim(top=1.25 * gates.get_ylim()[1])
     labels = [f"{condition.replace('_', ' ')}\n{preset}" for preset, condition in places]
     gates.set_xticks(range(len(places)), labels, fontsize=8)
-    success.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.18))
+    success.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.16))
+    _note(figure, "Lines: 95 % interval over n episodes (Wilson's of success, the normal one of mean gates).")
     _save(figure, path, title)
+
+
+def _success(evaluation: Evaluation) -> Bar:
+    return share_bar([episode.outcome == FINISHED for episode in evaluation.episodes])
+
+
+def _gates(evaluation: Evaluation) -> Bar:
+    return mean_bar([episode.gates_passed for episode in evaluation.episodes])
 
 
 def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str | None = None) -> None:
@@ -77,8 +130,10 @@ def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str |
             shown.add(cause)
         _dress(axes, f"{name}: {int(bottom.sum())} of {len(evaluation.episodes)} crashed")
         axes.set_xticks(gates)
+        axes.set_xlim(0.4, evaluation.num_gates + 0.6)
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("next gate at the crash")
+    from_zero(panels[0])
     panels[0].set_ylabel("episodes")
     if shown:
         figure.legend(loc="outside lower center", ncols=len(shown), frameon=False, fontsize=8)
@@ -102,28 +157,36 @@ def plot_sight(
     columns, track = len(flights), next(iter(flights.values()))[0]
     width, depth = (high - low for low, high in zip(track.bounds_low[:2], track.bounds_high[:2], strict=True))
     map_height = min(6.5, 8.5 / columns * depth / width)
-    figure = Figure(figsize=(10.0, map_height + 5.4), layout="constrained")
-    rows = figure.subfigures(3, 1, squeeze=False, height_ratios=[map_height + 0.4, 2.8, 2.2])
-    maps, distributions, shares = rows[:, 0]
-    _draw_maps(maps, flights, camera)
-    panels = distributions.subplots(1, columns, sharey=True, squeeze=False)[0]
-    for axes, (name, (_, _, sights)) in zip(panels, flights.items(), strict=True):
+    rows = [map_height, 1.3, 2.4, 1.9]  # inches
+    figure = Figure(figsize=(10.0, sum(rows) + 2.6), layout="constrained")
+    grid = figure.add_gridspec(4, columns, height_ratios=rows)
+    maps, profiles, below = ([figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(3))
+    _draw_maps(figure, maps, profiles, flights, camera)
+    for axes, (name, (_, _, sights)) in zip(below, flights.items(), strict=True):
         _draw_distributions(axes, name, sights, camera)
-    panels[0].set_ylabel("share of observations, per 5°")
-    _draw_shares(shares.subplots(), {name: sights for name, (_, _, sights) in flights.items()})
+        axes.sharey(below[0])
+    from_zero(below[0], least=0.01)
+    below[0].set_ylabel("share of observations, per 5°")
+    _draw_shares(figure.add_subplot(grid[3, :]), {name: sights for name, (_, _, sights) in flights.items()})
     _save(figure, path, title)
 
 
 def _draw_maps(
-    figure: Figure, flights: Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]], camera: Camera
+    figure: Figure,
+    maps: Sequence[Axes],
+    profiles: Sequence[Axes],
+    flights: Mapping[str, tuple[Track, Trajectory, Mapping[str, Sight]]],
+    camera: Camera,
 ) -> None:
-    panels = figure.subplots(1, len(flights), squeeze=False)[0]
     speed = speed_scale([trajectory for _, trajectory, _ in flights.values()])
-    for axes, (name, (track, trajectory, _)) in zip(panels, flights.items(), strict=True):
+    for axes, below, (name, (track, trajectory, _)) in zip(maps, profiles, flights.items(), strict=True):
         draw_track(axes, track)
         draw_flight(axes, trajectory, speed, tilt=camera.tilt)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
-    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=list(panels), shrink=0.8, aspect=30)
+        draw_altitude(below, track, trajectory, speed)
+    for axes in (*maps[1:], *profiles[1:]):
+        axes.set_ylabel("")
+    bar = figure.colorbar(ScalarMappable(speed, SPEED_COLORS), ax=[*maps, *profiles], shrink=0.7, aspect=30, pad=0.01)
     bar.set_label("speed (m/s); arrows: camera", fontsize=8)
     bar.outline.set_visible(False)
 
@@ -145,31 +208,48 @@ def _draw_shares(axes: Axes, flights: Mapping[str, Mapping[str, Sight]]) -> None
     things = list(dict.fromkeys(thing for sights in flights.values() for thing in sights))
     width = 0.8 / len(flights)
     for index, (name, sights) in enumerate(flights.items()):
-        heights = [sights[thing].share_in_view if thing in sights else np.nan for thing in things]
-        places = np.arange(len(things)) + (index - (len(flights) - 1) / 2) * width
-        _draw_bars(axes, places, heights, SIGHT_COLORS[index], name, width, "{:.0%}")
+        at = [
+            number + (index - (len(flights) - 1) / 2) * width for number, thing in enumerate(things) if thing in sights
+        ]
+        bars = [mean_bar(s.shares_by_flight, s.share_in_view) for s in (sights[t] for t in things if t in sights)]
+        _draw_bars(axes, np.array(at), bars, SIGHT_COLORS[index], name, width, "{:.0%}")
     labels = ["any gate" if thing == NEAREST_VISIBLE_GATE else thing for thing in things]
     axes.set_xticks(range(len(things)), labels, fontsize=8)
-    axes.set_ylim(0.0, 1.1)
+    axes.set_xlim(-0.6, len(things) - 0.4)
+    _dress(axes, "Share of time in view; lines: 95 % interval over n flights")
+    _share_axis(axes)
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.22))
+
+
+def _share_axis(axes: Axes) -> None:
+    """Let the axis go from 0 to 1, and leave room above for what is written on the bars."""
+    axes.set_ylim(0.0, 1.35)
+    axes.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    _dress(axes, "Share of time in view")
-    axes.legend(frameon=False, fontsize=8)
 
 
 def _draw_bars(
     axes: Axes,
     places: np.ndarray,
-    heights: Sequence[float],
+    bars: Sequence[Bar],
     color: str,
     label: str,
     width: float = 0.4,
     form: str = "{:.2g}",
 ) -> None:
-    """Draw bars with their values above them; NaN draws nothing."""
-    axes.bar(places, heights, width=0.92 * width, color=color, label=label)
-    for place, height in zip(places, heights, strict=True):
-        if np.isfinite(height):
-            axes.text(place, height, form.format(height), ha="center", va="bottom", fontsize=7, color=INK)
+    """Draw bars with their intervals, and value and n above."""
+    heights = np.array([bar.height for bar in bars])
+    ends = np.array([(bar.height - bar.low, bar.high - bar.height) for bar in bars]).clip(0.0).T  # (2, M)
+    style: dict[str, Any] = {"ecolor": INK, "elinewidth": 1.2, "capsize": 2.5}
+    axes.bar(places, heights, yerr=ends, error_kw=style, width=0.92 * width, color=color, label=label)
+    for place, bar in zip(places, bars, strict=True):
+        words = f"{form.format(bar.height)}\nn = {bar.n}"
+        at = (place, bar.high)
+        axes.annotate(words, at, (0, 3), textcoords="offset points", ha="center", va="bottom", fontsize=7, color=INK)
+
+
+def _note(figure: Figure, text: str) -> None:
+    figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=MUTED)
 
 
 def _dress(axes: Axes, title: str) -> None:

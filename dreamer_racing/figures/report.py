@@ -4,6 +4,7 @@ Shapes: K control steps of a recorded episode.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from dreamer_racing.evaluation.course import Course, act, with_memory
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
 from dreamer_racing.evaluation.trajectory import write_trajectory
-from dreamer_racing.figures.drawing import plot_top_down
-from dreamer_racing.figures.film import side_by_side, write_video
+from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
+from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
+from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Flyer
 from dreamer_racing.training.directory import RunDirectory
@@ -51,6 +53,7 @@ class EvaluationReport:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
+        self.on_episode: Callable[[int, int], None] | None = None
         self._learner = learner
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
@@ -75,7 +78,7 @@ class EvaluationReport:
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        return self._course.evaluate(self.episodes, deterministic)
+        return self._course.evaluate(self.episodes, deterministic, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
@@ -92,13 +95,26 @@ class EvaluationReport:
         plot_top_down(self._course.base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return
-        frames = trajectory.pixels[: self.video_steps]
+        painter = None
         if isinstance(self._learner, DreamerLearner):
             painter = find_painter(self._learner, self._course.base.worlds)
-            frames = dream_beside_flight(self._learner, trajectory, painter, self.video_steps)
             if (recorded := record_dream(self._learner, trajectory, painter)) is not None:
                 recorded.save(into.evaluations / f"{name}_dream.npz")
-        write_video(into.videos / f"{name}.mp4", frames, fps=round(1 / trajectory.control_dt))
+        self._film(into.videos / f"{name}.mp4", trajectory, painter)
+
+    def _film(self, path: Path, trajectory: Trajectory, painter: Painter | None) -> None:
+        """Write the flight, beside what the world model makes of it if there is a painter; slowly if it is short."""
+        assert trajectory.pixels is not None
+        count = min(len(trajectory.pixels), self.video_steps)
+        if painter is None or not isinstance(self._learner, DreamerLearner):
+            frames, right = enlarge_to_watch(trajectory.pixels[:count].numpy()), list[str]()
+        else:
+            frames = dream_beside_flight(self._learner, trajectory, painter, count).numpy()
+            right = dream_words(count, SEEN_STEPS, trajectory.control_dt, SEEN_STEPS + DREAMT_STEPS)
+        slower = slow_motion(count * trajectory.control_dt)
+        slowed = f"  {slower}x slower" if slower > 1 else ""
+        left = [words + slowed for words in race_words(self._course.base.track, trajectory)[:count]]
+        write_video(path, caption(frames, left, right), fps=1 / (slower * trajectory.control_dt), scale=1)
 
     def close(self) -> None:
         """Free the evaluation's simulator."""
@@ -122,6 +138,7 @@ class ReturnReport:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
+        self.on_episode: Callable[[int, int], None] | None = None
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
@@ -161,6 +178,8 @@ class ReturnReport:
             total, length = total + step["next", "reward"].view(-1), length + 1
             done = step["next", "done"].view(-1)
             counted = done & (left > 0)
+            if self.on_episode and counted.any():
+                self.on_episode(self.episodes - int(left.sum() - counted.sum()), self.episodes)
             returns.append(total[counted])
             lengths.append(length[counted])
             left, total, length = left - counted.long(), total.masked_fill(done, 0), length.masked_fill(done, 0)
@@ -180,15 +199,13 @@ class ReturnReport:
         self._env.close(raise_if_closed=False)
 
 
-def dream_beside_flight(
-    learner: DreamerLearner, trajectory: Trajectory, painter: Painter | None, max_steps: int
-) -> Tensor:
+def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
     """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
 
     Args:
         learner: whose world model dreams.
         trajectory: a recorded episode with images.
-        painter: what shows its latents; None: the on-board view alone.
+        painter: what shows its latents.
         max_steps: K at most.
 
     Returns:
@@ -196,8 +213,6 @@ def dream_beside_flight(
     """
     assert trajectory.pixels is not None
     pixels = trajectory.pixels[:max_steps]
-    if painter is None:
-        return pixels
     shown = []
     for start in range(0, len(pixels), SEEN_STEPS + DREAMT_STEPS):
         part = slice(start, min(start + SEEN_STEPS + DREAMT_STEPS, len(pixels)))

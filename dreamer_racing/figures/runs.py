@@ -10,8 +10,8 @@ import re
 import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, field
+from itertools import combinations, groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -31,6 +31,7 @@ SAME_CURVE = (
     "model.cuda_graph",
 )  # fmt: skip
 """Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
+IN_KEY = ("algorithm", "track")  # settings that every key names anyway
 
 
 class CurveKey(NamedTuple):
@@ -39,7 +40,7 @@ class CurveKey(NamedTuple):
     track: str
     algorithm: str
     variant: str
-    """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``; empty otherwise."""
+    """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``, and by what `group_runs` adds; or empty."""
 
     @property
     def is_reference(self) -> bool:
@@ -59,11 +60,13 @@ class RunData:
         directory: of the run.
         config: settings of `config.yaml` by dotted name.
         metrics: its `metrics.csv`.
+        overrides: what its command line set, by dotted name, as text; empty if that was not stored.
     """
 
     directory: Path
     config: dict[str, Any]
     metrics: MetricsTable
+    overrides: dict[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -77,7 +80,7 @@ class RunData:
 
     @property
     def key(self) -> CurveKey:
-        """Which curve the run belongs to."""
+        """Which curve the run belongs to, by its folder's name; `group_runs` looks at the settings, too."""
         algorithm = str(self.config.get("algorithm", DEFAULT_ALGORITHM))
         track = Path(str(self.config.get("track", "unknown"))).stem
         named = re.fullmatch(rf"{re.escape(f'{algorithm}_{track}')}(?:_(?P<variant>.+))?_seed\d+", self.name)
@@ -115,7 +118,7 @@ def _runs_below(folder: Path) -> Iterator[Path]:
 
 
 def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None) -> tuple[list[RunData], list[str]]:
-    """Read runs, leaving out those that cannot be read.
+    """Read runs, leaving out those that cannot be read, and of repeated ones all but the one that got furthest.
 
     Args:
         directories: of the runs.
@@ -127,7 +130,8 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
     runs, problems = [], []
     for directory in directories:
         try:
-            run = RunData(directory, _read_config(directory), read_metrics(RunDirectory(directory).metrics, wanted))
+            metrics = read_metrics(RunDirectory(directory).metrics, wanted)
+            run = RunData(directory, _read_config(directory), metrics, _read_overrides(directory))
         except FileNotFoundError as error:
             problems.append(f"{directory.name} left out: it has no {Path(error.filename).name}")
         except (ValueError, OSError) as error:
@@ -136,7 +140,21 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
         else:
             runs.append(run)
             problems += [f"{directory.name}: {problem}" for problem in run.metrics.problems]
-    return runs, problems
+    return _once_each(runs, problems), problems
+
+
+def _once_each(runs: Sequence[RunData], problems: list[str]) -> list[RunData]:
+    """Keep one run of each seed of each curve: a second one is no second sample."""
+    kept = []
+    for group in _by_curve(runs).values():
+        for _, repeated in groupby(group, key=lambda run: run.seed):
+            *others, best = sorted(repeated, key=lambda run: run.metrics.env_steps.max(initial=0))
+            kept.append(best)
+            problems += [
+                f"{run.name} left out: it has the settings and the seed of {best.name}, which got as far or further"
+                for run in others
+            ]
+    return kept
 
 
 def _read_config(directory: Path) -> dict[str, Any]:
@@ -150,6 +168,16 @@ def _read_config(directory: Path) -> dict[str, Any]:
     return dict(_flatten(config))
 
 
+def _read_overrides(directory: Path) -> dict[str, str]:
+    """Read what the command line set; it only names curves, so that a run without it is as good."""
+    try:
+        told = yaml.safe_load(RunDirectory(directory).overrides.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    pairs = (str(item).lstrip("+~").partition("=") for item in (told if isinstance(told, list) else ()))
+    return {name: value for name, _, value in pairs}
+
+
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in config.items():
         if isinstance(value, Mapping):
@@ -161,47 +189,87 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
     """Put the runs of one curve together, in order of their seeds.
 
+    Runs of one algorithm, track and named variant whose settings differ in more than `SAME_CURVE` are curves of their
+    own, and the variant of each says in what: the overrides that not all of them were given, or else the settings. What
+    one of them does not have, because it was started by an older version, is no difference.
+
     Raises:
-        ValueError: runs of one curve differ in a setting that changes what is learned, or not even in the seed; the
-            message names the settings and both values. What one of them does not have, because it was started by an
-            older version, is no difference.
+        ValueError: two runs of one curve do not even differ in the seed.
     """
     groups = _by_curve(runs)
-    for key, group in groups.items():
-        for first, second in combinations(group, 2):
-            _check_alike(key, first, second)
+    for group in groups.values():
+        for first, second in pairwise(group):
+            if first.seed == second.seed:
+                raise ValueError(
+                    f"{first.directory} and {second.directory} are the same run twice: the same settings, and "
+                    f"seed: {first.seed} in both. Plot one of them."
+                )
     return groups
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:
-    """Take the run of the lowest seed of each curve, alike or not."""
+    """Take the run of the lowest seed of each curve."""
     return [group[0] for group in _by_curve(runs).values()]
 
 
 def _by_curve(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
-    groups: dict[CurveKey, list[RunData]] = defaultdict(list)
+    named: dict[CurveKey, list[RunData]] = defaultdict(list)
     for run in sorted(runs, key=lambda run: (run.key, run.seed, str(run.directory))):
-        groups[run.key].append(run)
-    return dict(groups)
+        named[run.key].append(run)
+    groups = {}
+    for key, group in named.items():
+        parts = _split_by_settings(group)
+        for label, part in zip(_differences(parts), parts, strict=True):
+            groups[key._replace(variant=" ".join(filter(None, (key.variant, label))))] = part
+    return dict(sorted(groups.items()))
 
 
-def _check_alike(key: CurveKey, first: RunData, second: RunData) -> None:
-    different = [
-        f"{name}: {first.config[name]} and {second.config[name]}"
-        for name in sorted(first.config.keys() & second.config.keys())
-        if not name.startswith(SAME_CURVE) and first.config[name] != second.config[name]
-    ]
-    if different:
-        raise ValueError(
-            f"{first.directory} and {second.directory} would be one curve ({key}), but "
-            f"were not configured alike: {'; '.join(different)}. Plot them apart, or name their folders "
-            "<algorithm>_<track>_<variant>_seed<k> with different variants."
-        )
-    if first.seed == second.seed:
-        raise ValueError(
-            f"{first.directory} and {second.directory} are the same run twice: the same settings, and "
-            f"seed: {first.seed} in both. Plot one of them."
-        )
+def _split_by_settings(runs: Sequence[RunData]) -> list[list[RunData]]:
+    """Put each run to the first others that are all set like it."""
+    parts: list[list[RunData]] = []
+    for run in runs:
+        like = (part for part in parts if not any(_different(run.config, other.config) for other in part))
+        if (part := next(like, None)) is None:
+            parts.append([run])
+        else:
+            part.append(run)
+    return parts
+
+
+def _different(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Name the settings that both have, with different values, and that change what is learned."""
+    common = first.keys() & second.keys()
+    return sorted(name for name in common if not name.startswith(SAME_CURVE) and first[name] != second[name])
+
+
+def _differences(parts: Sequence[Sequence[RunData]]) -> list[str]:
+    """Say of each part in what it differs from the others: nothing of a single one, and of what is as by default."""
+    if len(parts) == 1:
+        return [""]
+    told = [_of_learning(part[0].overrides) for part in parts]
+    names = {name for one in told for name in one if any(other.get(name) != one[name] for other in told)}
+    labels = _name_by(told, sorted(names))
+    if len(set(labels)) == len(labels):
+        return labels
+    # The command lines do not tell, of two versions say; the settings do, all that runs of a part have between them.
+    configs = [_of_learning({name: value for run in part for name, value in run.config.items()}) for part in parts]
+    pairs = combinations(configs, 2)
+    different = sorted({name for first, second in pairs for name in _different(first, second)})
+    enough = next(n for n in range(1, len(different) + 1) if _tells_apart(configs, different[:n]))
+    more = ", …" if enough < len(different) else ""
+    return [f"{label}{more}" for label in _name_by(configs, different[:enough])]
+
+
+def _of_learning(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if not name.startswith((*SAME_CURVE, *IN_KEY))}
+
+
+def _name_by(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
+    return [", ".join(f"{name}={one[name]}" for name in names if name in one) for one in settings]
+
+
+def _tells_apart(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> bool:
+    return len(set(_name_by(settings, names))) == len(settings)
 
 
 def evaluation_files(directory: Path, ending: str) -> dict[int, Path]:

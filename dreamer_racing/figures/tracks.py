@@ -9,7 +9,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.figures.drawing import INK, draw_track, draw_track_side, save
+from dreamer_racing.figures.drawing import INK, draw_track, save
+from dreamer_racing.figures.top_down import draw_track_side
 
 COLUMNS = 3
 CELL = (5.0, 5.6)  # inches of a track, width and height

@@ -72,6 +72,11 @@ class RunDirectory:
         return self.path / "metrics.csv"
 
     @property
+    def wandb_run(self) -> Path:
+        """The id that the run has at W&B."""
+        return self.path / "wandb" / "run.json"
+
+    @property
     def evaluations(self) -> Path:
         """Folder of what evaluations during training measured."""
         return self.path / "evaluations"

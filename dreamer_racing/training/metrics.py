@@ -33,8 +33,7 @@ class MetricsLog:
 
     Args:
         run_dir: folder of the run.
-        loggers: TorchRL loggers that receive every row too.
-        tensorboard: also write TensorBoard files to ``run_dir/tensorboard``.
+        loggers: TorchRL loggers that receive every row too (`dreamer_racing.training.loggers` makes some).
         resume_env_steps: of the checkpoint this run continues: rows beyond it are removed. If None, the run is new,
             and a ``metrics.csv`` already there is kept under another name.
 
@@ -48,15 +47,12 @@ class MetricsLog:
         self,
         run_dir: str | Path,
         loggers: Sequence[Logger] = (),
-        tensorboard: bool = False,
         resume_env_steps: int | None = None,
     ) -> None:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.path = RunDirectory(run_dir).metrics
         self.loggers = list(loggers)
-        if tensorboard:
-            self.loggers.append(_tensorboard(run_dir, resume_env_steps))
         self._mean = RunningMean()
         self._columns = [X_AXIS]
         if resume_env_steps is None:
@@ -94,8 +90,7 @@ class MetricsLog:
             row = {name: f"{value:.8g}" for name, value in values.items()}
             csv.DictWriter(file, self._columns).writerow({X_AXIS: env_steps, **row})
         for sink in self.loggers:
-            for name, value in values.items():
-                sink.log_scalar(name, value, step=env_steps)
+            sink.log_metrics(values, step=env_steps)
             if flush := getattr(sink.experiment, "flush", None):
                 flush()
         return values
@@ -107,9 +102,9 @@ class MetricsLog:
     def close(self) -> None:
         """Closes the loggers that can be closed."""
         for sink in self.loggers:
-            close = getattr(sink.experiment, "close", None)
-            if close is not None:
-                close()
+            for name in ("close", "finish"):  # TensorBoard's word for it, and W&B's
+                if end := getattr(sink.experiment, name, None):
+                    end()
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -142,19 +137,6 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
     """Read the complete rows."""
     header, rows, _ = read_rows(path)
     return [dict(zip(header, row, strict=True)) for row in rows]
-
-
-def _tensorboard(run_dir: Path, resume_env_steps: int | None) -> Logger:
-    """Make the logger of a run's TensorBoard files; what they hold beyond a run's resumption is not shown any more."""
-    from torch.utils.tensorboard import SummaryWriter
-    from torchrl.record.loggers.tensorboard import TensorboardLogger
-
-    class ResumingLogger(TensorboardLogger):
-        def _create_experiment(self) -> SummaryWriter:
-            purge_step = None if resume_env_steps is None else resume_env_steps + 1
-            return SummaryWriter(log_dir=str(run_dir / self.exp_name), purge_step=purge_step)
-
-    return ResumingLogger(exp_name="tensorboard", log_dir=str(run_dir))
 
 
 def _keep_aside(path: Path) -> None:

@@ -54,6 +54,11 @@ class Progress:
         elif time.monotonic() - self._since >= self._seconds:
             self._write_line(", ".join(f"{word} {number}" for word, number in numbers.items()))
 
+    def evaluating(self, episodes: int, total: int) -> None:
+        """Show how far an evaluation is, until there are numbers to show; a log has no use for it."""
+        if self._bar is not None:
+            self._bar.set_postfix_str(f"evaluating: {episodes} of {total} episodes")
+
     def say(self, text: str) -> None:
         """Say something in a line of its own."""
         if self._bar is not None:

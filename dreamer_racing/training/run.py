@@ -1,12 +1,12 @@
 """A training run: collect, learn, log, evaluate, save, end.
 
-The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`,
-`logger.every`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
+The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
+`logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
 """
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -24,6 +24,7 @@ from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.loggers import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.replay_ratio import ReplayRatio
@@ -32,6 +33,9 @@ from dreamer_racing.training.signals import GracefulExit
 
 class Report(Protocol):
     """Evaluates a learner's policy."""
+
+    on_episode: Callable[[int, int], None] | None
+    """Is told how many episodes have ended, and of how many."""
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate, write what there is to look at, return metrics."""
@@ -116,6 +120,8 @@ class Run:
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
             metrics = self.report.make(self.counters["env_steps"], self.config.evaluation.stochastic)
+            if self.config.logger.media:
+                log_evaluation(self.metrics.loggers, self.directory, self.counters["env_steps"])
         self.metrics.push(metrics)
         self.evaluated = self.counters["updates"]
         # Gates first, return where the gates are the same: a return lies far below a million.
@@ -195,6 +201,7 @@ def train(run: Run) -> None:
         GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
         Progress(config.total_env_steps, counters["env_steps"]) as progress,
     ):
+        run.report.on_episode = progress.evaluating
         if run.directory.finished_env_steps() >= config.total_env_steps:
             progress.say(
                 f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"

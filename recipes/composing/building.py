@@ -18,6 +18,7 @@ from composing.arena import Environment, crash_causes, make_report, reward_terms
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
+from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
@@ -36,6 +37,7 @@ from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.loggers import RunLogger, make_loggers
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.run import Report, Run
 
@@ -228,6 +230,16 @@ def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Rep
     return make_report(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
 
+def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
+    """Make the loggers of a run, resumed at so many env_steps if it is, and give them its configuration."""
+    asked = config.logger
+    loggers = make_loggers(directory.path, asked.tensorboard, asked.wandb.value, asked.project, resumed)
+    plain = OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
+    for sink in loggers:
+        sink.log_configuration(flat_settings(cast(DictConfig, plain)), OmegaConf.to_yaml(plain))
+    return loggers
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -268,11 +280,8 @@ def assemble(
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
     write_configuration(directory, config, overrides, counters["env_steps"])
-    metrics = MetricsLog(
-        directory.path,
-        tensorboard=config.logger.tensorboard,
-        resume_env_steps=counters["env_steps"] if config.resume else None,
-    )
+    resumed = counters["env_steps"] if config.resume else None
+    metrics = MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed)
     print(f"run directory: {directory.path}")
     return kind(
         config=config,

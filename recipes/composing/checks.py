@@ -30,6 +30,7 @@ from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.loggers import check_loggers
 from dreamer_racing.training.schedule import Clock
 
 RACE_ONLY = {
@@ -84,6 +85,7 @@ def check(config: RunConfig) -> None:
         ValueError: the message gives the numbers and the setting to change.
     """
     check_settings(config)
+    check_loggers(config.logger.wandb.value)
     values = OmegaConf.structured(config)
     on_cuda = config.env.device.partition(":")[0] == "cuda"
     if not on_cuda and config.env.device != "cpu":

@@ -70,11 +70,22 @@ class CurriculumConfig:
     relabel: bool = True  # recompute rewards of replayed steps with today's b₂
 
 
+class Wandb(Enum):
+    """Where what Weights & Biases gets goes."""
+
+    none = "none"
+    offline = "offline"
+    online = "online"
+
+
 @dataclass
 class LoggerConfig:
     """Where metrics go besides metrics.csv."""
 
     tensorboard: bool = True
+    wandb: Wandb = Wandb.none  # Weights & Biases; online alone sends anything
+    project: str = "dreamer_racing"  # of W&B
+    media: bool = True  # whether TensorBoard and W&B get plots and films of evaluations
     every: int = setting(2_000, NOT_NEGATIVE)  # env_steps between rows
 
 

@@ -129,6 +129,13 @@ def test_flies_the_episodes_dealt_to_each_environment_however_long_they_last(epi
     ]
 
 
+def test_says_how_many_episodes_have_ended():
+    told = []
+    script = [[(2, "ground"), (3, "ground")], [(2, "ground"), (1, "ground")]]
+    evaluate(ScriptedRace(script), idle(2), episodes=3, on_episode=lambda *numbers: told.append(numbers))
+    assert told == [(2, 3), (3, 3)]  # both worlds' first together
+
+
 def test_statistics_by_hand():
     result = evaluate(ScriptedRace(SCRIPT), idle(), 5)
     assert [episode.outcome for episode in result.episodes] == ["ground", TIMEOUT, "gate_frame", FINISHED, TIMEOUT]

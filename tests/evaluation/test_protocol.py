@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 
+import numpy as np
+import pytest
 import torch
 from PIL import Image
 from torchrl.data import Unbounded
@@ -24,7 +26,7 @@ from dreamer_racing.evaluation.protocol import (
     results_table,
     run_protocol,
 )
-from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
+from dreamer_racing.figures.protocol import mean_bar, plot_conditions, plot_crashes, share_bar
 from dreamer_racing.machine import command_line, git_commit, provenance
 
 WORLDS = {"track": "circle", "from_pixels": False, "num_threads": 1}
@@ -103,7 +105,7 @@ def test_both_policies_meet_the_same_starts():
     assert starts.std(0).min() > 0.1
 
 
-def test_table_and_plots(tmp_path):
+def test_table_and_plots(tmp_path, figures):
     results = list(run_protocol(Falling(), WORLDS, episodes=2, conditions=CONDITIONS[:1], num_envs=2))
     table = results_table(results).splitlines()
     assert table[0].startswith("| physics | condition | policy | success | gates | best lap (s) ")
@@ -115,6 +117,23 @@ def test_table_and_plots(tmp_path):
     for path in (tmp_path / "conditions.png", tmp_path / "new" / "crashes.png"):
         with Image.open(path) as image:
             assert image.width == 1350
+    success, gates = figures[0].axes
+    for axes in (success, gates):
+        assert axes.get_ylim()[0] == 0.0  # nobody finished, no gate was passed
+        assert [note.get_text() for note in axes.texts] == [f"{'0%' if axes is success else '0.00'}\nn = 2"] * 4
+    for axes in figures[1].axes:
+        assert axes.get_ylim()[0] == 0.0
+
+
+def test_intervals_of_bars():
+    bar = share_bar([True] * 8 + [False] * 2)  # Wilson's, by hand: (8 + 1.92) / (10 + 3.84) ± 0.2267
+    np.testing.assert_allclose(bar, (0.8, 0.4902, 0.9433, 10), atol=1e-4)
+    never = share_bar([False] * 60)
+    assert never.low == never.height == 0.0 and never.high == pytest.approx(0.0602, abs=1e-4)
+    mean = mean_bar([1.0, 3.0, 5.0, 7.0])
+    half = 1.96 * np.sqrt(20 / 3) / 2
+    np.testing.assert_allclose(mean, (4.0, 4 - half, 4 + half, 4))
+    assert mean_bar([5.0]) == (5.0, 5.0, 5.0, 1) and mean_bar([0.0, 1.0, 0.0]).low == 0.0
 
 
 def test_a_lesioned_policy_is_flown_like_any_other():

@@ -98,15 +98,28 @@ def test_a_lost_state_is_left_out():
     assert len(measure_sight([lost], track_of((10.0, 0, 1.0), (20.0, 0, 1.0)), LEVEL)["next gate"].angle) == 1
 
 
+def test_observations_know_their_flight():
+    track = track_of((10.0, 0, 1.0), (20.0, 0, 1.0))
+    lost = flight((0.0, 0.0, 1.0), rows=2)
+    lost.position[0] = math.nan
+    away = flight((0.0, 0.0, 1.0), yaw_degrees=180.0, rows=3)
+    sight = measure_sight([lost, away], track, LEVEL)["next gate"]
+    assert sight.flight.tolist() == [0, 1, 1, 1] and sight.shares_by_flight == [1.0, 0.0]
+
+
 def test_numbers_of_a_sight():
-    sight = Sight(torch.tensor([2.0, 4.0, 12.0, 180.0, math.nan]), torch.tensor([True, True, True, False, False]))
+    sight = Sight(
+        torch.tensor([2.0, 4.0, 12.0, 180.0, math.nan]),
+        torch.tensor([True, True, True, False, False]),
+        torch.tensor([0, 0, 0, 2, 2]),
+    )
     histogram = sight.histogram()
     assert histogram[[0, 2, 35]].tolist() == [0.5, 0.25, 0.25] and histogram.sum() == 1
     numbers = json.loads(json.dumps(sight.to_dict(), allow_nan=False))
     assert numbers["observations"] == 5 and numbers["share_in_view"] == pytest.approx(0.6)
     assert numbers["angle_mean_degrees"] == pytest.approx(49.5)
     assert numbers["angle_quantiles_degrees"]["50 %"] == pytest.approx(8.0)
-    never = Sight(torch.tensor([math.nan]), torch.tensor([False]))
+    never = Sight(torch.tensor([math.nan]), torch.tensor([False]), torch.tensor([0]))
     assert never.to_dict()["angle_quantiles_degrees"]["50 %"] is None
     table = sight_table({"with": {"gate": sight, "none": never}}).splitlines()
     assert table[2] == "| with | gate | 60% | 50° | 2° | 4° | 8° | 54° | 155° |"

@@ -241,12 +241,37 @@ def test_names_say_the_variant(tmp_path, name, settings, key):
     assert run.key == key
 
 
-def test_mixed_configurations_are_refused_with_both_values(tmp_path):
-    write_run(tmp_path, "dreamer_v3_circle_seed0", seed=0, device="cpu", logger={"every": 10})
-    other = {"preset": "faithful", "looks": "randomised"}
-    write_run(tmp_path, "dreamer_v3_circle_seed1", seed=1, device="cuda", logger={"every": 20}, env=other)
-    with pytest.raises(ValueError, match=r"seed0 and .*seed1 .*alike: env.preset: easy and faithful\. "):
-        curves_of(tmp_path)
+def tell(run: Path, *overrides: str) -> Path:
+    """Store what a command line set."""
+    (run / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
+    return run
+
+
+def test_mixed_configurations_are_curves_of_their_own_named_by_the_overrides_that_differ(tmp_path):
+    for seed, given in enumerate(((), (), ("env.preset=faithful",), ("tuned=race", "+decoys=paper"))):
+        settings = {"env": {"preset": "faithful"}} if seed == 2 else {"decoys": "paper"} if seed == 3 else {}
+        name = f"dreamer_v3_circle_2026010{seed}"  # as recipes name them
+        run = write_run(tmp_path, name, [float(seed)] * 2, seed=seed, **{"decoys": None} | settings)
+        tell(run, f"seed={seed}", "track=circle", "logger.every=5", *given)
+    curves = curves_of(tmp_path).curves
+    assert [(curve.key.variant, curve.centre[-1], curve.seeds.max()) for curve in curves] == [
+        ("", 0.5, 2),  # of both that are set alike
+        ("decoys=paper, tuned=race", 3.0, 1),
+        ("env.preset=faithful", 2.0, 1),
+    ]
+    assert [curve.key.is_reference for curve in curves] == [True, False, False]
+
+
+def test_settings_name_curves_whose_command_lines_do_not(tmp_path):
+    for seed, (preset, tilt) in enumerate((("easy", 25), ("faithful", 25), ("faithful", 20))):
+        env = {"env": {"preset": preset, "camera_tilt": tilt, "zoom": seed}}
+        write_run(tmp_path, f"dreamer_v3_circle_paper_seed{seed}", seed=seed, device=f"cuda:{seed}", **env)
+    runs, _ = read_runs(find_runs([tmp_path]))
+    assert [key.variant for key in group_runs(runs)] == [
+        "paper env.camera_tilt=20, env.preset=faithful, …",  # no more than tells them apart: not their zoom
+        "paper env.camera_tilt=25, env.preset=easy, …",
+        "paper env.camera_tilt=25, env.preset=faithful, …",
+    ]
 
 
 def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path):
@@ -254,8 +279,10 @@ def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path)
         write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, **decoys)
     assert curves_of(tmp_path).curves[0].seeds.max() == 3
     write_run(tmp_path, "dreamer_v3_circle_seed3", seed=3, decoys={"count": 2})
-    with pytest.raises(ValueError, match=r"seed2 and .*seed3 .*alike: decoys\.count: 4 and 2\."):  # not with the first
-        curves_of(tmp_path)
+    curves = curves_of(tmp_path).curves  # unlike seed 2, but not unlike the first
+    assert [(curve.key.variant, curve.seeds.max()) for curve in curves] == [
+        ("decoys.count=2", 1), ("decoys.count=4", 3)
+    ]  # fmt: skip
 
 
 def test_runs_that_differ_in_what_does_not_matter_are_one_curve(tmp_path):
@@ -266,11 +293,15 @@ def test_runs_that_differ_in_what_does_not_matter_are_one_curve(tmp_path):
     assert [run.seed for run in first_of_each_curve(runs)] == [0]
 
 
-def test_the_same_seed_twice_is_refused(tmp_path):
-    write_run(tmp_path / "a", "dreamer_v3_circle_seed0")
-    write_run(tmp_path / "b", "dreamer_v3_circle_seed0")
+def test_of_the_same_seed_twice_the_longer_run_counts(tmp_path):
+    write_run(tmp_path / "a", "first", [1.0] * 3)
+    write_run(tmp_path / "b", "again", [5.0] * 2)
+    result = curves_of(tmp_path)
+    assert at(result.curves[0], 1500)[::3] == (1.0, 1)
+    assert result.problems == ["again left out: it has the settings and the seed of first, which got as far or further"]
+    ((first,), _), ((again,), _) = (read_runs([tmp_path / name]) for name in ("a/first", "b/again"))
     with pytest.raises(ValueError, match="same run twice.*seed: 0"):
-        curves_of(tmp_path)
+        learning_curves([first, again])
 
 
 # --- files in any state ---

@@ -15,7 +15,8 @@ from PIL import Image
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve, plot_top_down
+from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve
+from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.training.metrics import read_metrics
 
 
@@ -44,8 +45,9 @@ def test_every_track_fits_and_only_different_heights_get_a_side_view(name, tmp_p
     plot_top_down(track, trajectory, tmp_path / "new" / "plot.png")
     with Image.open(tmp_path / "new" / "plot.png") as image:
         assert image.width == 1350
-        assert 800 < image.height < 2000
-    panels = figures[0].axes
+        assert 1000 < image.height < 2400
+    *panels, altitude, bar = figures[0].axes
+    assert (altitude.get_ylabel(), bar.get_ylabel()) == ("altitude (m)", "speed (m/s)")
     heights = [gate.position[2] for gate in track.gates]
     assert len(panels) == (2 if max(heights) - min(heights) > 0.5 else 1)
     top = panels[0]
@@ -63,7 +65,7 @@ def test_path_is_coloured_by_speed_and_ends_with_the_crash(tmp_path, figures):
     track = load_track("circle")
     trajectory = straight_flight(track)
     plot_top_down(track, trajectory, tmp_path / "plot.png")
-    (axes,) = figures[0].axes
+    axes = figures[0].axes[0]
     line, arrows = axes.collections
     assert line.get_clim() == (0.0, 8.0)
     np.testing.assert_allclose(line.get_array(), np.linspace(0, 8, 61)[1:], rtol=1e-6)
@@ -71,14 +73,22 @@ def test_path_is_coloured_by_speed_and_ends_with_the_crash(tmp_path, figures):
     assert len(arrows.get_offsets()) == 13  # 1.2 s, one every 0.1 s and one at the start
     markers = {marker.get_marker(): marker.get_xydata()[0] for marker in axes.lines if marker.get_marker() != "None"}
     np.testing.assert_allclose(markers["o"], track.start_position[:2])
-    np.testing.assert_allclose(markers["X"], trajectory.position[-1, :2])
+    np.testing.assert_allclose(markers["x"], trajectory.position[-1, :2])
     assert axes.get_title(loc="left") == "circle: 1.20 s, up to 8.0 m/s (ground)"
+
+
+def test_a_short_flight_lies_over_the_marks_of_its_ends(tmp_path, figures):
+    track = load_track("circle")
+    plot_top_down(track, straight_flight(track, steps=5), tmp_path / "plot.png")
+    axes = figures[0].axes[0]
+    marks = [line for line in axes.lines if line.get_marker() in ("o", "x")]
+    assert len(marks) == 2 and all(mark.get_zorder() < axes.collections[0].get_zorder() for mark in marks)
 
 
 def test_no_crash_marker_without_a_crash(tmp_path, figures):
     track = load_track("circle")
     plot_top_down(track, straight_flight(track, outcome="finished"), tmp_path / "plot.png")
-    assert "X" not in [line.get_marker() for line in figures[0].axes[0].lines]
+    assert "x" not in [line.get_marker() for line in figures[0].axes[0].lines]
 
 
 def test_gates_are_bars_across_the_direction_of_flight():
@@ -147,6 +157,16 @@ def test_curves_of_nothing_are_refused(tmp_path):
         plot_curve(metrics, tmp_path / "curve.png", columns={"Mine": ["bogus"]})
     with pytest.raises(ValueError, match="nothing was logged"):
         plot_curve(write_metrics(tmp_path / "metrics.csv", rows=0), tmp_path / "curve.png")
+
+
+@pytest.mark.parametrize("values", [[0.0], [0.0, 0.0, 0.0], [3.0, 0.0]])
+def test_curves_of_what_is_never_negative_do_not_go_below_zero(tmp_path, figures, values):
+    rows = [f"{1000 * index},{value}\n" for index, value in enumerate(values)]
+    (tmp_path / "metrics.csv").write_text("env_steps,episode/gates_passed\n" + "".join(rows))
+    plot_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
+    (axes,) = figures[0].axes
+    assert axes.get_xlim()[0] == axes.get_ylim()[0] == 0.0
+    assert axes.get_ylim()[1] >= max(*values, 1.0) and axes.get_xlim()[1] == max(1.0, 1000.0 * (len(values) - 1))
 
 
 def test_running_mean_keeps_constants_and_ends():

@@ -10,15 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from matplotlib.figure import Figure
 
-from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.tracks import Gate, load_track
 from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, STRIDE, Dream, record_dream
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.evaluation.trajectory import read_trajectory, write_trajectory
-from dreamer_racing.figures.drawing import CRASH_COLOR
-from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, dream_video, film_strip, shown_frames
-from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights, profile_axis
+from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, left_out_of, speed_scale
+from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
+from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.hud import dream_video
+from dreamer_racing.figures.profiles import MISSED_COLOR, Crossing, crossings, draw_altitude, profile_axis
 
 
 def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool = False) -> Trajectory:
@@ -36,9 +38,6 @@ def random_flight(steps: int = 60, outcome: str | None = "ground", pixels: bool 
         control_dt=0.02,
         outcome=outcome,
     )
-
-
-CRASH_RGB = (224, 49, 49)  # `CRASH_COLOR`
 
 
 # --- stored flights ---
@@ -160,7 +159,7 @@ def test_dreams_of_three_stages(tmp_path, figures):
     labels = [text.get_text() for text in panels[0].get_xticklabels()]
     assert labels[:3] == ["-0.08 s", "+0.00 s", "+0.08 s"] and labels[-1] == "+0.80 s"
     video = dream_video([("early", flat_dream(frames=5)), ("late", flat_dream())], scale=2)
-    assert video.shape == (13, 2 * (20 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)
+    assert video.shape == (13, 2 * (15 + 2 * 8 + 8), 2 * (2 * 8 + 8), 3)  # a strip of words above each
 
 
 # --- figures ---
@@ -169,18 +168,62 @@ def test_dreams_of_three_stages(tmp_path, figures):
 def test_flights_side_by_side(tmp_path, figures):
     flights = [NamedFlight(name, load_track(name), random_flight()) for name in ("figure8", "figure8_decoys")]
     plot_flights(flights, tmp_path / "flights.png", over="time")
-    maps, profiles = figures[0].axes[0:4:2], figures[0].axes[1:4:2]
+    maps, altitudes, speeds = figures[0].axes[0:6:3], figures[0].axes[1:6:3], figures[0].axes[2:6:3]
     assert [axes.get_title(loc="left").split("\n")[0] for axes in maps] == ["figure8", "figure8_decoys"]
     assert "2 gates in 1.20 s (ground)" in maps[0].get_title(loc="left")
-    for axes in profiles:
-        assert axes.get_xlabel() == "time (s)" and axes.get_xlim() == (0.0, pytest.approx(1.2))
-        assert [text.get_text() for text in axes.texts] == ["1", "2"]
-        assert [line.get_color() for line in axes.lines if line.get_marker() == "X"] == [CRASH_COLOR]
+    assert altitudes[0].get_ylabel() == "altitude (m)" and speeds[0].get_ylabel() == "speed (m/s)"
+    for axes in (*altitudes, *speeds):
+        assert axes.get_xlim() == (0.0, pytest.approx(1.2))
+        assert [line.get_color() for line in axes.lines if line.get_marker() == "x"] == [CRASH_COLOR]
+    for axes in speeds:
+        assert axes.get_xlabel() == "time (s)" and [text.get_text() for text in axes.texts] == ["1", "2"]
     labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
-    assert labels == ["gate", "decoy", "start", "crash", "camera", "bounding box"]
+    assert labels[:6] == ["gate", "decoy", "start", "crash", "camera", "bounding box"]
 
 
-def test_axis_of_the_speed_profile():
+def test_maps_of_different_halls_have_one_scale_and_stand_in_line(tmp_path, figures):
+    flights = [NamedFlight(name, load_track(name), random_flight()) for name in ("circle", "figure8", "kidney")]
+    plot_flights(flights, tmp_path / "flights.png")
+    for row in range(3):
+        boxes = [axes.get_position() for axes in figures[0].axes[row:9:3]]
+        for side in ("y0", "y1", "width"):
+            assert np.ptp([getattr(box, side) for box in boxes]) < 0.002, (row, side)
+    for flight, axes in zip(flights, figures[0].axes[0:9:3], strict=True):
+        for low, high, limits in zip(
+            flight.track.bounds_low, flight.track.bounds_high, (axes.get_xlim(), axes.get_ylim()), strict=False
+        ):
+            assert limits[0] < low < high < limits[1]
+
+
+def straight(height: float, backwards: bool = False) -> Trajectory:
+    """Along x from −2 to 2 m in 4 steps at one height; the first gate counts between 0 and 1 m if it does."""
+    steps = torch.arange(-2.0, 3.0)
+    x = -steps if backwards else steps
+    flight = random_flight(steps=4, outcome=None)
+    flight.position[:] = torch.stack((x, torch.zeros(5), torch.full((5,), height)), dim=-1)
+    flight.target_gate[:] = torch.tensor([0, 0, 0, 1, 1]) if height == 1.35 and not backwards else 0
+    return flight
+
+
+def test_altitude_tells_a_gate_passed_from_one_flown_over(figures):
+    gates = (Gate((0.25, 0.0, 1.35), 0.0), Gate((0.0, 1.5, 1.35), 0.0))  # the second to the left of the path
+    track = replace(load_track("circle"), gates=gates)
+    assert crossings(track, straight(1.35)) == [Crossing(2.25, 0, True)]
+    assert crossings(track, straight(3.0)) == [Crossing(2.25, 0, False)]
+    assert crossings(track, straight(1.35, backwards=True)) == [Crossing(1.75, 0, False)]
+    for height, color in ((1.35, GATE_COLOR), (3.0, MISSED_COLOR)):
+        axes = Figure().subplots()
+        draw_altitude(axes, track, straight(height), speed_scale([straight(height)]))
+        beams = [line.get_xydata() for line in axes.lines if line.get_color() == color]
+        shape = track.shape
+        expected = [
+            [[2.25, 1.35 + sign * shape.opening / 2], [2.25, 1.35 + sign * shape.outer / 2]] for sign in (-1, 1)
+        ]
+        np.testing.assert_allclose(beams, expected)
+        assert axes.get_ylim()[0] == 0.0 and axes.get_ylim()[1] > height
+
+
+def test_axis_of_the_profiles():
     flight = random_flight(steps=2)
     flight.position[:] = torch.tensor([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     np.testing.assert_allclose(profile_axis(flight, "distance"), [0, 5, 17])
@@ -189,16 +232,11 @@ def test_axis_of_the_speed_profile():
         plot_flights([NamedFlight("a", load_track("circle"), flight)], Path("a.png"), over="height")
 
 
-def test_what_was_left_out_is_written_above(tmp_path, figures):
+def test_what_was_left_out_is_written_beside_a_figure_and_not_into_it(tmp_path, figures):
     flight = NamedFlight("lost", load_track("split_s"), random_flight())
-    plot_flights([flight], tmp_path / "flights.png")
-    plot_flights([flight], tmp_path / "warned.png", problems=["a_run without its last flight"])
-    plot_dreams([("early", flat_dream())], tmp_path / "dreams.png", problems=[f"problem {i}" for i in range(10)])
-    assert [figure.get_suptitle() for figure in figures[:2]] == ["", "! a_run without its last flight"]
-    lines = figures[2].get_suptitle().splitlines()
-    assert lines[0] == "! problem 0" and lines[-2:] == ["! problem 7", "! and 2 more"]
-    with Image.open(tmp_path / "flights.png") as plain, Image.open(tmp_path / "warned.png") as warned:
-        assert plain.width > 700 and warned.width == plain.width
-        assert warned.height - plain.height == pytest.approx(150 * (0.16 + 0.1), abs=2)
-        above = warned.crop((0, 0, warned.width, warned.height - plain.height)).convert("RGB")
-        assert {color for _, color in above.getcolors(10_000)} > {CRASH_RGB, (255, 255, 255)}
+    path = tmp_path / "flights.png"
+    plot_flights([flight], path, problems=["a_run without its last flight", "b_run: ½"])
+    assert left_out_of(path).read_text(encoding="utf-8") == "a_run without its last flight\nb_run: ½\n"
+    assert figures[0].get_suptitle() == ""
+    plot_flights([flight], path)
+    assert not left_out_of(path).exists()

@@ -235,7 +235,7 @@ def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
     write_trajectory(tmp_path / "straight.csv", simulated, "circle")
     lines = write_report(flown, tmp_path / "straight.csv")
     latency, beside, tracking = figures
-    titles = [axes.get_title(loc="left") for axes in beside.axes[0:4:2]]
+    titles = [axes.get_title(loc="left") for axes in beside.axes[0:6:3]]
     assert titles[0] == "flown\ncircle: 8 gates in 6.46 s (finished)"
     assert titles[1] == "simulated (straight)\ncircle: 0 gates in 1.00 s (timeout)"
     assert latency.axes[0].get_xlabel() == "ms, of armed ticks"
@@ -253,7 +253,7 @@ def test_two_flights_beside_each_other(tmp_path, flown, figures):
     other = Flown(tmp_path / "other", kill_at=OFF + 1.0).fly()
     lines = write_report(other, flown)
     assert "ended: cut: kill" in lines[0] and any(line.startswith("against: up to 8.4 m/s") for line in lines)
-    titles = [axes.get_title(loc="left").split("\n")[0] for axes in figures[1].axes[0:4:2]]
+    titles = [axes.get_title(loc="left").split("\n")[0] for axes in figures[1].axes[0:6:3]]
     assert titles == ["flown", f"other flight ({flown.name})"]
 
 

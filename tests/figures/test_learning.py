@@ -10,8 +10,13 @@ from matplotlib.colors import to_rgba
 
 from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
 from dreamer_racing.figures.curves import Curve, LearningCurves, learning_curves
-from dreamer_racing.figures.drawing import INK
-from dreamer_racing.figures.learning import OTHER_COLOR, line_styles, plot_comparison, plot_learning_curves
+from dreamer_racing.figures.learning import (
+    OTHER_COLOR,
+    REFERENCE_COLOR,
+    line_styles,
+    plot_comparison,
+    plot_learning_curves,
+)
 from dreamer_racing.figures.runs import CurveKey, find_runs, read_runs
 from tests.figures.test_curves import write_run
 from tests.running_recipes import compose
@@ -39,7 +44,7 @@ def test_learning_curves_have_a_panel_a_track_and_a_row_a_quantity(tmp_path, fig
     assert all(axes.get_xlim() == (0.0, 2000.0) and len(axes.lines) == 2 for axes in panels)
     assert all(len(axes.collections) == 2 for axes in panels)  # bands
     assert legend_texts(figures[0]) == ["DreamerV3 (2 seeds)", "SAC (2 seeds)"]
-    assert figures[0].get_suptitle() == "! ppo_circle_seed0 left out: it has no metrics.csv"
+    assert (tmp_path / "figure_left_out.txt").read_text() == "ppo_circle_seed0 left out: it has no metrics.csv\n"
     (legend,) = [child for child in below.get_children() if hasattr(child, "get_texts")]
     assert "standard deviation (n − 1) (none of one seed); running mean" in legend.get_title().get_text()
     colors = [line.get_color() for line in legend.get_lines()]
@@ -141,7 +146,7 @@ def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, fig
     assert [label.get_text() for label in axes.get_yticklabels()] == ["default", "no replay", "lost"]
     bars = axes.patches
     assert [(bar.get_width(), bar.get_facecolor()) for bar in bars] == [
-        (3.0, to_rgba(INK)),
+        (3.0, to_rgba(REFERENCE_COLOR)),
         (4.0, to_rgba(OTHER_COLOR)),
     ]
     (spread,) = [line.get_segments()[0] for line in axes.collections]  # none of a single seed
@@ -151,13 +156,17 @@ def test_a_bar_a_variant_a_dot_a_seed_and_a_line_for_the_reference(tmp_path, fig
     assert dots == [[[1, 0], [2, 0], [6, 0]], [[4, 1]]]
     dashed = [line.get_xdata() for line in axes.lines if line.get_marker() == "None"]
     assert dashed == [[3.0, 3.0]]
-    assert [(note.get_text(), note.xy) for note in axes.texts] == [("n = 1", (4.0, 1)), ("no values", (0.0, 2))]
+    end_of_line = pytest.approx(3 + deviation)
+    assert [(note.get_text(), note.xy) for note in axes.texts] == [
+        ("n = 3", (max(6.0, end_of_line.expected), 0)), ("n = 1", (4.0, 1)), ("no values", (0.0, 2))
+    ]  # fmt: skip
     assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first on top
 
 
 def test_the_picture_says_how_and_what_was_left_out(tmp_path, figures):
     plot_comparison(COMPARISON, tmp_path / "comparison.png")
-    assert figures[0].get_suptitle() == "! late left out"
+    assert (tmp_path / "comparison_left_out.txt").read_text() == "late left out\n"
+    assert figures[0].get_suptitle() == ""
     assert " ".join(figures[0].get_supxlabel().split()) == CAPTION
 
 
@@ -174,3 +183,27 @@ def test_variants_without_any_value_are_still_listed(tmp_path, figures):
     plot_comparison(Comparison(nothing, []), tmp_path / "comparison.png")
     (axes,) = figures[0].axes
     assert len(axes.get_yticklabels()) == 3 and not axes.patches
+
+
+@pytest.mark.parametrize("returns", [[0.0], [0.0, 0.0]])
+def test_one_row_and_nothing_but_zeros_are_drawn_from_zero_on(tmp_path, figures, returns, recwarn):
+    columns = "env_steps,evaluation/gates_per_episode,evaluation/lap_time_mean,held_out/image_error\n"
+    rows = [f"{1000 * index},{value},{value},{value}\n" for index, value in enumerate(returns)]
+    (write_run(tmp_path, "ppo_circle_seed0", algorithm="ppo") / "metrics.csv").write_text(columns + "".join(rows))
+    runs, _ = read_runs(find_runs([tmp_path]))
+    plot_learning_curves(learning_curves(runs, ["gates", "lap_time", "image_error"]), tmp_path / "figure.png")
+    panels = figures[0].axes[:-1]
+    assert all(axes.get_xlim()[0] == axes.get_ylim()[0] == 0.0 for axes in panels)
+    assert all(axes.get_ylim()[1] > 0.0 and axes.get_xlim()[1] > 0.0 for axes in panels)
+    if len(returns) == 1:
+        assert all("o" in [line.get_marker() for line in axes.lines] for axes in panels)  # a line of one point is none
+    assert not recwarn.list
+
+
+def test_a_track_s_panels_end_with_its_own_runs(tmp_path, figures):
+    for track, rows in (("circle", 2), ("kidney", 8)):
+        write_run(tmp_path, f"ppo_{track}_seed0", [1.0] * rows, track=track, algorithm="ppo")
+    runs, _ = read_runs(find_runs([tmp_path]))
+    plot_learning_curves(learning_curves(runs, ["return", "success_rate"]), tmp_path / "figure.png")
+    ends = [axes.get_xlim()[1] for axes in figures[0].axes[:-1]]
+    assert ends[0] == ends[2] == pytest.approx(2000, rel=0.05) and ends[1] == ends[3] == 8000

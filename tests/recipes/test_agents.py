@@ -131,7 +131,7 @@ def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> N
     for settings in ({"pilot": "hover"}, {"viewer": True}):
         with pytest.raises(ValueError, match="and agent=kidney: give one of them"):
             fly.check(fly.FlyConfig(agent="kidney", **settings))
-    with pytest.raises(ValueError, match="pilot=human: there are scripted, hover"):
+    with pytest.raises(ValueError, match="pilot=human: there are scripted, hover, keyboard, gamepad"):
         fly.check(fly.FlyConfig(pilot="human"))
     (tmp_path / "agent.json").write_text("{}")
     for settings, words in (

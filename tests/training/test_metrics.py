@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.loggers import make_loggers
 from dreamer_racing.training.metrics import MetricsLog
 
 
@@ -115,7 +116,7 @@ def test_tensorboard_shows_a_resumed_run_once(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     def fly(resume: int | None, value: float, steps: list[int]) -> None:
-        with MetricsLog(tmp_path, tensorboard=True, resume_env_steps=resume) as log:
+        with MetricsLog(tmp_path, make_loggers(tmp_path, tensorboard=True, resume_env_steps=resume), resume) as log:
             for step in steps:
                 log.push({"loss": value})
                 log.write(step)
@@ -130,7 +131,7 @@ def test_tensorboard_shows_a_resumed_run_once(tmp_path):
 def test_tensorboard_is_written_row_by_row(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log = MetricsLog(tmp_path, tensorboard=True)
+    log = MetricsLog(tmp_path, make_loggers(tmp_path, tensorboard=True))
     log.push({"loss": 1.0})
     log.write(100)
     events = EventAccumulator(str(tmp_path / "tensorboard"))
@@ -144,7 +145,7 @@ def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
     from torchrl.record.loggers.csv import CSVLogger
 
     other = CSVLogger(exp_name="other", log_dir=str(tmp_path))
-    with MetricsLog(tmp_path, loggers=[other], tensorboard=True) as log:
+    with MetricsLog(tmp_path, [other, *make_loggers(tmp_path, tensorboard=True)]) as log:
         for step in (10, 20):
             log.push({"loss/actor": torch.tensor(step / 10)})
             log.write(step)

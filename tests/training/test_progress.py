@@ -57,3 +57,12 @@ def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
         and "gates=3.00" in terminal.getvalue()
         and "success=100%" in terminal.getvalue()
     )
+
+
+def test_a_terminal_shows_how_far_an_evaluation_is_and_a_log_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, log = Terminal(), io.StringIO()
+    for stream in (terminal, log):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Progress(total=100) as progress:
+            progress.evaluating(12, 60)
+    assert "evaluating: 12 of 60 episodes" in terminal.getvalue() and log.getvalue() == ""

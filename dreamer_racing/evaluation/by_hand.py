@@ -1,0 +1,169 @@
+"""A person at the sticks: a policy of one drone that acts as a keyboard, a gamepad or a script says.
+
+The sticks ask for body rates and thrust, as a radio does that flies acro (mode 2): a centred stick asks for no rate,
+and a centred throttle for the thrust that holds a level drone.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+KINDS = ("keyboard", "gamepad")
+WINDOW = 512  # pixels, side of the window
+KEYBOARD_SHARE = 0.35  # of the largest rates and thrust, at a key held down: keys know of no half way
+EASE = 0.25  # share of the way to where the keys are that the sticks go in a control step
+DEAD_ZONE = 0.06  # of a gamepad's stick
+GAMEPAD_AXES = {"yaw": 0, "throttle": 1, "roll": 2, "pitch": 3}  # mode 2; SDL counts up and forward as −1
+
+
+class StickPositions(NamedTuple):
+    """Where the sticks are, each in [−1, 1]."""
+
+    roll: float = 0.0
+    """+ to the right."""
+    pitch: float = 0.0
+    """+ forward, nose down."""
+    yaw: float = 0.0
+    """+ to the right."""
+    throttle: float = 0.0
+    """0 holds a level drone, ±1 is all and nothing."""
+
+
+Sticks = Callable[[np.ndarray], StickPositions]
+"""Shows an on-board image (H, W, 3) uint8 to the one who flies, and says where the sticks are."""
+
+
+class FlightAbandonedError(Exception):
+    """The one who flies has closed the window or pressed escape."""
+
+
+class HandPolicy(TensorDictModuleBase):
+    """Acts as sticks say: reads `pixels` of one drone, writes `action`.
+
+    Args:
+        sticks: who flies.
+        hover_action: collective thrust, in units of the action, that holds a level drone.
+
+    Example:
+        >>> policy = HandPolicy(lambda image: StickPositions(pitch=0.5), hover_action=-0.4)
+        >>> policy(TensorDict({"pixels": torch.zeros(1, 64, 64, 3, dtype=torch.uint8)}, [1]))["action"]
+        tensor([[-0.4000,  0.0000,  0.5000,  0.0000]])
+    """
+
+    def __init__(self, sticks: Sticks, hover_action: float) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["pixels"], ["action"]
+        self._sticks, self._hover = sticks, hover_action
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action of the coming control step."""
+        at = self._sticks(tensordict["pixels"][0].cpu().numpy())
+        room = 1.0 - self._hover if at.throttle > 0 else 1.0 + self._hover
+        action = [self._hover + room * at.throttle, at.roll, at.pitch, -at.yaw]
+        return tensordict.set("action", torch.tensor([action], device=tensordict.device).clamp(-1.0, 1.0))
+
+
+def keys_to_sticks(held: Mapping[str, bool], before: StickPositions) -> StickPositions:
+    """Move the sticks towards what keys ask for.
+
+    Args:
+        held: whether ``left``, ``right``, ``up``, ``down`` (roll and pitch), ``a``, ``d`` (yaw), ``w``, ``s``
+            (throttle) are held down; those that are missing are not.
+        before: where the sticks were a control step ago.
+    """
+    pairs = (("right", "left"), ("up", "down"), ("d", "a"), ("w", "s"))
+    wanted = [KEYBOARD_SHARE * (bool(held.get(more)) - bool(held.get(less))) for more, less in pairs]
+    return StickPositions(*(old + EASE * (new - old) for old, new in zip(before, wanted, strict=True)))
+
+
+def axes_to_sticks(axes: Mapping[str, float]) -> StickPositions:
+    """Read a gamepad: up and forward are negative there; what is near the centre is the centre."""
+    live = {name: 0.0 if abs(value) < DEAD_ZONE else value for name, value in axes.items()}
+    return StickPositions(live["roll"], -live["pitch"], live["yaw"], -live["throttle"])
+
+
+def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse to fly by hand where nobody could.
+
+    Args:
+        kind: ``keyboard`` or ``gamepad``.
+        environment: the environment variables to judge.
+
+    Raises:
+        ValueError: pygame is not installed, or there is no display; the message says what would help.
+    """
+    if importlib.util.find_spec("pygame") is None:
+        raise ValueError(f"pilot={kind} needs the package pygame: pip install 'dreamer_racing[play]'.")
+    displays = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
+        raise ValueError(
+            f"pilot={kind} needs a display to show what the camera sees, and neither DISPLAY nor WAYLAND_DISPLAY is "
+            "set: start it on a desktop, or over ssh -X. pilot=scripted flies without."
+        )
+
+
+class PygameSticks:
+    """A window with the on-board image, and a keyboard or a gamepad; keeps a flight at the speed of time.
+
+    Arrows: roll and pitch. A and D: yaw. W and S: throttle. Escape ends the flight.
+
+    Args:
+        kind: ``keyboard`` or ``gamepad``.
+        control_dt: s, duration of a control step.
+
+    Raises:
+        ValueError: see `check_by_hand`; or there is no gamepad.
+    """
+
+    def __init__(self, kind: str, control_dt: float) -> None:
+        check_by_hand(kind)
+        import pygame
+
+        self._pygame: Any = pygame
+        self._control_dt, self._due = control_dt, time.monotonic()
+        self._at = StickPositions()
+        pygame.init()
+        self._gamepad = None
+        if kind == "gamepad":
+            if not pygame.joystick.get_count():
+                pygame.quit()
+                raise ValueError("pilot=gamepad: there is no gamepad. Plug one in, or take pilot=keyboard.")
+            self._gamepad = pygame.joystick.Joystick(0)
+        self._window = pygame.display.set_mode((WINDOW, WINDOW))
+        pygame.display.set_caption("dreamer_racing: arrows, W A S D; escape ends")
+
+    def __call__(self, image: np.ndarray) -> StickPositions:
+        """Show an image, wait until the control step is due, and read the sticks.
+
+        Raises:
+            FlightAbandonedError: the window was closed, or escape pressed.
+        """
+        pygame = self._pygame
+        surface = pygame.surfarray.make_surface(image.swapaxes(0, 1))
+        self._window.blit(pygame.transform.scale(surface, (WINDOW, WINDOW)), (0, 0))
+        pygame.display.flip()
+        self._due = max(self._due + self._control_dt, time.monotonic())
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
+                raise FlightAbandonedError
+        if self._gamepad is not None:
+            return axes_to_sticks({name: self._gamepad.get_axis(axis) for name, axis in GAMEPAD_AXES.items()})
+        held = pygame.key.get_pressed()
+        names = ("left", "right", "up", "down", "a", "d", "w", "s")
+        self._at = keys_to_sticks({name: held[pygame.key.key_code(name)] for name in names}, self._at)
+        return self._at
+
+    def close(self) -> None:
+        """Close the window."""
+        self._pygame.quit()

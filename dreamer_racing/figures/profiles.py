@@ -1,0 +1,160 @@
+"""Speed and altitude along a flight: what a map from above cannot show. A drone above a gate is not through it.
+
+Shapes: K control steps of an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.evaluation.trajectory import Trajectory
+from dreamer_racing.figures.drawing import CRASH, FAINT, GATE_COLOR, MUTED, SPEED_COLORS, dress
+
+PROFILE_AXES = {"distance": "distance flown (m)", "time": "time (s)"}
+FRAME: dict[str, Any] = {"linewidth": 3.5, "solid_capstyle": "butt", "zorder": 2}
+MISSED_COLOR = "#adb5bd"  # of a gate that was crossed on the map, and not passed
+HEADROOM = 0.3  # m above the highest thing drawn
+
+
+class Crossing(NamedTuple):
+    """Where a flight, seen from above, crosses the bar of a race gate."""
+
+    row: float
+    """Of the trajectory, between two rows: 0.5 is halfway from the first to the second."""
+    gate: int
+    """Its index on the track."""
+    passed: bool
+    """Whether the race counted it: through the opening, in its turn, forwards."""
+
+
+def crossings(track: Track, trajectory: Trajectory) -> list[Crossing]:
+    """Find where a flight crosses the gates' bars on the map, at any height, in the order of flight."""
+    found = []
+    target = trajectory.target_gate.numpy()
+    for index, gate in enumerate(track.gates):
+        rows = _rows_of_crossing(gate, track.shape.outer / 2, trajectory.position.numpy())
+        found += [Crossing(row, index, bool(target[int(row)] == index != target[int(row) + 1])) for row in rows]
+    return sorted(found)
+
+
+def _rows_of_crossing(gate: Gate, reach: float, position: np.ndarray) -> list[float]:
+    """Find between which rows of (K + 1, 3) a gate's plane is crossed, within its reach to either side, m."""
+    offset = position[:, :2] - np.array(gate.position[:2])
+    along, side = offset @ np.array(gate.forward[:2]), offset @ np.array(gate.left[:2])  # (K + 1,)
+    steps = np.flatnonzero((along[:-1] < 0) != (along[1:] < 0))
+    share = along[steps] / (along[steps] - along[steps + 1])
+    across = side[steps] + share * (side[steps + 1] - side[steps])
+    return [float(row) for row in (steps + share)[np.abs(across) <= reach]]
+
+
+def profile_axis(trajectory: Trajectory, over: str) -> np.ndarray:
+    """Where the rows of a trajectory lie on the axis of a profile, (K + 1,), m or s.
+
+    Args:
+        trajectory: the flight.
+        over: ``distance`` or ``time``.
+    """
+    if over == "time":
+        return np.arange(len(trajectory.position)) * trajectory.control_dt
+    steps = np.nan_to_num(np.linalg.norm(np.diff(trajectory.position.numpy(), axis=0), axis=1))  # (K,) m
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def draw_speed(axes: Axes, trajectory: Trajectory, speed: Normalize, over: str = "distance") -> None:
+    """Draw the speed, coloured by itself, and a numbered line at every gate passed.
+
+    Args:
+        axes: where.
+        trajectory: the flight.
+        speed: scale of the colours, and of the axis.
+        over: the other axis: ``distance`` flown (m) or ``time`` (s).
+    """
+    along = profile_axis(trajectory, over)
+    _draw_profile(axes, trajectory, along, trajectory.speed.numpy(), speed)
+    _number_passes(axes, trajectory, along)
+    axes.set(ylim=(0.0, 1.05 * float(speed.vmax or 1.0)), xlabel=PROFILE_AXES[over], ylabel="speed (m/s)")
+
+
+def draw_altitude(
+    axes: Axes, track: Track, trajectory: Trajectory, speed: Normalize, over: str = "distance", numbers: bool = True
+) -> None:
+    """Draw the altitude, coloured by speed, and the frame of every gate where the map shows its bar crossed.
+
+    The gap of a frame is the opening. Frames of gates that did not count are grey.
+
+    Args:
+        axes: where.
+        track: whose gates.
+        trajectory: the flight.
+        speed: scale of the colours.
+        over: the other axis: ``distance`` flown (m) or ``time`` (s).
+        numbers: whether gates passed are numbered above.
+    """
+    along = profile_axis(trajectory, over)
+    height = trajectory.position[:, 2].numpy()
+    _draw_profile(axes, trajectory, along, height, speed)
+    for row, index, passed in crossings(track, trajectory):
+        _draw_frame(axes, track, index, float(np.interp(row, np.arange(len(along)), along)), passed)
+    if numbers:
+        _number_passes(axes, trajectory, along)
+    top = max(gate.position[2] + track.shape.outer / 2 for gate in track.gates)
+    axes.axhline(0.0, color=MUTED, linewidth=1.0, zorder=1)
+    axes.axhline(track.bounds_high[2], color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)), zorder=1)
+    axes.set(ylim=(min(0.0, float(np.nanmin(height))), max(top, float(np.nanmax(height))) + HEADROOM))
+    axes.set(xlabel=PROFILE_AXES[over], ylabel="altitude (m)")
+
+
+def altitude_legend(flights: Sequence[tuple[Track, Trajectory]]) -> list[Line2D]:
+    """Make the entries of the legend that profiles of altitude need beside `flight_legend`."""
+    passed = {crossing.passed for flight in flights for crossing in crossings(*flight)}
+    handles = []
+    if True in passed:
+        handles.append(Line2D([], [], color=GATE_COLOR, label="frame, passed", **_IN_LEGEND))
+    if False in passed:
+        handles.append(Line2D([], [], color=MISSED_COLOR, label="above, below or out of turn", **_IN_LEGEND))
+    return handles
+
+
+_IN_LEGEND: dict[str, Any] = {"linestyle": "", "marker": "|", "markersize": 11, "markeredgewidth": 3.5}
+
+
+def _draw_frame(axes: Axes, track: Track, index: int, place: float, passed: bool) -> None:
+    """Draw the two beams of a gate's frame, above and below its opening."""
+    middle, shape = track.gates[index].position[2], track.shape
+    color = GATE_COLOR if passed else MISSED_COLOR
+    for sign in (-1, 1):
+        ends = (middle + sign * shape.opening / 2, middle + sign * shape.outer / 2)
+        axes.plot((place, place), ends, color=color, **FRAME)
+    if not passed:
+        at = (place, middle + shape.outer / 2)
+        axes.annotate(f"({index + 1})", at, (0, 1), textcoords="offset points", ha="center", fontsize=7, color=MUTED)
+
+
+def _draw_profile(axes: Axes, trajectory: Trajectory, along: np.ndarray, values: np.ndarray, speed: Normalize) -> None:
+    """Draw values (K + 1,) along a flight, coloured by speed, and a crash at their end."""
+    points = np.stack((along, values), axis=1)
+    lines = LineCollection(list(np.stack((points[:-1], points[1:]), axis=1)), cmap=SPEED_COLORS, norm=speed)
+    lines.set(array=trajectory.speed[1:].numpy(), linewidth=2.2, capstyle="round", zorder=4)
+    axes.add_collection(lines)
+    if trajectory.crashed and np.isfinite(points[-1]).all():
+        axes.plot(*points[-1], **CRASH, zorder=3, clip_on=False)
+    axes.set_xlim(0.0, max(along[-1], 1e-6))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    dress(axes)
+
+
+def _number_passes(axes: Axes, trajectory: Trajectory, along: np.ndarray) -> None:
+    """Draw a numbered line at every gate passed."""
+    for row in np.flatnonzero(np.diff(trajectory.target_gate)):
+        place, number = along[row + 1], str(int(trajectory.target_gate[row]) + 1)
+        axes.axvline(place, color=FAINT, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
+        axes.text(place, 1.02, number, transform=axes.get_xaxis_transform(), ha="center", fontsize=7, color=MUTED)

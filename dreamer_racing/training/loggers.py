@@ -1,0 +1,219 @@
+"""Loggers beside `metrics.csv`: TorchRL's own, that also take a run's configuration, pictures and films.
+
+Each is a `torchrl.record.loggers.Logger` and a `MediaLogger`; `make_loggers` chooses them by name. Nothing leaves the
+machine unless ``wandb="online"``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import secrets
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import imageio.v2 as imageio
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+from torchrl.record.loggers import Logger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
+from torchrl.record.loggers.wandb import WandbLogger
+
+from dreamer_racing.figures.film import write_gif
+from dreamer_racing.training.directory import RunDirectory
+
+WANDB_MODES = ("none", "offline", "online")
+GIF_FRAMES = 100  # of a film in TensorBoard, at most
+GIF_WIDTH = 320  # pixels, at most
+OUTCOMES = ("evaluation/success_rate", "evaluation/gates_per_episode", "evaluation/return_mean", "episode/return")
+"""Metrics by which TensorBoard's table of hyperparameters compares runs."""
+
+
+@runtime_checkable
+class MediaLogger(Protocol):
+    """What a run asks of a logger beside scalars."""
+
+    def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
+        """Take a run's settings by dotted name, and the same as YAML."""
+        ...
+
+    def log_picture(self, name: str, file: Path, env_steps: int) -> None:
+        """Take a PNG file."""
+        ...
+
+    def log_film(self, name: str, file: Path, env_steps: int) -> None:
+        """Take an mp4 file."""
+        ...
+
+
+def make_loggers(
+    run_dir: str | Path,
+    tensorboard: bool = False,
+    wandb: Literal["none", "offline", "online"] = "none",
+    project: str = "dreamer_racing",
+    resume_env_steps: int | None = None,
+) -> list[RunLogger]:
+    """Make the loggers of a run.
+
+    Args:
+        run_dir: of the run; whatever is written lies in it.
+        tensorboard: whether to write to ``run_dir/tensorboard``.
+        wandb: whether to write to ``run_dir/wandb``, and to the server too.
+        project: of W&B.
+        resume_env_steps: those of the checkpoint this run continues; None if it is new.
+
+    Raises:
+        ValueError: `check_loggers` has something against it.
+    """
+    check_loggers(wandb)
+    loggers: list[RunLogger] = [TensorboardRunLogger(run_dir, resume_env_steps)] if tensorboard else []
+    if wandb != "none":
+        loggers.append(WandbRunLogger(run_dir, project, wandb == "offline", resumed=resume_env_steps is not None))
+    return loggers
+
+
+def check_loggers(wandb: str) -> None:
+    """Refuse a mode of W&B that there is not, or that needs what is not installed.
+
+    Raises:
+        ValueError: so it is.
+    """
+    if wandb not in WANDB_MODES:
+        raise ValueError(f"logger.wandb={wandb}: there are {', '.join(WANDB_MODES)}.")
+    if wandb != "none" and importlib.util.find_spec("wandb") is None:
+        raise ValueError(
+            f"logger.wandb={wandb} needs the package wandb: pip install 'dreamer_racing[wandb]', or logger.wandb=none."
+        )
+
+
+class TensorboardRunLogger(TensorboardLogger):
+    """TensorBoard files of a run; what they hold beyond a run's resumption is not shown any more.
+
+    Args:
+        run_dir: of the run.
+        resume_env_steps: those of the checkpoint this run continues; None if it is new.
+    """
+
+    def __init__(self, run_dir: str | Path, resume_env_steps: int | None = None) -> None:
+        self._resume_env_steps = resume_env_steps
+        super().__init__(exp_name="tensorboard", log_dir=str(run_dir))
+
+    def _create_experiment(self) -> SummaryWriter:
+        purge_step = None if self._resume_env_steps is None else self._resume_env_steps + 1
+        return SummaryWriter(log_dir=str(Path(self.log_dir) / self.exp_name), purge_step=purge_step)
+
+    def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
+        """Show the configuration as text, and the settings in the table of hyperparameters."""
+        self.experiment.add_text("configuration", f"```yaml\n{text}\n```", self._resume_env_steps or 0)
+        self.log_hparams(dict(settings))
+
+    def log_hparams(self, cfg: Any) -> None:
+        """Enter the settings of this run; `SummaryWriter.add_hparams` would make a run of its own of each start."""
+        from torch.utils.tensorboard.summary import hparams
+
+        plain = (int, float, str)  # of a bool, TensorBoard would make a number
+        known = {name: value if type(value) in plain else json.dumps(value, default=str) for name, value in cfg.items()}
+        for summary in hparams(known, dict.fromkeys(OUTCOMES, 0.0)):
+            self.experiment.file_writer.add_summary(summary)
+
+    def log_picture(self, name: str, file: Path, env_steps: int) -> None:
+        """Show a PNG file as it is."""
+        self._log_encoded(name, file.read_bytes(), env_steps)
+
+    def log_film(self, name: str, file: Path, env_steps: int) -> None:
+        """Show a film as a GIF, of no more frames and pixels than one looks at."""
+        frames, fps = read_film(file, GIF_FRAMES, GIF_WIDTH)
+        gif = file.with_name(f".{file.stem}.gif")
+        write_gif(gif, frames, fps)
+        try:
+            self._log_encoded(name, gif.read_bytes(), env_steps)
+        finally:
+            gif.unlink()
+
+    def _log_encoded(self, name: str, image: bytes, env_steps: int) -> None:
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        shown = Summary.Value(tag=name, image=Summary.Image(colorspace=3, encoded_image_string=image))
+        self.experiment.file_writer.add_summary(Summary(value=[shown]), env_steps)
+
+
+class WandbRunLogger(WandbLogger):
+    """A run of Weights & Biases, which a resumed run continues.
+
+    Args:
+        run_dir: of the run; its files and its id lie in ``run_dir/wandb``.
+        project: of W&B.
+        offline: whether nothing goes to the server; `wandb sync` sends it later.
+        resumed: whether the run continues: then it has the id that it began with, if it had one.
+    """
+
+    def __init__(self, run_dir: str | Path, project: str, offline: bool, resumed: bool = False) -> None:
+        place = RunDirectory(Path(run_dir)).wandb_run
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if not (resumed and place.exists()):
+            place.write_text(json.dumps({"id": secrets.token_hex(4)}) + "\n", encoding="utf-8")
+        super().__init__(
+            exp_name=Path(run_dir).resolve().name,
+            offline=offline,
+            log_dir=str(run_dir),
+            id=json.loads(place.read_text(encoding="utf-8"))["id"],
+            project=project,
+            log_env_packages=False,
+            mode="offline" if offline else "online",
+        )
+
+    def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
+        """Take the settings."""
+        self.log_hparams(dict(settings))
+
+    def log_picture(self, name: str, file: Path, env_steps: int) -> None:
+        """Take a PNG file as it is."""
+        import wandb
+
+        self.log_metrics({name: wandb.Image(str(file))}, step=env_steps)
+
+    def log_film(self, name: str, file: Path, env_steps: int) -> None:
+        """Take an mp4 file as it is."""
+        import wandb
+
+        self.log_metrics({name: wandb.Video(str(file), format="mp4")}, step=env_steps)
+
+
+RunLogger = TensorboardRunLogger | WandbRunLogger
+
+
+def log_evaluation(loggers: Sequence[Logger], directory: RunDirectory, env_steps: int) -> None:
+    """Give loggers what evaluations at these env_steps have left to look at.
+
+    Args:
+        loggers: those among them that are no `MediaLogger` are left out.
+        directory: of the run.
+        env_steps: of the evaluation.
+    """
+    stem = f"{env_steps:09d}"
+    for sink in loggers:
+        if isinstance(sink, MediaLogger):
+            for file in sorted(directory.plots.glob(f"{stem}*.png")):
+                sink.log_picture(f"evaluation{file.stem.removeprefix(stem)}/plot", file, env_steps)
+            for file in sorted(directory.videos.glob(f"{stem}*.mp4")):
+                sink.log_film(f"evaluation{file.stem.removeprefix(stem)}/film", file, env_steps)
+
+
+def read_film(file: Path, max_frames: int, max_width: int) -> tuple[np.ndarray, float]:
+    """Read a film, leaving out frames and pixels.
+
+    Args:
+        file: mp4.
+        max_frames: T at most: every second is kept, or every third, and so on.
+        max_width: pixels at most, likewise.
+
+    Returns:
+        (T, H, W, 3) uint8, and the frames per second at which it plays as fast as the film.
+    """
+    reader: Any = imageio.get_reader(file, format="FFMPEG")
+    with reader:
+        fps = float(reader.get_meta_data()["fps"])
+        frames = [np.asarray(frame) for frame in reader]
+    every, coarser = -(-len(frames) // max_frames), -(-frames[0].shape[1] // max_width)
+    return np.stack([frame[::coarser, ::coarser] for frame in frames[::every]]), fps / every
