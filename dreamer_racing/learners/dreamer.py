@@ -225,6 +225,7 @@ class DreamerLearner:
         *,
         rates: float | None = None,
         world_model_rate: float = 1.0,
+        kl_target: float | None = None,
         min_std: float | None = None,
         max_std: float | None = None,
         **numbers: float,
@@ -236,6 +237,7 @@ class DreamerLearner:
         Args:
             rates: Share of the learning rates that the learner was made with, of all optimisers.
             world_model_rate: Share of that share, of the world model's alone; given together with ``rates``.
+            kl_target: Of `ActorPPOConfig`.
             min_std: Smallest standard deviation of actions, of the networks' own.
             max_std: Largest.
             numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
@@ -249,6 +251,8 @@ class DreamerLearner:
             for group, rate in zip(self._groups, self._rates, strict=True):
                 group["lr"] = rate * rates
             self._groups[0]["lr"] *= world_model_rate
+        if kl_target is not None:
+            numbers["kl_target"] = kl_target
         for name, value in numbers.items():
             self._set_in_losses(name, value)
         for name, bound in (("min_std", min_std), ("max_std", max_std)):

@@ -71,6 +71,7 @@ class ClippedActorLoss(ActorLoss):
     def __init__(self, *args: Any, ppo: ActorPPOConfig | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.ppo = ppo or ActorPPOConfig()
+        self.kl_target = self.ppo.kl_target  # may be on a schedule, `DreamerLearner.adjust`
         self.register_buffer("pace", torch.ones(1))  # share of the learning rate
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
@@ -106,7 +107,7 @@ class ClippedActorLoss(ActorLoss):
             learning rate) and ``gradient_norm/actor`` of what was done; scalars. A step whose gradient is not finite is
             not made.
         """
-        if self.ppo.kl_target is None:
+        if self.kl_target is None:
             self.pace.fill_(1.0)
         with self._paced():
             clip = self.ppo.advantage_clip
@@ -144,7 +145,7 @@ class ClippedActorLoss(ActorLoss):
 
     def _set_pace(self, kl: Tensor) -> None:
         """Go slower after a divergence well above the target, and faster, up to the full rate, well below it."""
-        target = self.ppo.kl_target
+        target = self.kl_target
         if target is None:
             return
         if not kl <= KL_TOLERANCE * target:

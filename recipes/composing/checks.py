@@ -213,6 +213,7 @@ def check_schedule(config: DreamerConfig) -> None:
         "learning_rates": POSITIVE,
         "world_model_rate": POSITIVE,
         **{name: allowed_values(config.loss, name) for name in LOSS_RAMPS},
+        "kl_target": allowed_values(config.loss.ppo, "kl_target"),
         "start_on_line": allowed_values(config.env, "start_on_line"),
     }
     for name, allowed in targets.items():
@@ -227,7 +228,7 @@ def check_schedule(config: DreamerConfig) -> None:
     check_deviations(config)
     if config.schedule.wait_for_model is not None:
         check_wait(config)
-    check_kl(config.loss.ppo)
+    check_kl(config.loss.ppo, config.schedule.kl_target.to)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
@@ -251,17 +252,25 @@ def check_deviations(config: DreamerConfig) -> None:
         raise ValueError(f"{low}={least[low]} must be below {high}={most[high]}: the bounds of the actions' deviation.")
 
 
-def check_kl(ppo: ActorPPOConfig) -> None:
-    """Refuse a target for the divergence that a stop below it would keep from ever being reached.
+def check_kl(ppo: ActorPPOConfig, to: float | None) -> None:
+    """Refuse a target for the divergence that a stop below it would keep from ever being reached, also where it leads.
 
     Raises:
         ValueError: the message names both settings.
     """
-    if ppo.kl_target is not None and ppo.kl_stop < KL_TOLERANCE * ppo.kl_target:
-        raise ValueError(
-            f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before loss.ppo.kl_target={ppo.kl_target} is seen to be "
-            f"exceeded: the stop must be at least {KL_TOLERANCE} times the target."
-        )
+    if ppo.kl_target is None:
+        if to is not None:
+            raise ValueError(
+                f"schedule.kl_target.to={to} begins at loss.ppo.kl_target=null: give that a number, or leave the ramp "
+                "out with schedule.kl_target.to=null."
+            )
+        return
+    for name, target in (("loss.ppo.kl_target", ppo.kl_target), ("schedule.kl_target.to", to)):
+        if target is not None and ppo.kl_stop < KL_TOLERANCE * target:
+            raise ValueError(
+                f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before {name}={target} is seen to be exceeded: the "
+                f"stop must be at least {KL_TOLERANCE} times the target."
+            )
 
 
 def check_wait(config: DreamerConfig) -> None:

@@ -33,6 +33,8 @@ def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, flo
     schedule, loss = config.schedule, config.loss
     of_losses = {name: getattr(schedule, name).at(getattr(loss, name), times) for name in LOSS_RAMPS}
     rates = {"rates": schedule.learning_rates, "world_model_rate": schedule.world_model_rate}
+    if (kl_target := loss.ppo.kl_target) is not None:
+        of_losses["kl_target"] = schedule.kl_target.at(kl_target, times)
     return {**{name: ramp.at(1.0, times) for name, ramp in rates.items()}, **of_losses}
 
 

@@ -149,6 +149,7 @@ class ScheduleConfig:
     world_model_rate: Ramp = field(default_factory=Ramp)  # `to`: share of that share, of the world model's alone
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
+    kl_target: Ramp = field(default_factory=Ramp)  # loss.ppo.kl_target
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     max_std: Ramp = field(default_factory=Ramp)  # loss.max_std
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
