@@ -139,6 +139,17 @@ def test_a_divergence_about_its_target_changes_no_rate():
     assert loss.pace.item() == pytest.approx(0.01)
 
 
+def test_a_target_on_a_schedule_is_the_one_that_is_steered_to():
+    learner = make_learner(ppo=replace(PPO, updates=1, kl_stop=1e9, kl_target=0.01))
+    loss = learner.losses["actor"]
+    for target, pace in ((0.01, 1.0), (0.001, 0.8)):
+        learner.adjust(kl_target=target)
+        loss._set_pace(torch.tensor(0.01))
+        assert loss.pace.item() == pytest.approx(pace)
+    learner.adjust()
+    assert loss.kl_target == 0.001
+
+
 def test_the_pace_is_that_of_the_steps():
     """Adam's first step moves each weight by the learning rate, whatever the gradient."""
     moved = []

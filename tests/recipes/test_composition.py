@@ -168,6 +168,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5)
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
     learner.adjust(**end)
+    assert "kl_target" not in end  # there is none to begin at
     assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
 
 

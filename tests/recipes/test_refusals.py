@@ -77,6 +77,12 @@ REFUSED = [
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),
     (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends improvements before loss.ppo.kl_target=0.03"]),
+    (
+        ["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0.03"],
+        ["loss.ppo.kl_stop=0.03 ends improvements before schedule.kl_target.to=0.03"],
+    ),
+    (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 begins at loss.ppo.kl_target=null"]),
+    (["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0"], ["schedule.kl_target.to=0.0: must be above 0"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
     (["loss.min_std=0.3", "schedule.max_std.to=0.15"], ["loss.min_std=0.3 must be below schedule.max_std.to=0.15"]),
