@@ -1,0 +1,103 @@
+"""Flights of agents in real time against the plant in a process of its own: how many finish, how fast, how late.
+
+    python benchmarks/flights.py --actors circle kidney figure8 --flights 10 --json flights.json
+    python benchmarks/flights.py --actors exports/paper_large --disarmed 15 --plant track=circle preset=easy
+
+Each flight is what a person would type in two terminals, `recipes/plant.py` and `recipes/hil.py`, three laps long, with
+a seed of its own. By default poses are late by up to 2 ms, 1 % of them are lost, and they have 1 mm and 0.17° of noise.
+A flight counts as finished when every gate of its laps was passed. With --disarmed the loop sees, chooses and sends for
+so many seconds and never arms, which measures actors that cannot fly. Keep both cores idle meanwhile.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from measuring import print_table, write_json
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+PLANT = ["preset=easy", "jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
+COLUMNS = ("actor", "seed", "finished", "gates", "laps_s", "speed_max", "latency_p99_ms", "jitter_p99_ms", "overruns")
+LONGEST = 120  # s that a flight may take, start of both programs included
+
+
+def main() -> None:
+    """Fly every actor so often, one flight after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--actors", nargs="+", required=True, help="agents that ship, paths of exports, or pilot")
+    parser.add_argument("--flights", type=int, default=1, help="of each, with seeds from 1 on")
+    parser.add_argument("--laps", type=int, default=3)
+    parser.add_argument("--disarmed", type=float, metavar="SECONDS", help="never arm, and end after so long")
+    parser.add_argument("--plant", nargs="*", default=PLANT, help="options of recipes/plant.py")
+    parser.add_argument("--hil", nargs="*", default=[], help="further options of recipes/hil.py")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    records = []
+    for actor in arguments.actors:
+        for seed in range(1, arguments.flights + 1):
+            with tempfile.TemporaryDirectory() as folder:
+                records.append(fly(actor, seed, arguments, Path(folder)))
+            print_table(records[-1:], COLUMNS)
+            write_json(records, arguments.json)
+
+
+def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Fly once; return what came of it.
+
+    Raises:
+        RuntimeError: No flight came about; the message is the loop's own.
+    """
+    plant = [*arguments.plant, f"seed={seed}"]
+    if not any(option.startswith("track=") for option in plant):
+        plant.append(f"track={Path(actor).name}")
+    hil = [f"actor={actor}", f"run_dir={folder}", *arguments.hil]
+    if arguments.disarmed:
+        hil += ["arm=false", f"patience={arguments.disarmed:g}"]
+    else:
+        hil += ["arm=true", f"laps={arguments.laps}", "patience=30", "duration=60"]
+    vehicle = subprocess.Popen([sys.executable, str(RECIPES / "plant.py"), *plant], stdout=subprocess.DEVNULL)
+    try:
+        loop = subprocess.run(
+            [sys.executable, str(RECIPES / "hil.py"), *hil],
+            capture_output=True,
+            text=True,
+            timeout=LONGEST,
+            check=False,
+        )
+    finally:
+        vehicle.send_signal(signal.SIGTERM)
+        vehicle.wait()
+    if not (folder / "statistics.json").exists():
+        raise RuntimeError(f"actor={actor}: {loop.stderr.strip() or loop.stdout.strip()}")
+    statistics = json.loads((folder / "statistics.json").read_text(encoding="utf-8"))
+    return {
+        "actor": actor,
+        "seed": seed,
+        "finished": not arguments.disarmed and loop.returncode == 0,
+        "gates": len(statistics["passes"]),
+        "laps_s": [round(lap, 3) for lap in statistics["laps"]],
+        "speed_max": None if arguments.disarmed else speed_max(folder),
+        "latency_p99_ms": statistics["loop"]["latency"]["p99_ms"],
+        "jitter_p99_ms": statistics["loop"]["jitter"]["p99_ms"],
+        "overruns": statistics["loop"]["overruns"],
+        "plant": plant,
+        "hil": hil,
+        "ended": statistics["ended"],
+        "loop": statistics["loop"],
+    }
+
+
+def speed_max(folder: Path) -> float:
+    """Return the highest speed of a recorded flight, m/s, as its report has it."""
+    subprocess.run([sys.executable, str(RECIPES / "hil.py"), f"report={folder}"], stdout=subprocess.DEVNULL, check=True)
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    return float(report["flown"]["speed_max"])
+
+
+if __name__ == "__main__":
+    main()
