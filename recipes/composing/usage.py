@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -31,7 +32,10 @@ def answer_help() -> None:
     """Print the help and leave, if the command line of a recipe asks for it."""
     program = Path(sys.argv[0])
     if program.resolve().parent == RECIPES and {"--help", "-h"} & set(sys.argv[1:]):
-        print("\n".join(usage(program.stem)))
+        try:
+            print("\n".join(usage(program.stem)), flush=True)
+        except BrokenPipeError:  # `| head` has what it wanted: what is left goes nowhere, also at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -34,6 +36,17 @@ def test_groups_are_the_recipes_own() -> None:
 def test_help_loads_no_torch(flag: str, tmp_path: Path) -> None:
     done = recipe("export", flag, cwd=tmp_path, before="import sys; sys.modules['torch'] = None")
     assert done.returncode == 0 and done.stdout.startswith("usage: python recipes/export.py"), done.stderr
+
+
+def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / "export.py"), "--help"],
+        stdout=writer, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False,
+    )  # fmt: skip
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_other_programs_keep_their_help(monkeypatch: pytest.MonkeyPatch) -> None:
