@@ -83,6 +83,11 @@ class TransportLink(ABC):
         if self.thrust is not None and self.thrust.voltage != voltage:
             self.thrust = replace(self.thrust, voltage=voltage)
 
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest command; for links whose commands differ in size."""
+        return len(self.encode(at_rest()))
+
     @abstractmethod
     def encode(self, command: Command) -> bytes:
         """Return the bytes that say a command: `at_rest`, or an armed one whose numbers are finite."""

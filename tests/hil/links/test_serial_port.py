@@ -79,6 +79,7 @@ def test_mavlink_over_a_serial_port(wire):
     common = pytest.importorskip("pymavlink.dialects.v20.common")
     far, path = wire
     link = make_link(LinkConfig("mavlink", device=path, thrust=THRUST))
+    assert len(read(far, len(link.send(at_rest()._replace(armed=True))))) > 0
     sent = link.send(at_rest())
     kinds = [message.get_type() for message in common.MAVLink(None).parse_buffer(read(far, len(sent)))]
     assert kinds == ["COMMAND_LONG", "SET_ATTITUDE_TARGET"]
