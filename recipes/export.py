@@ -29,6 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
@@ -137,6 +138,7 @@ def prepare(
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
         track=trained.track,
+        track_sha256=hash_track(load_track(worlds_of(trained)["track"])),
         preset=trained.env.preset,
     )
     return step, contract, flight

@@ -24,7 +24,7 @@ from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.figures.sim_to_real import plot_study
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
@@ -93,7 +93,10 @@ def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
         return config.track, partial(PilotFlyer, load_track(config.track), config.preset, config.rate)
     path = agent_path(config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
-    return config.track or contract["source"]["track"], partial(ActorFlyer, path)
+    track = config.track or contract["source"]["track"]
+    if note := check_contract(contract, load_track(track)):
+        print(f"note: {note}")
+    return track, partial(ActorFlyer, path)
 
 
 if __name__ == "__main__":

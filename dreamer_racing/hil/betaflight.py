@@ -150,6 +150,27 @@ def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
     return findings
 
 
+def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
+    """Refuse to fly with a flight controller whose settings are not those of an actor; return how many were compared.
+
+    Args:
+        path: The text that ``dump all`` or ``diff all`` gave.
+        contract: As `read_contract` returns it.
+        link: One of `LINKS`.
+
+    Raises:
+        ValueError: Settings differ or are missing, and the message has a line for each; or as `check_dump`.
+        OSError: There is no such file.
+    """
+    findings = check_dump(path.read_text(encoding="utf-8", errors="replace"), contract, link)
+    if wrong := [str(finding) for finding in findings if finding.status is not Status.OK]:
+        raise ValueError(
+            f"betaflight_dump={path}: {len(wrong)} of {len(findings)} settings of the flight controller are not those "
+            "of this actor:\n" + "\n".join(wrong)
+        )
+    return len(findings)
+
+
 def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tuple[int, int] | None]:
     """Return values by name, of the profiles selected at the end, and the firmware's release where it is said."""
     version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)

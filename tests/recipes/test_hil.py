@@ -18,12 +18,14 @@ from typing import Self
 import pytest
 
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.chain import describe_inputs, describe_outputs
 from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from tests.running_recipes import ROOT, recipe, recipe_module
 
 hil = recipe_module("hil")
+flights = recipe_module("composing.flight")
 
 
 def free_port() -> int:
@@ -96,6 +98,8 @@ def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
             "operator=timed enables by itself, and link=crsf may be",
         ),
         ({"actor": "pilot", "link_host": "10.0.0.5"}, "link_host=10.0.0.5 is another machine"),
+        ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
+        ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
     ],
@@ -110,13 +114,22 @@ def test_what_does_not_go_together_is_refused(changes, message):
     [
         ({"actor": "pilot"}, "track= is missing: actor=pilot has none of its own"),
         ({"actor": "pilot", "track": "moon"}, "moon"),
-        ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', and track=circle"),
+        ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', .* track=circle"),
         ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
         ({"actor": "nobody"}, "There is no file nobody"),
         ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
         ({"actor": "kidney", "link": "pigeon"}, "pigeon"),
         ({"actor": "kidney", "pose": "stars"}, "stars.*udp, mavlink, ros2"),
-        ({"actor": "kidney", "limits": hil.LimitsConfig(hold_after=0.2)}, "hold_after=0.2: must be below cut_after"),
+        ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),
+        (
+            {"actor": "kidney", "link": "crsf", "betaflight_dump": "x", "arm_channel": 5},
+            "betaflight_dump= is compared with arming by AUX1",
+        ),
+        ({"actor": "kidney", "link": "crsf", "betaflight_dump": "/nowhere"}, "/nowhere"),
+        (
+            {"actor": "kidney", "limits": flights.LimitsConfig(hold_after=0.2)},
+            "hold_after=0.2: must be below cut_after",
+        ),
     ],
 )
 def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, tmp_path):
@@ -144,6 +157,35 @@ def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
     assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
 
 
+def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_path):
+    """Before a port is opened: the device does not exist."""
+    path = tmp_path / "dump.txt"
+    drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
+    config = hil.HilConfig(
+        actor="kidney", arm=True, link="crsf", device="/dev/none", run_dir=str(tmp_path / "run"), **drone,
+        betaflight_dump=str(path),
+    )  # fmt: skip
+    contract = hil.make_flyer(config)[1]
+    kidney = load_track("kidney")
+    lines = [line for line in print_settings(contract, "crsf") if not line.startswith("#")]
+    path.write_text("\n".join(["# Betaflight / STM32F405 (S405) 4.5.1 Jul 28 2024 / 05:09:33 (77d01ba3b)", *lines]))
+    assert [note.partition(":")[0] for note in flights.check_flight(config, contract, kidney)] == ["flight controller"]
+    wrong = path.read_text().replace("yaw_srate = 23", "yaw_srate = 67").replace("set failsafe_delay = 5\n", "")
+    path.write_text(wrong)
+    with ExitStack() as opened, pytest.raises(ValueError, match="2 of .* settings of the flight controller") as refused:
+        hil.prepare(config, opened)
+    said = [" ".join(line.split()[:2]) for line in str(refused.value).splitlines()[1:]]
+    assert sorted(said) == ["differs set", "missing set"] and "found 67" in str(refused.value)
+    config.betaflight_dump = None
+    assert "its settings were not compared" in flights.check_flight(config, contract, kidney)[0]
+
+
+def test_a_limit_that_was_set_may_clip_and_is_said():
+    config = hil.HilConfig(actor="kidney", limits=flights.LimitsConfig(thrust_max=20.0))
+    notes = flights.check_flight(config, hil.make_flyer(config)[1], load_track("kidney"))
+    assert len(notes) == 1 and notes[0].startswith("limits.thrust_max=20 clips the actor, which asks for up to 26.")
+
+
 def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
     drone = {"mass": 0.6, "full_thrust": 9.0, "reference_voltage": 15.0, "voltage": 15.0}  # 11.25 V lift 5.1 N
     config = hil.HilConfig(actor="kidney", link="crsf", device="/dev/null", **drone)
@@ -153,7 +195,7 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
     config.voltage_tolerance = 0.15
     assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0
     config.link, config.voltage_tolerance = "sbus", 0.25  # hears nothing
-    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and hil.battery_config(config) is None
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and flights.battery_config(config) is None
 
 
 @pytest.mark.parametrize(
