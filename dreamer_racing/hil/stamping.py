@@ -6,6 +6,7 @@ is when a packet arrived; what is wanted is when it was measured.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from enum import Enum
 
@@ -45,24 +46,29 @@ class PoseClock:
         self.out_of_order = 0
         self._offsets: deque[float] = deque(maxlen=WINDOW)  # arrival less stamp, s
         self._newest: Received | None = None
+        self._latest = -math.inf  # s, of the poses so far
 
     def read(self, received: Received) -> Pose | None:
-        """Return the pose of a packet; None if it is not newer than the newest one.
+        """Return the pose of a packet; None if its number is not newer than the newest one's, or its time is older.
 
         Only after a silence may numbers and stamps begin anew: else a replayed packet would be taken for a new sender.
         """
         packet = received.packet
         if self._newest is not None:
             newer = 0 < (packet.sequence - self._newest.packet.sequence) % 2**32 < 2**31
-            if not newer and received.time - self._newest.time < SILENCE:
+            waited = received.time - self._newest.time
+            if waited < 0.0 or (not newer and waited < SILENCE):
                 self.out_of_order += 1
                 return None
             if packet.stamp < self._newest.packet.stamp:
                 self._offsets.clear()
         self._newest = received
-        return Pose(
-            self._measured(received), packet.position, packet.attitude, packet.linear_velocity, packet.body_rates
-        )
+        measured = self._measured(received)
+        if measured < self._latest:  # a packet that was delayed less tells more of the clocks; its pose is an older one
+            self.out_of_order += 1
+            return None
+        self._latest = measured
+        return Pose(measured, packet.position, packet.attitude, packet.linear_velocity, packet.body_rates)
 
     def _measured(self, received: Received) -> float:
         if self.stamping is Stamping.receive:

@@ -52,6 +52,26 @@ def test_old_and_repeated_packets_are_left_out_and_wrapping_is_no_step_back():
     assert clock.out_of_order == 2
 
 
+def test_what_arrived_earlier_than_the_newest_pose_is_left_out_whatever_its_number():
+    """A wall clock that is set ages what waits: 0.3 s here, in a packet that is newer by its number."""
+    for stamping in Stamping:
+        clock = PoseClock(stamping, 0.0)
+        packets = [received(0, 7.0, 10.0), received(1, 7.02, 9.72), received(2, 7.04, 10.04), received(3, 7.05, 10.05)]
+        assert times(clock, packets) == [10.0, None, 10.04, 10.05]
+        assert clock.out_of_order == 1
+
+
+def test_a_piece_that_holds_several_poses_gives_the_last_of_them():
+    assert times(PoseClock(Stamping.receive, 0.0), [received(k, 7.0 + 0.01 * k, 10.0) for k in range(3)]) == [10.0] * 3
+
+
+def test_poses_never_step_back_when_a_faster_packet_tells_more_of_the_clocks():
+    clock = PoseClock(Stamping.sender, 0.0)
+    packets = [received(0, 0.00, 100.050), received(1, 0.01, 100.051), received(2, 0.02, 100.020)]
+    packets += [received(3, 0.03, 100.052), received(4, 0.06, 100.070)]
+    assert times(clock, packets) == [100.05, 100.051, None, 100.052, 100.07]
+
+
 def test_a_sender_may_begin_anew_after_a_silence_only():
     clock = PoseClock(Stamping.sender, 0.0)
     assert times(clock, [received(5000, 900.0, 1.0), received(0, 3.0, 1.4)]) == [1.0, None]
