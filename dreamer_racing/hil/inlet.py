@@ -92,7 +92,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 class Arrivals:
-    """Puts the kernel's times of arrival, which are the wall clock's, on the monotonic clock, be the wall clock set or not.
+    """Puts the kernel's times of arrival, which are the wall clock's, on the monotonic clock; the first may be set.
 
     What arrived did so after the queue was last empty. A time that the wall clock of now puts before that, or into the
     future, was stamped before the clock was set: there the difference of the clocks as it was then counts.

@@ -65,16 +65,23 @@ class Motion:
 
     Attributes:
         newest: None before the first pose.
+        repeats: Whether the newest one stands exactly where the one before it did; a measurement never does.
+        changed_at: s, since when poses stand where the newest one does.
     """
 
     def __init__(self, limits: SafetyLimits) -> None:
         self.newest: Seen | None = None
+        self.repeats = False
+        self.changed_at = -math.inf
         self._limits = limits
         self._odometer = Odometer(limits.velocity_window)
 
     def take(self, seen: Seen) -> Findings:
         """Take in a pose that is newer than the last; find what no vehicle does from one to the other."""
         last, self.newest = self.newest, seen
+        self.repeats = last is not None and (seen.position, seen.attitude) == (last.position, last.attitude)
+        if not self.repeats:
+            self.changed_at = seen.time
         findings = {} if last is None else self._check_step(last, seen)
         mismatch = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
         if mismatch is not None and not mismatch <= self._limits.velocity_tolerance:

@@ -19,6 +19,7 @@ class Reason(enum.Enum):
     POSE_JUMP = "pose jump"
     ATTITUDE_JUMP = "attitude jump"
     POSE_CONTRADICTION = "pose contradiction"
+    POSE_FROZEN = "pose frozen"
     POSE_STALE = "pose stale"
     POSE_LOST = "pose lost"
     GEOFENCE = "geofence"

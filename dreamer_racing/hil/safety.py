@@ -160,7 +160,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._moved_at = self._now + self.limits.lift_off_time - self.limits.still_time
+            self._left_at = math.inf
 
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
@@ -190,7 +190,8 @@ class Safety:
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
         self._upright_at = self._wanted_at = self._armed_at = self._now
-        self._moved_at = math.inf  # when it was last seen to move in this flight; as if, until it must have
+        self._left_at = math.inf  # when it was first seen to move in this flight
+        self._moved_at = -math.inf  # when it was last
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
@@ -271,7 +272,22 @@ class Safety:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
         if seen.speed > limits.start_speed:
             self._moved_at = self._now
-        elif self.armed and self._now - self._moved_at > limits.still_time:
+            self._left_at = min(self._left_at, self._now)
+        return findings | self._check_stillness()
+
+    def _check_stillness(self) -> Findings:
+        """Find poses that are the same to the last digit while it flies, and what is held fast, or lies somewhere."""
+        limits, motion, now = self.limits, self._motion, self._now
+        if not self.armed:
+            return {}
+        findings: Findings = {}
+        frozen = now - max(motion.changed_at, self._left_at)
+        if motion.repeats and frozen > limits.cut_after:
+            findings[Reason.POSE_FROZEN] = (
+                f"poses have been the same for {frozen:.3g} s (allowed: {limits.cut_after:g})"
+            )
+        has_left = math.isfinite(self._left_at)
+        if now - self._moved_at > limits.still_time if has_left else now - self._armed_at > limits.lift_off_time:
             findings[Reason.STRANDED] = "it does not move: is it held fast, or lying somewhere?"
         return findings
 

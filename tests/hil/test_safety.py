@@ -297,9 +297,36 @@ def test_what_has_flown_and_lies_still_is_cut():
     flight = Flight(still_time=0.5).flying()
     assert flight.ticks(40).state is State.FLYING  # it has not left the start yet, and has 3 s for that
     flight.tick(pose={"velocity": (0.0, 0.3, 0.0)})
-    assert flight.ticks(16).state is State.FLYING  # as long as allowed
-    verdict = flight.tick()
+    measured = [{"position": (1.0, 0.0, 1e-9 * digit)} for digit in range(17)]  # no two measurements are the same
+    assert [flight.tick(pose=pose).state for pose in measured[:16]] == [State.FLYING] * 16  # as long as allowed
+    verdict = flight.tick(pose=measured[16])
     assert verdict.state is State.CUT and verdict.reasons == (Reason.STRANDED,)
+
+
+@pytest.mark.parametrize("claimed", [3.0, 0.0])
+def test_a_pose_that_is_repeated_as_if_new_while_it_flies_is_cut(claimed):
+    """At 3 m/s the odometer tolerates it and nothing seems to lie still; without velocities, it seems to lie still."""
+    flight = Flight(velocity_tolerance=4.0, jump_tolerance=1.0, cut_after=0.125).flying()
+    flight.tick(pose={"position": (1.1, 0.0, 0.0), "velocity": (3.0, 0.0, 0.0)})
+    frozen = {"pose": {"position": (1.2, 0.0, 0.0), "velocity": (claimed, 0.0, 0.0)}}
+    assert flight.ticks(5, **frozen).state is State.FLYING  # 4/32 s from the first to the last: as long as allowed
+    verdict = flight.tick(**frozen)
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.POSE_FROZEN,)
+    assert verdict.words == ("poses have been the same for 0.156 s (allowed: 0.125)",)
+
+
+@pytest.mark.parametrize("moved", [{"position": (1.2, 1e-9, 0.0)}, {"attitude": turned(2, 1e-3)}])
+def test_a_pose_of_which_anything_changes_is_not_frozen(moved):
+    flight = Flight(cut_after=0.125, jump_tolerance=1.0).flying()
+    flight.tick(pose={"velocity": (3.0, 0.0, 0.0)})
+    still = {"position": (1.2, 0.0, 0.0), "velocity": (3.0, 0.0, 0.0)}
+    for _ in range(10):
+        assert flight.ticks(4, pose=still).state is State.FLYING
+        assert flight.tick(pose=still | moved).state is State.FLYING
+
+
+def test_what_stands_on_the_ground_may_be_measured_the_same_again_and_again():
+    assert Flight(lift_off_time=3.0).flying().ticks(80).state is State.FLYING
 
 
 def test_tilt_counts_anew_after_being_upright():
