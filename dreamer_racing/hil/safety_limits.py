@@ -42,6 +42,7 @@ class SafetyLimits:
         tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still.
         overruns_max: overruns of the loop that may happen within `overrun_window`.
         overrun_window: s.
+        clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.
         speed_max: m/s; the shipped agents fly at up to 11.5 in simulation.
         jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
         turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
@@ -74,6 +75,7 @@ class SafetyLimits:
     tick_max: float = setting(0.200, _SECONDS)
     overruns_max: int = setting(3, Range(0, 1000))
     overrun_window: float = setting(1.0, Range(0, 60, open_below=True))
+    clock_drift_max: float = setting(200.0, Range(0, 1e5))
     speed_max: float = setting(15.0, _MOST)
     jump_tolerance: float = setting(0.1, _TOLERANCE)
     turn_rate_max: float = setting(15.0, _MOST)

@@ -7,16 +7,12 @@ is when a packet arrived; what is wanted is when it was measured.
 from __future__ import annotations
 
 import math
-from collections import deque
 from enum import Enum
 
 from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.pose import Received
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
-
-WINDOW = 200
-"""Packets over which the least delay is sought [choice]: a second at 200 Hz, in which clocks drift by some 20 µs."""
-
 
 SILENCE = 0.5
 """s without a packet after which a sender may begin anew, with lower numbers [choice]; the vehicle is cut by then."""
@@ -26,7 +22,7 @@ class Stamping(Enum):
     """What a pose's time is."""
 
     receive = "receive"  # when it arrived, less a fixed latency
-    sender = "sender"  # the sender's stamp, put on our clock by the least delay of the newest packets
+    sender = "sender"  # the sender's stamp, put on our clock by the least delay so far
 
 
 class PoseClock:
@@ -35,16 +31,19 @@ class PoseClock:
     Args:
         stamping: How.
         latency: s, of the least delayed packet from measurement to arrival: what no stamp shows.
+        drift_max: ppm, by which the sender's clock may go slower than ours. The least delay is forgotten no faster
+            than this accounts for: what grows faster is delay, and poses become that much older.
 
     Attributes:
         out_of_order: Packets so far that were older than one before, or the same again; they are left out.
     """
 
-    def __init__(self, stamping: Stamping, latency: float) -> None:
+    def __init__(self, stamping: Stamping, latency: float, drift_max: float = SafetyLimits.clock_drift_max) -> None:
         self.stamping = stamping
         self.latency = latency
         self.out_of_order = 0
-        self._offsets: deque[float] = deque(maxlen=WINDOW)  # arrival less stamp, s
+        self._drift_max = 1e-6 * drift_max
+        self._offset = math.inf  # s, arrival less stamp of the least delayed packet
         self._newest: Received | None = None
         self._latest = -math.inf  # s, of the poses so far
 
@@ -60,8 +59,9 @@ class PoseClock:
             if waited < 0.0 or (not newer and waited < SILENCE):
                 self.out_of_order += 1
                 return None
-            if packet.stamp < self._newest.packet.stamp:
-                self._offsets.clear()
+            if waited >= SILENCE or packet.stamp < self._newest.packet.stamp:
+                self._offset = math.inf  # it may be another clock
+            self._offset += self._drift_max * waited
         self._newest = received
         measured = self._measured(received)
         if measured < self._latest:  # a packet that was delayed less tells more of the clocks; its pose is an older one
@@ -73,9 +73,8 @@ class PoseClock:
     def _measured(self, received: Received) -> float:
         if self.stamping is Stamping.receive:
             return received.time - self.latency
-        self._offsets.append(received.time - received.packet.stamp)
-        measured = received.packet.stamp + min(self._offsets) - self.latency
-        return min(measured, received.time - self.latency)
+        self._offset = min(self._offset, received.time - received.packet.stamp)
+        return min(received.packet.stamp + self._offset, received.time) - self.latency
 
 
 def extrapolate(pose: Pose, time: float) -> Pose:
