@@ -113,7 +113,7 @@ class FlightChain:
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
         self.progress = GateProgress(track)
-        self.clock = PoseClock(config.stamping, config.latency)
+        self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)
         self.battery = None if config.battery is None else Battery(config.battery)
         self._flyer, self._camera, self._config = flyer, camera, config

@@ -53,6 +53,7 @@ class UdpInlet:
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._arrivals = Arrivals()
         self._socket = bind(host, port)
         self.address: tuple[str, int] = self._socket.getsockname()
         if RECEIVED_AT is not None:
@@ -61,11 +62,13 @@ class UdpInlet:
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield datagrams."""
         for _ in range(self._MOST):
+            began = time.monotonic()
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(self._SIZE, 64)
             except (BlockingIOError, ConnectionRefusedError):
+                self._arrivals.emptied(began)
                 return
-            yield arrival(ancillary), data
+            yield self._arrivals.of(ancillary), data
 
     def close(self) -> None:
         """Close the socket."""
@@ -88,12 +91,39 @@ def bind(host: str, port: int) -> socket.socket:
     return listening
 
 
-def arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Return when the kernel received a packet, by the monotonic clock; now, if it does not say."""
-    now = time.monotonic()
+class Arrivals:
+    """Puts the kernel's times of arrival, which are the wall clock's, on the monotonic clock; the first may be set.
+
+    What arrived did so after the queue was last empty. A time that the wall clock of now puts before that, or into the
+    future, was stamped before the clock was set: there the difference of the clocks as it was then counts.
+    """
+
+    _SLACK = 1e-3  # s, to which the two clocks can be compared [choice]: reading both may be interrupted
+
+    def __init__(self) -> None:
+        self.emptied(time.monotonic())
+
+    def emptied(self, since: float) -> None:
+        """Say that nothing was waiting any more at a time, s (``time.monotonic``)."""
+        self._since = since
+        self._ahead = time.time() - time.monotonic()  # s, of the wall clock before the monotonic one
+
+    def of(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+        """Return when a datagram that was read just now arrived; now, if the kernel does not say."""
+        now = time.monotonic()
+        stamp = kernel_stamp(ancillary)
+        if stamp is None:
+            return now
+        arrived = stamp - (time.time() - now)
+        if not self._since - self._SLACK <= arrived <= now + self._SLACK:
+            arrived = stamp - self._ahead
+        return min(max(arrived, self._since), now)
+
+
+def kernel_stamp(ancillary: list[tuple[int, int, bytes]]) -> float | None:
+    """Return when the kernel received a datagram, s by the wall clock; None if it does not say."""
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == RECEIVED_AT and len(data) >= 16:
             seconds, nanoseconds = struct.unpack_from("@ll", data)
-            age = time.time() - (seconds + 1e-9 * nanoseconds)
-            return now - min(max(age, 0.0), 1.0)  # a stepped wall clock must not make it older than it can be
-    return now
+            return seconds + 1e-9 * nanoseconds
+    return None

@@ -109,6 +109,25 @@ def test_packets_carry_the_time_of_their_arrival(poses, sender):
     assert poses.poll() == []
 
 
+@pytest.mark.parametrize("step", [-3600.0, -0.02, 0.02, 0.5, 3600.0])
+def test_a_wall_clock_that_is_set_does_not_move_arrivals(poses, sender, monkeypatch, step):
+    """What waits was stamped by the clock of before, what comes later by the one of after."""
+    assert poses.poll() == []
+    real = time.time
+    before = time.monotonic()
+    sender.sendto(encode_pose(packet(1)), poses.address)
+    after = time.monotonic()
+    time.sleep(0.01)
+    monkeypatch.setattr(time, "time", lambda: real() + step)  # for the inlet; the kernel's own stays as it is
+    (waited,) = poses.poll()
+    monkeypatch.undo()
+    sender.sendto(encode_pose(packet(2)), poses.address)
+    time.sleep(0.01)
+    (late,) = poses.poll()
+    assert before - 2e-3 < waited.time < after + 2e-3
+    assert after < late.time < time.monotonic() - 0.005
+
+
 def test_a_port_in_use_is_said(poses):
     with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{poses.address[1]}: .*in use"):
         UdpPose(poses.address[1])
