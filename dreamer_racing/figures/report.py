@@ -5,6 +5,7 @@ Shapes: K control steps of a recorded episode.
 
 import json
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
@@ -72,7 +74,8 @@ class EvaluationReport:
 
     def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
         result = self.evaluate(deterministic)
-        self.write(name, result)
+        with self.attempt("evaluations, plots and videos"):
+            self.write(name, result)
         numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
         return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
 
@@ -139,6 +142,7 @@ class ReturnReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
@@ -159,7 +163,8 @@ class ReturnReport:
                 "return_std": returns.std(correction=0).item(),
                 "episode_length": lengths.mean().item(),
             }
-            self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
+            with self.attempt("evaluations and videos"):
+                self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
             metrics |= {f"evaluation{suffix}/{name}": value for name, value in numbers.items()}
         return metrics
 

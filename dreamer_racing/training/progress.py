@@ -44,11 +44,12 @@ class Progress:
         if self._bar is not None:
             self._bar.update(env_steps - self._bar.n)
 
-    def show(self, metrics: Mapping[str, float], unsaved: str = "") -> None:
-        """Show the latest numbers, and since when nothing could be saved."""
+    def show(self, metrics: Mapping[str, float], unsaved: Mapping[str, int] | None = None) -> None:
+        """Show the latest numbers, and what cannot be written since which env_steps."""
         self._kept |= {word: f"{metrics[name]:.0%}" for word, name in KEPT.items() if name in metrics}
         numbers = {word: f"{metrics[name]:.2f}" for word, name in SHOWN.items() if name in metrics}
-        numbers = ({"NOT SAVED": unsaved} if unsaved else {}) | numbers | self._kept
+        failing = "; ".join(f"{what} since {env_steps:,}" for what, env_steps in (unsaved or {}).items())
+        numbers = ({"NOT SAVED": failing} if failing else {}) | numbers | self._kept
         if self._bar is not None:
             self._bar.set_postfix(numbers)
         elif time.monotonic() - self._since >= self._seconds:

@@ -67,18 +67,28 @@ def launch(
     except RunCheckpointError as error:
         raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except NonFiniteLossError as error:
-        torch.save(error.batch.to("cpu").to_dict(), run.directory.nonfinite_batch)
         raise SystemExit(
-            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
-            f"kept in {run.directory.nonfinite_batch}; {run.last_good}. Continue from there with a lower "
+            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. "
+            f"{keep_batch(error, run.directory.nonfinite_batch)}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
+    except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
+        raise SystemExit(f"error: {error}. The run is not finished: {run.last_good}.") from error
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
         raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
+
+
+def keep_batch(error: NonFiniteLossError, path: Path) -> str:
+    """Keep the batch whose loss was not finite; say where, or why it could not be."""
+    try:
+        torch.save(error.batch.to("cpu").to_dict(), path)
+    except (OSError, RuntimeError) as refused:  # torch's word for a full disk
+        return f"The batch could not be kept ({' '.join(str(refused).split())})"
+    return f"The batch is kept in {path}"
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
