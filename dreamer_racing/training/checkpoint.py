@@ -149,7 +149,7 @@ class RunCheckpoints:
         try:
             self._checkpoint.save(partial, metadata={**(metadata or {}), "env_steps": env_steps, HAS_CHECKSUMS: True})
             _check_loadable(partial)
-            _write_checksums(partial)
+            write_checksums(partial)
             _sync_tree(partial)
             _publish(partial, final)
         except Exception as error:
@@ -344,9 +344,9 @@ def _check_loadable(path: Path) -> None:
         torch.load(file, map_location="cpu", mmap=True, weights_only=True)
 
 
-def _write_checksums(path: Path) -> None:
-    """Notes the checksum of every file, the manifest's too."""
-    files = sorted(file for file in path.rglob("*") if file.is_file())
+def write_checksums(path: Path) -> None:
+    """Notes the checksum of every other file of a checkpoint, the manifest's too."""
+    files = sorted(file for file in path.rglob("*") if file.is_file() and file.name != CHECKSUMS)
     sums = {file.relative_to(path).as_posix(): _checksum(file) for file in files}
     (path / CHECKSUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
 
