@@ -22,10 +22,10 @@ from composing.arena import worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
-from composing.saved import trained_config
+from composing.saved import read_yaml, trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
 from composing.usage import command
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
@@ -206,7 +206,7 @@ def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
     path = next((path for path in kept if path.exists()), None)
     if path is None:
         return None
-    overrides = [text for text in map(str, OmegaConf.load(path)) if override_key(text) not in OF_A_MACHINE]
+    overrides = [text for text in map(str, read_yaml(path, ListConfig)) if override_key(text) not in OF_A_MACHINE]
     return f"{command(trained.algorithm)} {shlex.join(overrides)}"
 
 

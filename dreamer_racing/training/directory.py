@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from dreamer_racing.training.lock import RunLock
 
@@ -170,12 +170,12 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
     if is_complete(path):
         return [path]
     for directory in (path / CHECKPOINTS, path):
-        found = []
-        for candidate in sorted(directory.glob(f"{PREFIX}-*"), reverse=True):
-            if is_complete(candidate):
-                found.append(candidate)
-            else:
-                logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
+        candidates = sorted(directory.glob(f"{PREFIX}-*"), reverse=True)
+        found = [candidate for candidate in candidates if is_complete(candidate)]
+        for candidate in candidates:
+            if candidate not in found:
+                lost = f"; what came after {found[0].name} is lost" if found and candidate > found[0] else ""
+                logger.warning("Passing over %s: it is not a complete checkpoint%s.", candidate, lost)
         if found:
             return found
     state = "exists, but holds none" if path.exists() else "does not exist"
@@ -216,7 +216,10 @@ def ensure_writable(directory: str | Path) -> Path:
 
 def is_complete(path: Path) -> bool:
     """Whether the manifest, which is written last, is there with every file it lists (a copy may have lost some)."""
-    if not path.is_dir() or not Checkpoint.is_checkpoint(path):
+    if not path.is_dir():
         return False
-    parts = Checkpoint.manifest(path)["components"].values()
+    try:
+        parts = Checkpoint.manifest(path)["components"].values()
+    except (CheckpointError, OSError, TypeError, ValueError, AttributeError):  # the last for JSON that is no object
+        return False
     return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])

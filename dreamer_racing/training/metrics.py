@@ -20,10 +20,13 @@ import torch
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from dreamer_racing.settings import quoted
 from dreamer_racing.training.directory import RunDirectory
 
 logger = logging.getLogger(__name__)
 X_AXIS = "env_steps"
+MOST_DIGITS = 19
+"""Of env_steps: more are damage, and Python reads no more than some thousands."""
 
 
 class MetricsLog:
@@ -192,9 +195,21 @@ class PendingMetrics:
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the complete rows."""
-    header, rows, _ = read_rows(path)
-    return [dict(zip(header, row, strict=True)) for row in rows]
+    """Read the complete rows; those without a number of env_steps are left out, and this is logged."""
+    header, cells, _ = read_rows(path)
+    rows = [dict(zip(header, row, strict=True)) for row in cells]
+    damaged = [row[X_AXIS] for row in rows if not _is_count(row[X_AXIS])]
+    if damaged:
+        logger.warning(
+            "%s is damaged: %s is no number of env_steps. %d of %d rows are left out for that.",
+            path, quoted(damaged[0]), len(damaged), len(rows),
+        )  # fmt: skip
+    return [row for row in rows if _is_count(row[X_AXIS])]
+
+
+def _is_count(cell: str) -> bool:
+    """Whether a cell is a whole number as this file's are written."""
+    return cell.isascii() and cell.isdigit() and len(cell) < MOST_DIGITS
 
 
 def _keep_aside(path: Path) -> None:

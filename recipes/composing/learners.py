@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
 from composing.command_line import agent_path
+from composing.saved import read_yaml
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
@@ -54,12 +55,13 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
 
     Raises:
         FileNotFoundError: there is no such run, checkpoint or agent.
-        ValueError: its networks are of another size, or were trained with another camera, control rate or loss.
+        ValueError: its networks are of another size, or were trained with another camera, control rate or loss; or its
+            configuration is damaged.
     """
     source = str(config.init_from)
     folder = agent_path(source)
     if not is_agent(folder):
-        saved = OmegaConf.load(RunDirectory.of(latest_checkpoint(folder)).config)
+        saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
         for name in ("env.control_rate", "env.camera_tilt"):
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:

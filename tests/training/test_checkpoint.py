@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import os
@@ -27,6 +28,7 @@ from dreamer_racing.training.checkpoint import (
     RunCheckpointError,
     RunCheckpoints,
     load_components,
+    load_state,
     newest_sound,
 )
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
@@ -384,15 +386,84 @@ def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
     assert load_components(newest, {"counters": {}})["env_steps"] == 30  # what is read of it is sound
 
 
-def test_checkpoints_of_before_there_were_checksums_are_read(saved):
+def forget_checksums(checkpoint: Path) -> None:
+    """Make a checkpoint as those before there were checksums."""
+    (checkpoint / CHECKSUMS).unlink()
+    manifest = json.loads((checkpoint / "manifest.json").read_text())
+    del manifest["metadata"][checkpoint_module.HAS_CHECKSUMS]
+    (checkpoint / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_checkpoints_of_before_there_were_checksums_are_read_with_a_warning(saved, caplog):
     newest = saved / "checkpoints/checkpoint-000000000030"
-    (newest / CHECKSUMS).unlink()
-    assert Run(saved).checkpoints.load()["env_steps"] == 30
+    forget_checksums(newest)
+    with caplog.at_level("WARNING"):
+        assert Run(saved).checkpoints.load()["env_steps"] == 30
+        assert newest_sound(saved) == newest
+    assert caplog.text.count(f"{newest} was saved by a version without checksums") == 1
     file = next(newest.rglob("*-learner/*.pt"))
     file.write_bytes(b"not a state" * 100)
     with pytest.raises(RunCheckpointError, match="could not be restored") as error:
         Run(saved).checkpoints.load()
     assert "weights_only" not in str(error.value)
+
+
+def test_every_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
+    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
+    for name in files_of(newest):
+        caplog.clear()
+        whole = (newest / name).read_bytes()
+        (newest / name).unlink()
+        with caplog.at_level("WARNING"):
+            assert newest_sound(saved) == before, name
+        assert str(newest) in caplog.text and before.name in caplog.text and "is lost" in caplog.text, name
+        (newest / name).write_bytes(whole)
+    assert newest_sound(saved) == newest
+
+
+@pytest.mark.parametrize("name", ["manifest.json", CHECKSUMS])
+@pytest.mark.parametrize("content", ["[]", "null", "3", '"text"', "{}", "", "[" * 9], ids=repr)
+def test_json_of_another_kind_is_damage(saved, name, content, caplog):
+    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
+    whole = (newest / name).read_bytes()
+    (newest / name).write_text(content)
+    with caplog.at_level("WARNING"):
+        assert newest_sound(saved) == before
+    assert str(newest) in caplog.text and "is lost" in caplog.text
+    (newest / name).write_bytes(whole)
+    (before / name).write_text(content)  # the older one: neither reading nor saving minds
+    run = Run(saved)
+    assert run.checkpoints.load()["env_steps"] == 30
+    run.advance()
+    run.save()
+    assert newest_sound(saved).name.endswith("40")
+
+
+class Payload:
+    """What a pickle that runs code looks like."""
+
+    def __init__(self, witness: Path) -> None:
+        self._witness = witness
+
+    def __reduce__(self) -> tuple:
+        return (os.system, (f"touch {self._witness}",))
+
+
+@pytest.mark.parametrize("checksums", ["of the lie", "of no version"])
+def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved, checksums):
+    newest, witness = saved / "checkpoints/checkpoint-000000000030", saved / "witness"
+    file = next(newest.rglob("*-learner/*.pt"))
+    torch.save({"weight": Payload(witness)}, file)
+    if checksums == "of the lie":  # whoever can write a file can write its sum
+        checkpoint_module.write_checksums(newest)
+    else:
+        forget_checksums(newest)
+    for read in (Run(saved).checkpoints.load, lambda: load_state(newest, "learner")):
+        with pytest.raises(RunCheckpointError, match="could not be restored. A file of it holds what is no state"):
+            read()
+    assert not witness.exists()
+    torch.load(file, weights_only=False)  # as nothing of ours does
+    assert witness.exists(), "the state was harmless: this test has tested nothing"
 
 
 def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
