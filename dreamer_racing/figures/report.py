@@ -133,10 +133,11 @@ class ReturnReport:
         env: batch size [N], with `pixels` or `vector`.
         episodes: episodes of an evaluation, dealt to the N worlds beforehand.
         video_steps: steps that the video shows at most.
+        seed: of the environment, anew at each evaluation: all meet the same starts, also in a run that was resumed.
     """
 
     def __init__(
-        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
+        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500, seed: int = 0
     ) -> None:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
@@ -146,6 +147,7 @@ class ReturnReport:
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
+        self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -175,6 +177,7 @@ class ReturnReport:
         left = torch.tensor(deal(self.episodes, num_envs))
         total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
         returns, lengths, frames, filming = [], [], [], True
+        self._env.set_seed(self._seed)
         tensordict = self._env.reset()
         while (left > 0).any():
             if filming and "pixels" in tensordict:

@@ -240,10 +240,11 @@ class DreamerLearner:
             kl_target: Of `ActorPPOConfig`.
             min_std: Smallest standard deviation of actions, of the networks' own.
             max_std: Largest.
-            numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
+            numbers: Others of `LossConfig`, set in all losses that have an attribute of the name.
 
         Raises:
             TypeError: If `LossConfig` has no number of such a name.
+            ValueError: If none of the losses has it as an attribute.
         """
         if unknown := numbers.keys() - {field.name for field in fields(LossConfig)}:
             raise TypeError(f"adjust({', '.join(sorted(unknown))}=...): LossConfig has no such number.")
@@ -261,12 +262,15 @@ class DreamerLearner:
                     agent.actor.get_buffer(name).fill_(bound)
 
     def _set_in_losses(self, name: str, value: float) -> None:
-        """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""
-        for loss in self.losses.values():
-            setting = getattr(loss, name, None)
-            if isinstance(setting, Tensor):
-                setting.fill_(value)
-            elif setting is not None:
+        """Set a number of all losses that have it: a scalar in place, a plain number or None anew."""
+        numbers = (Tensor, float, int, type(None))
+        if not (having := [loss for loss in self.losses.values() if isinstance(getattr(loss, name, ""), numbers)]):
+            losses = ", ".join(type(loss).__name__ for loss in self.losses.values())
+            raise ValueError(f"adjust({name}=...): none of {losses} has a number of that name that could move.")
+        for loss in having:
+            if isinstance(present := getattr(loss, name), Tensor):
+                present.fill_(value)
+            else:
                 setattr(loss, name, value)
 
     def check_finite(self) -> None:

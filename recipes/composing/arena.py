@@ -98,8 +98,9 @@ def make_report(
             options["num_envs"] = episodes
             print(f"evaluation: {episodes} worlds, one for each episode, so that every agent meets the same starts")
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
-    env = make_suite(config, min(8, episodes), config.seed + 1)
-    return ReturnReport(directory, learner, env, episodes, video_steps)
+    seed = config.seed + 1
+    env = make_suite(config, min(8, episodes), seed)
+    return ReturnReport(directory, learner, env, episodes, video_steps, seed)
 
 
 def crash_causes(config: RunConfig) -> type[CrashCause] | None:

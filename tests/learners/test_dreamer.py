@@ -374,6 +374,30 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
         learner.adjust(discont=0.5)
 
 
+def test_every_number_that_a_loss_has_moves_under_the_name_in_the_configuration():
+    learner = learner_of(seed=0, **CONFIG)
+    homes = {
+        "world_model": ("dynamics_scale", "representation_scale", "free_nats"),
+        "actor": ("discount", "lambda_", "entropy_scale"),
+        "critic": ("discount", "lambda_", "slow_critic_scale", "replay_value_scale", "replay_value_gradient"),
+    }
+    moved = {name: 0.25 for names in homes.values() for name in names}
+    learner.adjust(**moved)
+    for home, names in homes.items():
+        found = {name: float(getattr(learner.losses[home], name)) for name in names}
+        assert found == dict.fromkeys(names, 0.25), home
+
+
+@pytest.mark.parametrize("name", ["return_decay", "barlow_scale", "kl_target", "world_model", "ppo"])
+def test_a_number_that_no_loss_has_is_refused(name):
+    """What only a constructor reads, what another loss would have, and what is no number."""
+    learner = learner_of(seed=0, **CONFIG)
+    with pytest.raises(
+        ValueError, match=rf"adjust\({name}=...\): none of ReconstructionLoss, ReinforceLoss, CriticLoss"
+    ):
+        learner.adjust(**{name: 0.5})
+
+
 def test_a_discount_of_zero_leaves_only_the_next_reward():
     learner = learner_of(seed=0, **CONFIG)
     torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)

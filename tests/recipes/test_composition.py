@@ -172,6 +172,19 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
 
 
+def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
+    """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
+    overrides = ["tuned=race", "schedule.wait_for_model=null", "device=cpu", "total_env_steps=100000"]
+    found = []
+    for actor in ("asymmetric_ppo", "reinforce"):
+        resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
+        moved = recipe_module("composing.learners").scheduled(
+            OmegaConf.to_object(resolved), {Clock.run: 0.0, Clock.passes: 0.0}
+        )
+        found.append(set(moved) - {"rates", "world_model_rate"})
+    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
+
+
 def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))

@@ -25,6 +25,8 @@ SETTINGS = [
     "curriculum.threshold=-100", "curriculum.cooldown=3",
 ]  # fmt: skip
 
+RACES = ("env.episode_steps", "env.start_on_line", "env.control_rate", "curriculum")
+"""Settings of those that are for races."""
 
 BASELINE = [
     "env.from_pixels=false", "network.units=16", "env.num_envs=4", "env.episode_steps=40", "evaluation.every=500",
@@ -127,6 +129,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
         "random_state",
     }  # fmt: skip
     assert_same(whole, resumed, "checkpoint")
+    assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")
+
+
+@pytest.mark.slow
+def test_a_resumed_run_of_the_control_suite_is_evaluated_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Also its second evaluation: no world remembers how many there were before."""
+    settings = [setting for setting in SETTINGS if not setting.startswith(RACES)]
+    suite = ["tuned=none", "env=dmc", "task=cartpole_swingup", "env.from_pixels=false", "run_dir=whole"]
+    train(tmp_path, *settings, *suite)
+    kill(tmp_path / "whole", tmp_path / "killed")
+    train(tmp_path, "resume=killed")
+    assert_same(parts(tmp_path / "whole"), parts(tmp_path / "killed"), "checkpoint")
     assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")
 
 
