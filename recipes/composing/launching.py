@@ -23,8 +23,8 @@ from dreamer_racing.machine import (
     keep_freed_memory,
     out_of_memory_advice,
 )
-from dreamer_racing.training.checkpoint import RunCheckpointError
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
+from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train
 
 TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
@@ -52,6 +52,9 @@ def launch(
             overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
             config = hydra.compose(config.algorithm, overrides)
         check_overrides(config, overrides)
+        if config.resume and is_finished(config):
+            print(what_next(config, RunDirectory(Path(config.run_dir))))
+            return
         config = resolve(config)
         if config.resume and (changed := changed_settings(config)):
             print(f"resumed with other settings: {', '.join(changed)}")
@@ -119,6 +122,23 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
     return config, merged
+
+
+def is_finished(config: DictConfig) -> bool:
+    """Whether nothing is left of a run that is resumed, which is said.
+
+    If its newest checkpoint is damaged, the run goes on from the one before.
+    """
+    directory = RunDirectory(Path(config.run_dir))
+    if directory.finished_env_steps() < config.total_env_steps:
+        return False
+    checkpoint = newest_sound(config.resume)
+    config.resume = str(checkpoint)  # so that it is not looked for, and damage not told, again
+    env_steps = env_steps_of(checkpoint)
+    if env_steps < config.total_env_steps:
+        return False
+    print(f"complete already, at {env_steps:,} env_steps: give a larger total_env_steps to go on")
+    return True
 
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.evaluation.lesions import LESIONS
+from dreamer_racing.training.checkpoint import newest_sound
+from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from tests.running_recipes import CONFIG, SMALL, build, recipe, recipe_module, rows
 
 pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests share
@@ -60,6 +63,32 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     assert done.returncode == 0, done.stderr
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
+
+
+def everything_in(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """When each file of a folder was written, and what it holds."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
+    before = everything_in(run_dir)
+    env_steps = env_steps_of(latest_checkpoint(run_dir))
+    done = recipe("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
+    assert done.returncode == 0, done.stderr
+    assert f"complete already, at {env_steps:,} env_steps" in done.stdout and "go on:" in done.stdout
+    assert everything_in(run_dir) == before
+
+
+def test_a_finished_run_whose_newest_checkpoint_is_damaged_goes_on(run_dir: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(run_dir, tmp_path / "run")
+    newest = latest_checkpoint(copied)
+    env_steps = env_steps_of(newest)
+    next(newest.rglob("*-learner/*.pt")).write_bytes(b"")
+    done = recipe("dreamer_v3", "resume=run", f"total_env_steps={env_steps}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "complete already" not in done.stdout and done.stdout.count("is damaged") == 1
+    assert newest_sound(copied) == newest and RunDirectory(copied).finished_env_steps() == env_steps
 
 
 def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
@@ -202,6 +231,32 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     assert composed("tuned=race").loss.actor == "asymmetric_ppo"
 
 
+def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied = RunDirectory(shutil.copytree(run_dir, tmp_path / "run"))
+    places = (copied.config, copied.best.config, copied.overrides)
+    before, left = {place: place.read_text() for place in places}, [0]
+    config = OmegaConf.to_object(recipe_module("composing.launching").saved_config("dreamer_v3", copied.path))
+    config.seed = 7
+    write, sync = recipe_module("composing.building").write_configuration, os.fsync
+
+    def killed(descriptor: int) -> None:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        sync(descriptor)
+
+    for written in range(len(places)):
+        left[0] = written
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", killed)
+            with pytest.raises(KeyboardInterrupt):
+                write(copied, config, ["seed=7"], 800)
+        for index, place in enumerate(places):
+            assert (place.read_text() == before[place]) == (index >= written), place
+
+
 def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
     resumed = recipe_module("composing.launching").resumed_config
     with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first run\."):
@@ -214,7 +269,7 @@ def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) ->
         assert resumed("dreamer_v3", str(best), [])[0].track == "circle"
     copied = shutil.copytree(run_dir, tmp_path / "run")
     whole = (copied / "config.yaml").read_text()
-    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3"):
+    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3", ""):
         (copied / "config.yaml").write_text(damage)
         with pytest.raises(ValueError, match=r"config\.yaml is damaged|does not fit") as refusal:
             resumed("dreamer_v3", str(copied), [])
