@@ -4,6 +4,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,6 +43,7 @@ def launch(
         tune: says which file of the group ``tuned`` is meant by ``tuned=auto``; None where there is no such group.
     """
     start_logging()
+    threading.excepthook = tell_of_thread
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     with plain_errors():
@@ -83,6 +85,14 @@ def launch(
         raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
+
+
+def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
+    """Say in a line that a thread could not write, which who waits for it is told too; all else has its traceback."""
+    if isinstance(failure.exc_value, OSError):
+        print(f"error in {failure.thread.name if failure.thread else 'a thread'}: {failure.exc_value}", file=sys.stderr)
+    else:
+        threading.__excepthook__(failure)
 
 
 def keep_batch(error: NonFiniteLossError, path: Path) -> str:
