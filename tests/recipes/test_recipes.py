@@ -29,6 +29,12 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+def everything_in(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """When each file of a folder was written, and what it holds."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
 def test_a_run_leaves_what_it_promises(run_dir: Path) -> None:
     table = rows(run_dir)
     assert [int(row["env_steps"]) for row in table] == sorted(int(row["env_steps"]) for row in table)
@@ -63,12 +69,6 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     assert done.returncode == 0, done.stderr
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
-
-
-def everything_in(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """When each file of a folder was written, and what it holds."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
 
 
 def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
@@ -142,6 +142,55 @@ def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFix
         (holding / "evaluation.json").write_text("{}")
         assert fresh(tmp_path / "evaluation", "evaluation.json").name == f"evaluation_{number + 1}"
         assert f"evaluation_{number + 1}" in capsys.readouterr().out
+    (tmp_path / "evaluation_3" / "plots").mkdir()  # of one that was killed
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    (tmp_path / "evaluation" / "evaluation.json").unlink()
+    (tmp_path / "evaluation" / "plots").mkdir()
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    assert "holds files, but no evaluation.json" in capsys.readouterr().out
+
+
+KILLED_BEHIND_THE_FIRST_POLICY = """
+import os, signal
+from dreamer_racing.figures.report import EvaluationReport
+write = EvaluationReport.write
+EvaluationReport.write = lambda *given: (write(*given), os.kill(os.getpid(), signal.{signal}))
+"""
+
+
+def test_an_evaluation_that_was_killed_is_not_mixed_into_the_next(run_dir: Path, tmp_path: Path) -> None:
+    options = [f"checkpoint='{run_dir}'", "episodes=1", "num_envs=1", "video_steps=5", "run_dir=evaluation"]
+    for name, status in (("SIGINT", 130), ("SIGKILL", -9)):
+        before = KILLED_BEHIND_THE_FIRST_POLICY.format(signal=name)
+        done = recipe("evaluate", *options, cwd=tmp_path, before=before)
+        assert done.returncode == status and "Traceback" not in done.stderr, done.stderr
+        assert ("interrupted" in done.stderr) == (name == "SIGINT")
+    left = {folder.name for folder in tmp_path.iterdir()}
+    assert left == {"evaluation", "evaluation_2"} and not list(tmp_path.rglob("evaluation.json"))
+    before = everything_in(tmp_path)
+    done = recipe("evaluate", *options, cwd=tmp_path)
+    assert done.returncode == 0 and "writing to evaluation_3" in done.stdout, done.stderr
+    assert (tmp_path / "evaluation_3" / "evaluation.json").exists()
+    assert {path: file for path, file in everything_in(tmp_path).items() if "evaluation_3" not in path} == before
+
+
+FULL = """
+import resource, signal
+from dreamer_racing.figures.report import EvaluationReport
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+write = EvaluationReport.write
+def full(*given):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+    write(*given)
+EvaluationReport.write = full
+"""
+
+
+def test_an_evaluation_on_a_full_disk_ends_in_a_line(run_dir: Path, tmp_path: Path) -> None:
+    options = [f"checkpoint='{run_dir}'", "episodes=1", "num_envs=1", "video_steps=5", "run_dir=evaluation"]
+    done = recipe("evaluate", *options, cwd=tmp_path, before=FULL)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "error: [Errno 27] File too large" in done.stderr and "no whole result" in done.stderr
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import random
 import shutil
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -359,6 +360,29 @@ def test_first_signal_sets_the_flag_second_raises(number):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_the_first_signal_is_answered_at_once(monkeypatch):
+    """Within 0.2 s, the best of some: what answers is the handler, not the loop that learns."""
+    reader, writer = os.pipe()
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    sent, answered = [], []
+
+    def send() -> None:
+        sent.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    for _ in range(5):
+        with GracefulExit("saving") as stop:
+            sender = threading.Timer(0.05, send)
+            sender.start()
+            while not stop.requested:  # as an update, which polls nothing
+                sum(range(1000))
+            assert os.read(reader, 100) == b"\nSIGINT: saving\n"
+            answered.append(time.monotonic())
+            sender.join()
+    seconds = [after - before for before, after in zip(sent, answered, strict=True)]
+    assert min(seconds) < 0.2
 
 
 def flip(file: Path) -> None:
