@@ -113,17 +113,25 @@ class MetricsLog:
         written, self._pending.rows = rows, []
         self._pending.written = written[-1][0]
         for sink in self.loggers:
-            for env_steps, values in written:
-                sink.log_metrics(values, step=env_steps)
-            if flush := getattr(sink.experiment, "flush", None):
-                flush()
+            try:
+                for env_steps, values in written:
+                    sink.log_metrics(values, step=env_steps)
+                if flush := getattr(sink.experiment, "flush", None):
+                    flush()
+            except OSError:
+                if renew := getattr(sink, "renew", None):
+                    renew()
+                raise
 
     def close(self) -> None:
         """Closes the loggers that can be closed."""
         for sink in self.loggers:
             for name in ("close", "finish"):  # TensorBoard's word for it, and W&B's
                 if end := getattr(sink.experiment, name, None):
-                    end()
+                    try:
+                        end()
+                    except OSError as error:
+                        logger.warning("What %s has last been told may be lost: %s.", type(sink).__name__, error)
 
     def __enter__(self) -> MetricsLog:
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Mapping
@@ -88,6 +89,10 @@ class Progress:
 
 
 def _write(text: str, stream: TextIO) -> None:
-    """Write a line with the time of day, at once: what follows a log sees it as it comes."""
-    stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
-    stream.flush()
+    """Write a line with the time of day, at once: what follows a log sees it as it comes.
+
+    A log that takes no more, on a full disk or where nobody reads it, is no reason to end a run.
+    """
+    with contextlib.suppress(OSError):
+        stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
+        stream.flush()

@@ -235,6 +235,8 @@ def train(run: Run) -> None:
         Progress(config.total_env_steps, counters["env_steps"]) as progress,
     ):
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
+        if run.directory.finished_env_steps() > counters["env_steps"]:
+            run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
         run.learn(None, stop)  # what an interrupted run still owes
         while not stop.requested:
             run.keep_up(progress)

@@ -34,7 +34,7 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
@@ -219,9 +219,9 @@ def claim(config: RunConfig) -> RunLock:
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
     """Keep what a run is started with, beside it and beside its best checkpoint."""
     for place in (directory, directory.best):
-        OmegaConf.save(OmegaConf.structured(config), place.config)
+        replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
     kept = [override for override in overrides if not override.startswith("resume=")]
-    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
+    replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import threading
 from enum import IntEnum
 from pathlib import Path
 
@@ -208,6 +209,32 @@ def test_tensorboard_is_written_row_by_row(tmp_path):
     events.Reload()  # as TensorBoard does while the run goes on
     assert len(events.Scalars("loss")) == 1
     log.close()
+
+
+def test_tensorboard_goes_on_after_a_write_that_failed(tmp_path, monkeypatch):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (sink,) = loggers = make_loggers(tmp_path, tensorboard=True)
+    log = MetricsLog(tmp_path, loggers)
+    for env_steps in (10, 20, 30):
+        log.push({"loss": 1.0})
+        if env_steps != 20:
+            log.write(env_steps)
+            continue
+        file = sink.experiment.file_writer.event_writer._general_file_writer
+
+        def full(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(threading, "excepthook", lambda failure: None)  # of the thread that writes
+        monkeypatch.setattr(file, "write", full)
+        with pytest.raises(OSError, match="No space left"):
+            log.write(env_steps)
+    log.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("loss")] == [10, 30]
+    assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20", "30"]
 
 
 def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
