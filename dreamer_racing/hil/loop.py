@@ -220,9 +220,10 @@ class FlightLoop:
         noted = self.statistics
         noted.jitter.append(jitter)
         noted.busy.append(done - inputs.time)
-        if outputs.pose is not None:
+        if outputs.setpoint is not None:
             noted.render.append(outputs.render_s)
             noted.act.append(outputs.act_s)
+        if outputs.pose is not None:
             noted.pose_age.append(done - outputs.measured)
         if inputs.received:
             noted.latency.append(done - inputs.received[-1].time)

@@ -127,9 +127,22 @@ class Safety:
 
     def step(self, tick: Tick) -> Verdict:
         """Judge a tick."""
+        return self.judge(tick, self.examine(tick))
+
+    def examine(self, tick: Tick) -> Findings:
+        """Take in a tick, all of it but its setpoint: the first half of `step`, before the actor has chosen."""
         findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
-        findings |= self._take_pose(tick) | self._check_flight()
-        if self.armed:
+        return findings | self._take_pose(tick) | self._check_flight()
+
+    def cuts(self, findings: Findings) -> bool:
+        """Whether they cut a vehicle that flies, whatever it is that the actor would choose."""
+        return self.armed and bool(findings.keys() - _HOLDING)
+
+    def judge(self, tick: Tick, findings: Findings) -> Verdict:
+        """Judge a tick by what was found in it: the second half of `step`."""
+        if self.cuts(findings):
+            self.state = State.CUT
+        elif self.armed:
             findings |= self._check_setpoint(tick)
             self._fly_on(findings, tick.finish)
         else:
@@ -146,7 +159,7 @@ class Safety:
         return self.armed and self._now - self._armed_at < self.limits.arm_time
 
     def _fly_on(self, findings: Findings, finish: bool) -> None:
-        if findings.keys() - _HOLDING:
+        if self.cuts(findings):
             self.state = State.CUT
         elif finish:
             self.state = State.DISARMED

@@ -151,6 +151,33 @@ def test_lost_poses_are_held_then_cut_within_200_ms():
     assert 2.05 < last_armed < 2.2
 
 
+@pytest.mark.parametrize("phase", np.arange(0.005, 0.04, 0.01).round(3).tolist())
+def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_ms(phase):
+    """Whenever in a tick the last one was measured; what is cut does not wait for the actor."""
+    plant = Watched(CIRCLE)
+
+    class Slow(Hover):
+        rate = 25.0
+
+        def act(self, pose, image, target_gate):
+            if plant.elapsed > 1.0:  # not while the chain is warmed up
+                LockStep.sleep_until(plant, plant.now() + 0.03)
+            return hover()
+
+    poll, measured = plant.poses.poll, []
+
+    def lose():
+        received = [each for each in poll() if each.packet.stamp <= 2.0 + phase]
+        measured.extend(each.packet.stamp for each in received)
+        return received
+
+    plant.poses.poll = lose
+    assert plant.fly(chain_of(Slow(), plant), 25.0, 30.0).startswith("cut: the newest pose is ")
+    last_armed = max(moment for moment, command in plant.sent if command.armed)
+    cut = min(moment for moment, command in plant.sent if moment > last_armed)
+    assert 0.15 < cut - measured[-1] <= 0.195
+
+
 @pytest.mark.parametrize("armed", [True, False])
 def test_the_operators_kill_wins_at_once(armed):
     plant = Watched(CIRCLE)
