@@ -58,6 +58,7 @@ class Inputs(NamedTuple):
         operator: What the operator wants.
         overrun: Whether the tick before took longer than its period.
         voltages: Of the battery since the last tick, oldest first.
+        dropped: Whether the command of the tick before did not go out.
     """
 
     time: float
@@ -65,6 +66,7 @@ class Inputs(NamedTuple):
     operator: Operator
     overrun: bool
     voltages: Sequence[Reading] = ()
+    dropped: bool = False
 
 
 class Outputs(NamedTuple):
@@ -152,6 +154,7 @@ class FlightChain:
             contract_mismatch=self._mismatch,
             loop_overrun=inputs.overrun,
             finish=finish,
+            command_dropped=inputs.dropped,
         )
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
@@ -194,18 +197,20 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "operator": list(inputs.operator),
         "overrun": inputs.overrun,
         "voltages": [list(reading) for reading in inputs.voltages],
+        "dropped": inputs.dropped,
     }
 
 
 def read_inputs(message: dict[str, Any]) -> Inputs:
-    """Return what came in from what `describe_inputs` made of it; flights of old say nothing of voltages."""
+    """Return what came in from what `describe_inputs` made of it; flights of old say less."""
     received = []
     for arrived, sequence, stamp, *numbers in message["received"]:
         values = np.array(numbers)
         packet = PosePacket(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
         received.append(Received(arrived, packet))
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
-    return Inputs(message["time"], received, Operator(*message["operator"]), message["overrun"], voltages)
+    operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
+    return Inputs(message["time"], received, operator, message["overrun"], voltages, dropped)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

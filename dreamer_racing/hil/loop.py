@@ -132,6 +132,7 @@ class FlightLoop:
         self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
         self._stop: str | None = None
+        self._dropped = False  # whether the command of the tick before was
         self._reasons: tuple[Reason, ...] = ()
 
     def stop(self, reason: str) -> None:
@@ -184,11 +185,13 @@ class FlightLoop:
 
     def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
-        inputs = Inputs(start, self._poses.poll(), self._operator.poll(armed), overrun, self._link.listen())
+        operator = self._operator.poll(armed)
+        inputs = Inputs(start, self._poses.poll(), operator, overrun, self._link.listen(), self._dropped)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
         sent = self._link.send(outputs.verdict.command)
+        self._dropped = not sent
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}

@@ -56,6 +56,7 @@ class Tick(NamedTuple):
         contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
         loop_overrun: Whether the tick before took longer than its period.
         finish: Whether the flight is over.
+        command_dropped: Whether the command of the tick before did not go out.
     """
 
     now: float
@@ -67,6 +68,7 @@ class Tick(NamedTuple):
     contract_mismatch: str | None = None
     loop_overrun: bool = False
     finish: bool = False
+    command_dropped: bool = False
 
 
 class Verdict(NamedTuple):
@@ -202,7 +204,7 @@ class Safety:
         self._overruns.clear()
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
-        self._upright_at = self._wanted_at = self._armed_at = self._now
+        self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._now
         self._left_at = math.inf  # when it was first seen to move in this flight
         self._moved_at = -math.inf  # when it was last
 
@@ -241,15 +243,22 @@ class Safety:
         return findings
 
     def _check_loop(self, tick: Tick) -> Findings:
+        """Ask whether the loop keeps up, and whether anybody takes its commands."""
         limits, overruns = self.limits, self._overruns
+        findings: Findings = {}
         if tick.loop_overrun:
             overruns.append(self._now)
         if len(overruns) == overruns.maxlen and self._now - overruns[0] <= limits.overrun_window:
-            return {
-                Reason.OVERRUNS: f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
+            findings[Reason.OVERRUNS] = (
+                f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
                 f"(allowed: {limits.overruns_max})"
-            }
-        return {}
+            )
+        if not tick.command_dropped:
+            self._delivered_at = self._now
+        silent = self._now - self._delivered_at
+        if silent > limits.cut_after:
+            findings[Reason.LINK_LOST] = f"the link has taken no command for {silent:.3g} s"
+        return findings
 
     def _take_pose(self, tick: Tick) -> Findings:
         """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""

@@ -233,6 +233,21 @@ def test_a_disk_that_is_full_does_not_end_a_flight():
     assert max(moment for moment, command in plant.sent if command.armed) > 2.4
 
 
+def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
+    class Clogged(Watched):
+        def send(self, command):
+            return b"" if self.elapsed > 1.5 else super().send(command)
+
+    plant = Clogged(CIRCLE)
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        ended = plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder)
+    assert ended.startswith("cut: the link has taken no command for 0.16 s")
+    again = chain_of(Hover(), plant)
+    for tick in Flight(tmp_path).ticks:
+        assert describe_outputs(again.tick(read_inputs(tick["in"])))["state"] == tick["out"]["state"]
+    assert again.safety.state is State.CUT
+
+
 def test_what_is_held_fast_does_not_spin_for_ever():
     plant = Watched(CIRCLE)
     assert fly_hovering(plant).startswith("cut: it does not move")
