@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dreamer_racing.hil.aside import Aside
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import OperatorSource
 from dreamer_racing.hil.pose import PoseSource
@@ -28,6 +29,12 @@ FAREWELL = 1.0
 
 FAREWELL_RATE = 50.0
 """Hz of those frames [choice]."""
+
+LINES_MOST = 64
+"""Lines of the log that may wait for a terminal or a pipe [choice]; further ones are left out."""
+
+LINES_PATIENCE = 1.0
+"""s for which the end of a flight waits for them [choice]; motors are off by then."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
@@ -131,6 +138,7 @@ class FlightLoop:
         self._period = 1.0 / rate
         self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
+        self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was
         self._reasons: tuple[Reason, ...] = ()
@@ -155,6 +163,7 @@ class FlightLoop:
                 return self._run(duration, patience)
             finally:
                 self._say_farewell()
+                self._lines.close(LINES_PATIENCE)
 
     def _run(self, duration: float | None, patience: float | None) -> str:
         began = deadline = self._clock.now()
@@ -179,9 +188,13 @@ class FlightLoop:
         """Log what speaks against arming, when it changes; return it. In flight nothing is written."""
         words = "; ".join(outputs.verdict.words)
         if not outputs.verdict.command.armed and outputs.verdict.reasons != self._reasons:
-            logger.info("not armed: %s", words)
+            self._log(logging.INFO, "not armed: %s", words)
         self._reasons = outputs.verdict.reasons
         return words
+
+    def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:
+        """Log a line, and wait for nobody who is to read it."""
+        self._lines.do(lambda: logger.log(level, message, *values, exc_info=error))
 
     def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
@@ -206,8 +219,8 @@ class FlightLoop:
                 self._recorder.tick(inputs.time, message)
             for watch in self._watchers:
                 watch(outputs)
-        except Exception:
-            logger.exception("the flight goes on, and is neither recorded nor shown any longer")
+        except Exception as error:
+            self._log(logging.ERROR, "the flight goes on, and is neither recorded nor shown any longer", error=error)
             self.statistics.unrecorded = True
             self._recorder, self._watchers = None, ()
 
@@ -239,7 +252,7 @@ class FlightLoop:
                 self._link.send(at_rest())
             except Exception as error:  # whatever it is, the next one may get through
                 if not failed:
-                    logger.error("the link does not take the disarm frame: %s", error)
+                    self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)
                 failed = True
             deadline += 1.0 / FAREWELL_RATE
             self._clock.sleep_until(deadline)

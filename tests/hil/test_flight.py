@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -220,6 +222,33 @@ def test_whatever_breaks_the_vehicle_is_disarmed():
         plant.fly(chain_of(Broken(), plant), 50.0, 30.0)
     assert any(command.armed for _, command in plant.sent)
     assert [command.armed for _, command in plant.sent[-50:]] == [False] * 50
+
+
+def test_a_terminal_that_is_stopped_does_not_keep_disarm_frames_back():
+    """Ctrl+S: who writes to it waits. Here, until all disarm frames have gone out."""
+    plant, waited = Watched(CIRCLE), []
+
+    class Stopped(logging.Handler):
+        def emit(self, record):
+            deadline = time.monotonic() + 3
+            while (not plant.sent or plant.sent[-1][0] < 2.45) and time.monotonic() < deadline:  # 1.5 s and FAREWELL
+                time.sleep(0.001)
+            waited.append((record.getMessage(), time.monotonic() < deadline))
+
+    def kill(elapsed: float) -> None:
+        plant.killed = elapsed > 1.5
+
+    plant.happens = kill
+    log, handler = logging.getLogger("dreamer_racing.hil.loop"), Stopped()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        fly_hovering(plant)
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(logging.NOTSET)
+    assert all(in_time for _, in_time in waited), waited
+    assert any(said.startswith("not armed: the operator killed") for said, _ in waited)
 
 
 def test_a_disk_that_is_full_does_not_end_a_flight():
