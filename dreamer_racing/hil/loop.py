@@ -21,6 +21,7 @@ from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
 from dreamer_racing.hil.vehicle import Link, at_rest
+from dreamer_racing.hil.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
@@ -138,6 +139,7 @@ class FlightLoop:
         self._period = 1.0 / rate
         self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
+        self._watchdog = Watchdog(link, chain.safety.limits.tick_max, self._clock.now)
         self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was
@@ -163,6 +165,7 @@ class FlightLoop:
                 return self._run(duration, patience)
             finally:
                 self._say_farewell()
+                self._watchdog.close()
                 self._lines.close(LINES_PATIENCE)
 
     def _run(self, duration: float | None, patience: float | None) -> str:
@@ -177,11 +180,14 @@ class FlightLoop:
             if armed and not flew:
                 flew, began = True, start
             deadline, overrun = self._next(deadline)
+            if self._watchdog.acted:
+                longest = self._chain.safety.limits.tick_max
+                return f"cut: no command for more than {longest:g} s: the watchdog disarmed the vehicle"
             if flew and not armed:
                 return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
-            longest = duration if flew else patience
-            if longest is not None and start - began >= longest:
-                return f"{longest:g} s are over" + ("" if flew else f"; not armed: {words}")
+            most = duration if flew else patience
+            if most is not None and start - began >= most:
+                return f"{most:g} s are over" + ("" if flew else f"; not armed: {words}")
         return self._stop + ("" if flew else f"; not armed: {words}")
 
     def _say_why_not(self, outputs: Outputs) -> str:
@@ -203,7 +209,7 @@ class FlightLoop:
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
-        sent = self._link.send(outputs.verdict.command)
+        sent = self._watchdog.send(outputs.verdict.command)
         self._dropped = not sent
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
@@ -249,7 +255,7 @@ class FlightLoop:
         deadline, failed = self._clock.now(), False
         for _ in range(round(FAREWELL * FAREWELL_RATE)):
             try:
-                self._link.send(at_rest())
+                self._watchdog.send(at_rest())
             except Exception as error:  # whatever it is, the next one may get through
                 if not failed:
                     self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import os
@@ -208,6 +209,37 @@ def test_a_signal_ends_the_flight_with_a_second_of_disarm_frames(number):
     frames = [(moment, command) for moment, command in plant.sent if moment > sent[0] + 0.03]
     assert not any(command.armed for _, command in frames)
     assert frames[-1][0] - frames[0][0] == pytest.approx(FAREWELL, abs=0.05)
+
+
+def test_an_actor_that_hangs_is_disarmed_meanwhile_and_for_good():
+    class Slept(Watched):
+        """Time passes while the actor hangs; the plant's physics waits."""
+
+        slept = 0.0
+
+        def now(self):
+            return super().now() + self.slept
+
+        def sleep_until(self, deadline):
+            super().sleep_until(deadline - self.slept)
+
+    plant, meanwhile = Slept(CIRCLE), []
+
+    class Hangs(Hover):
+        def act(self, pose, image, target_gate):
+            if plant.elapsed > 1.5 and not plant.slept:
+                plant.slept, before = 0.21, len(plant.sent)  # more than limits.tick_max
+                deadline = time.monotonic() + 5
+                while len(plant.sent) < before + 3 and time.monotonic() < deadline:
+                    ctypes.CDLL(None).usleep(10_000)  # in C, as a driver hangs
+                meanwhile.extend(command.armed for _, command in plant.sent[before:])
+            return hover()
+
+    ended = plant.fly(chain_of(Hangs(), plant), 50.0, 30.0)
+    assert ended == "cut: no command for more than 0.2 s: the watchdog disarmed the vehicle"
+    assert meanwhile[:3] == [False] * 3
+    last_armed = max(index for index, (_, command) in enumerate(plant.sent) if command.armed)
+    assert len(plant.sent) - last_armed > 50
 
 
 def test_whatever_breaks_the_vehicle_is_disarmed():
