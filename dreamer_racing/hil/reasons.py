@@ -15,6 +15,7 @@ class Reason(enum.Enum):
     CONTRACT = "contract"
     CLOCK = "clock"
     OVERRUNS = "overruns"
+    LINK_LOST = "link lost"
     NOT_FINITE = "pose not finite"
     POSE_JUMP = "pose jump"
     ATTITUDE_JUMP = "attitude jump"

@@ -56,6 +56,7 @@ class Tick(NamedTuple):
         contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
         loop_overrun: Whether the tick before took longer than its period.
         finish: Whether the flight is over.
+        command_dropped: Whether the command of the tick before did not go out.
     """
 
     now: float
@@ -67,6 +68,7 @@ class Tick(NamedTuple):
     contract_mismatch: str | None = None
     loop_overrun: bool = False
     finish: bool = False
+    command_dropped: bool = False
 
 
 class Verdict(NamedTuple):
@@ -127,9 +129,22 @@ class Safety:
 
     def step(self, tick: Tick) -> Verdict:
         """Judge a tick."""
+        return self.judge(tick, self.examine(tick))
+
+    def examine(self, tick: Tick) -> Findings:
+        """Take in a tick, all of it but its setpoint: the first half of `step`, before the actor has chosen."""
         findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
-        findings |= self._take_pose(tick) | self._check_flight()
-        if self.armed:
+        return findings | self._take_pose(tick) | self._check_flight()
+
+    def cuts(self, findings: Findings) -> bool:
+        """Whether they cut a vehicle that flies, whatever it is that the actor would choose."""
+        return self.armed and bool(findings.keys() - _HOLDING)
+
+    def judge(self, tick: Tick, findings: Findings) -> Verdict:
+        """Judge a tick by what was found in it: the second half of `step`."""
+        if self.cuts(findings):
+            self.state = State.CUT
+        elif self.armed:
             findings |= self._check_setpoint(tick)
             self._fly_on(findings, tick.finish)
         else:
@@ -146,7 +161,7 @@ class Safety:
         return self.armed and self._now - self._armed_at < self.limits.arm_time
 
     def _fly_on(self, findings: Findings, finish: bool) -> None:
-        if findings.keys() - _HOLDING:
+        if self.cuts(findings):
             self.state = State.CUT
         elif finish:
             self.state = State.DISARMED
@@ -189,7 +204,7 @@ class Safety:
         self._overruns.clear()
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
-        self._upright_at = self._wanted_at = self._armed_at = self._now
+        self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._now
         self._left_at = math.inf  # when it was first seen to move in this flight
         self._moved_at = -math.inf  # when it was last
 
@@ -228,15 +243,22 @@ class Safety:
         return findings
 
     def _check_loop(self, tick: Tick) -> Findings:
+        """Ask whether the loop keeps up, and whether anybody takes its commands."""
         limits, overruns = self.limits, self._overruns
+        findings: Findings = {}
         if tick.loop_overrun:
             overruns.append(self._now)
         if len(overruns) == overruns.maxlen and self._now - overruns[0] <= limits.overrun_window:
-            return {
-                Reason.OVERRUNS: f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
+            findings[Reason.OVERRUNS] = (
+                f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
                 f"(allowed: {limits.overruns_max})"
-            }
-        return {}
+            )
+        if not tick.command_dropped:
+            self._delivered_at = self._now
+        silent = self._now - self._delivered_at
+        if silent > limits.cut_after:
+            findings[Reason.LINK_LOST] = f"the link has taken no command for {silent:.3g} s"
+        return findings
 
     def _take_pose(self, tick: Tick) -> Findings:
         """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""

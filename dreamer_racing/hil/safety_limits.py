@@ -38,8 +38,9 @@ class SafetyLimits:
         release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
         arm_time: s after arming in which the least thrust is sent: Betaflight arms at low throttle only.
         hold_after: s, age of a pose above which it holds.
-        cut_after: s, age of a pose, time in which poses repeat, or time without a setpoint, above which it cuts.
-        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still.
+        cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
+            none, above which it cuts.
+        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still, see `hil.watchdog`.
         overruns_max: overruns of the loop that may happen within `overrun_window`.
         overrun_window: s.
         clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.

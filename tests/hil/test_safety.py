@@ -414,6 +414,24 @@ def test_overruns_cut_when_there_are_too_many_within_the_window():
     assert set(states) == {State.FLYING}
 
 
+def test_a_link_that_takes_no_command_is_cut_when_that_lasts():
+    flight = Flight(cut_after=0.125).flying()
+    for _ in range(3):
+        assert flight.ticks(3, command_dropped=True).state is State.FLYING
+        assert flight.tick().state is State.FLYING  # one got through
+    assert flight.ticks(4, command_dropped=True).state is State.FLYING  # 4/32 s, as long as allowed
+    verdict = flight.tick(command_dropped=True)
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.LINK_LOST,)
+    assert verdict.words == ("the link has taken no command for 0.156 s",)
+
+
+def test_a_link_that_takes_no_command_does_not_arm():
+    flight = Flight()
+    flight.ticks(10, operator=OFF, command_dropped=True)
+    verdict = flight.tick(command_dropped=True)
+    assert verdict.state is State.DISARMED and verdict.reasons == (Reason.LINK_LOST,)
+
+
 def test_overruns_before_a_flight_delay_it():
     flight = Flight(overruns_max=0, overrun_window=0.25).ready()
     flight.tick(operator=OFF, loop_overrun=True)
@@ -546,6 +564,7 @@ odd_ticks = st.builds(
     contract_mismatch=st.sampled_from([None, "other"]),
     loop_overrun=st.booleans(),
     finish=st.booleans(),
+    command_dropped=st.booleans(),
 )
 small = st.builds(
     dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.booleans()
