@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
-import select
-import signal
 import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import Self
+from contextlib import ExitStack
 
 import pytest
 
@@ -22,69 +12,10 @@ from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.chain import describe_inputs, describe_outputs
 from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
-from tests.running_recipes import ROOT, recipe, recipe_module
+from tests.running_recipes import ROOT, free_port, recipe, recipe_module
 
 hil = recipe_module("hil")
 flights = recipe_module("composing.flight")
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-class Process:
-    """A recipe that runs, and what it has said so far."""
-
-    def __init__(self, name: str, *overrides: str) -> None:
-        command = [sys.executable, str(ROOT / "recipes" / f"{name}.py"), *overrides]
-        self.running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0)
-        self.said = ""
-
-    def listen(self, seconds: float) -> None:
-        stdout = self.running.stdout
-        assert stdout is not None
-        if select.select([stdout], [], [], seconds)[0]:
-            self.said += os.read(stdout.fileno(), 65536).decode()
-
-    def wait_for(self, text: str, other: Process | None = None) -> None:
-        """Wait until it has said that; fail if it takes too long, or the other one ends meanwhile."""
-        deadline = time.monotonic() + 90
-        while text not in self.said:
-            assert time.monotonic() < deadline and self.running.poll() is None, self.said
-            assert other is None or other.running.poll() is None, other.end()
-            self.listen(0.2)
-
-    def end(self) -> str:
-        """Wait for its end; return all that it said."""
-        deadline = time.monotonic() + 60
-        while self.running.poll() is None and time.monotonic() < deadline:
-            self.listen(0.2)
-        while self.running.stdout is not None and (rest := self.running.stdout.read()):
-            self.said += rest.decode()
-        return self.said
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.running.kill()
-        self.running.wait()
-        self.running.stdout.close()
-
-
-@contextmanager
-def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
-    """Start a plant and a loop that flies it by the pilot, and wait until it flies; limits allow for slow machines."""
-    command_port, pose_port = free_port(), free_port()
-    slow = ("hold_after=0.4", "cut_after=0.9", "tick_max=1.0", "overruns_max=1000", "speed_max=40")
-    with Process("plant", "track=circle", f"command_port={command_port}", f"pose_port={pose_port}") as plant:
-        plant.wait_for("listens on")
-        own = ("actor=pilot", "track=circle", "arm=true", f"run_dir={folder}", *(f"limits.{limit}" for limit in slow))
-        with Process("hil", *own, f"link_port={command_port}", f"pose_port={pose_port}") as loop:
-            plant.wait_for("the stand let go", loop)
-            yield plant, loop
 
 
 @pytest.mark.parametrize(
@@ -294,27 +225,3 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     assert "replayed: 5 ticks, every one as it was written" in said and "taken as it is now" in said
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
     assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
-
-
-def test_the_loop_cuts_when_the_plant_is_killed(tmp_path):
-    with flight(tmp_path) as (plant, loop):
-        plant.running.kill()
-        said = loop.end()
-    assert loop.running.returncode == 0, said  # laps= was not asked for
-    assert "ended: cut: the newest pose is" in said
-    flown = Flight(tmp_path)
-    assert flown.whole and flown.ticks[-1]["out"]["state"] == "cut"
-    assert json.loads((tmp_path / "statistics.json").read_text())["loop"]["ticks"] == len(flown.ticks)
-
-
-def test_the_plant_cuts_when_the_loop_is_killed_and_the_flight_is_on_disk(tmp_path):
-    with flight(tmp_path) as (plant, loop):
-        time.sleep(0.5)
-        loop.running.kill()
-        loop.running.wait()
-        plant.wait_for("nothing heard for 0.25 s: motors cut")
-        plant.running.send_signal(signal.SIGTERM)
-        plant.end()
-    assert plant.running.returncode == 0
-    flown = Flight(tmp_path)
-    assert not flown.whole and flown.ticks[-1]["out"]["command"][0] is True
