@@ -20,6 +20,7 @@ from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
+from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
@@ -433,7 +434,7 @@ def make_dreamer(
     losses: LossConfig | None = None,
     config: LearnerConfig | None = None,
     *,
-    horizon: int = 16,
+    horizon: int = HORIZON,
     device: torch.device | str = "cpu",
     seed: int | None = None,
 ) -> DreamerLearner:
