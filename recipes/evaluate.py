@@ -111,8 +111,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     if config.episodes < EPISODES:
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
-    worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
-    policy = restored.flyer.evaluation_policy()
+    policy, worlds = restored.flyer.evaluation_policy(), worlds_of(trained)
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)

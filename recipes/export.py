@@ -111,7 +111,6 @@ def prepare(
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
         num_envs=1,
-        from_pixels=trained.env.from_pixels,
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         num_threads=1,

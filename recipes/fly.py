@@ -171,7 +171,7 @@ def fly_agent(config: FlyConfig) -> tuple[Track, Evaluation]:
                 raise ValueError(
                     f"{name}={given}: {config.agent} was trained with {name}={trained}, and flies with nothing else."
                 )
-        worlds = worlds_of(restored.trained) | {"from_pixels": restored.trained.env.from_pixels, "seed": config.seed}
+        worlds = worlds_of(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     return track, fly_races(restored.flyer.evaluation_policy(), worlds, episodes=1)
