@@ -30,10 +30,9 @@ from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import EVALUATION, RunDirectory
 
 PROTOCOLS = ("nominal", "full")
-RESULT = "evaluation.json"
 
 register()
 
@@ -48,7 +47,7 @@ def main(config: DictConfig) -> None:
         check(settings)
         restored = restore(settings)
         StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
-        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, RESULT)
+        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
     if report:
@@ -60,7 +59,7 @@ def main(config: DictConfig) -> None:
     written["provenance"]["start_noise"] = settings.start_noise
     if not report:
         write_markdown(directory, results, written["provenance"])
-    (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
+    (directory / EVALUATION).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
     print(f"\nwritten to {directory}")
 
 
