@@ -30,10 +30,9 @@ from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
-from dreamer_racing.training.directory import RunDirectory, replace_text
+from dreamer_racing.training.directory import EVALUATION, RunDirectory, replace_text
 
 PROTOCOLS = ("nominal", "full")
-RESULT = "evaluation.json"
 
 register()
 
@@ -48,7 +47,7 @@ def main(config: DictConfig) -> None:
         check(settings)
         restored = restore(settings)
         StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
-        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, RESULT)
+        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
     with plain_disk_errors():
@@ -61,7 +60,7 @@ def main(config: DictConfig) -> None:
         written["provenance"]["start_noise"] = settings.start_noise
         if not report:
             write_markdown(directory, results, written["provenance"])
-        replace_text(directory / RESULT, json.dumps(written, indent=2, allow_nan=False) + "\n")
+        replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
     print(f"\nwritten to {directory}")
 
 
@@ -112,8 +111,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     if config.episodes < EPISODES:
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
-    worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
-    policy = restored.flyer.evaluation_policy()
+    policy, worlds = restored.flyer.evaluation_policy(), worlds_of(trained)
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)

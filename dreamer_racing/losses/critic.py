@@ -90,11 +90,11 @@ class CriticLoss(LossModule):
         self,
         critic: Critic,
         *,
-        discount: float = 0.997,
-        lambda_: float = 0.95,
-        slow_critic_scale: float = 1.0,
-        replay_value_scale: float = 0.3,
-        replay_value_gradient: bool = True,
+        discount: float = LossConfig.discount,
+        lambda_: float = LossConfig.lambda_,
+        slow_critic_scale: float = LossConfig.slow_critic_scale,
+        replay_value_scale: float = LossConfig.replay_value_scale,
+        replay_value_gradient: bool = LossConfig.replay_value_gradient,
     ) -> None:
         super().__init__()
         self.critic = critic

@@ -29,7 +29,6 @@ from torchrl.checkpoint import (
 )
 
 from dreamer_racing.training.directory import (
-    CHECKPOINTS,
     PREFIX,
     REPLACED,
     RunDirectory,
@@ -120,7 +119,7 @@ class RunCheckpoints:
     """
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2) -> None:
-        self.directory = Path(run_dir).absolute() / CHECKPOINTS
+        self.directory = RunDirectory(Path(run_dir).absolute()).checkpoints
         self.components = components
         self._checkpoint = _bind({**components, "random_state": RandomState()})
         self._keep_last = keep_last

@@ -22,6 +22,8 @@ CHECKPOINTS = "checkpoints"
 PREFIX = "checkpoint"
 REPLACED = ".replaced"
 """End of the hidden name under which a checkpoint waits until another of its name is there."""
+EVALUATION = "evaluation.json"
+"""Numbers of an evaluation, in whichever folder it is written to."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,13 @@ class RunDirectory:
     def best(self) -> RunDirectory:
         """Networks as they were at the best evaluation, with the configuration."""
         return RunDirectory(self.path / "best")
+
+    @property
+    def run(self) -> RunDirectory:
+        """That of the run, where this is its best checkpoint's; else this one."""
+        around = RunDirectory(self.path.parent)
+        is_run = around.config.exists() or around.starts.exists()
+        return around if self == around.best and is_run else self
 
     @property
     def config(self) -> Path:
@@ -95,8 +104,13 @@ class RunDirectory:
 
     @property
     def evaluation(self) -> Path:
-        """Folder of an evaluation after training, with ``evaluation.json``."""
+        """Folder of an evaluation after training."""
         return self.path / "evaluation"
+
+    @property
+    def evaluation_file(self) -> Path:
+        """Numbers of that evaluation."""
+        return self.evaluation / EVALUATION
 
     @property
     def nonfinite_batch(self) -> Path:

@@ -1,7 +1,4 @@
-"""Metrics of a run: a CSV file over ``env_steps``, loggers beside it, and the episodes in a collector's rollouts.
-
-Shapes: N environments, T steps a rollout, E finished episodes.
-"""
+"""Metrics of a run: a CSV file over ``env_steps``, and loggers beside it."""
 
 from __future__ import annotations
 

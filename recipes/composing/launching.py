@@ -110,11 +110,13 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     Raises:
         ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
     """
-    run_dir = RunDirectory.of(latest_checkpoint(resume)).path
-    of_run = RunDirectory(run_dir.parent)
-    if run_dir == of_run.best.path and of_run.config.exists():
-        raise ValueError(f"resume={resume} are the networks of a run's best evaluation alone: resume={run_dir.parent}.")
-    for file in (RunDirectory(run_dir).config, RunDirectory(run_dir).overrides):
+    directory = RunDirectory.of(latest_checkpoint(resume))
+    run_dir = directory.path
+    if directory.run != directory:
+        raise ValueError(
+            f"resume={resume} are the networks of a run's best evaluation alone: resume={directory.run.path}."
+        )
+    for file in (directory.config, directory.overrides):
         if not file.exists():
             raise ValueError(f"{run_dir} cannot be continued: it lacks {file.name}, which every run has.")
     known = saved_config(algorithm, run_dir)

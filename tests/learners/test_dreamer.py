@@ -478,3 +478,14 @@ def test_composing_by_names_draws_the_weights_that_composing_by_hand_does(actor)
     drawn = losses["world_model"].privileged_decoder.state_dict()
     for name, value in named.losses["world_model"].privileged_decoder.state_dict().items():
         assert torch.equal(value, drawn[name]), name
+
+
+def test_a_seed_means_the_weights_that_it_has_always_meant():
+    """Sums of all weights' magnitudes, so that runs begun with one seed at different versions compare."""
+    learner = make_dreamer("debug", Interface(privileged_dim=7), LossConfig(world_model="informed"), seed=3)
+    drawn = {**dict(learner.agent.named_children()), "decoder": learner.losses["world_model"].privileged_decoder}
+    sums = {
+        name: sum(p.detach().double().abs().sum().item() for p in home.parameters()) for name, home in drawn.items()
+    }
+    expected = {"world_model": 2380.58803, "actor": 103.634042, "critic": 223.145986, "decoder": 126.838377}
+    assert sums == pytest.approx(expected, rel=1e-6)

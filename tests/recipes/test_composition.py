@@ -190,3 +190,22 @@ def test_nothing_goes_by_gates_where_there_are_none():
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
         recipe_module("composing.checks").check_dreamer(config)
+
+
+def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
+    """Two places compose a learner: a recipe's `build`, for all to read, and `make_learner`, for what restores one."""
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
+    overrides += ["loss.actor=asymmetric_ppo", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
+    recipe, learners = recipe_module("dreamer_v3"), recipe_module("composing.learners")
+    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides)))
+    run = recipe.build(config, overrides)
+    made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
+    begun = run.learner.state_dict()
+    run.close()
+    assert begun["losses"]["world_model"] and begun["losses"]["actor"], "the losses have weights of their own"
+    for part in ({"agent": begun["agent"]}, begun["losses"]):
+        for home, weights in part.items():
+            other = made["agent"] if home == "agent" else made["losses"][home]
+            assert weights.keys() == other.keys()
+            for name, value in weights.items():
+                assert torch.equal(value, other[name]), f"{home}: {name}"

@@ -17,6 +17,15 @@ def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path
     assert run.best.config == tmp_path / "best" / "config.yaml"
 
 
+def test_the_best_of_a_run_knows_the_run_and_a_run_that_is_called_best_is_its_own(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    run.best.path.mkdir(parents=True)
+    assert run.best.run == run.best  # no run is around it
+    run.config.touch()
+    assert run.best.run == run == run.run
+    assert run.evaluation_file == tmp_path / "run" / "evaluation" / "evaluation.json"
+
+
 def test_every_start_is_kept(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path)
     assert run.read_starts() == []
