@@ -105,7 +105,7 @@ class TensorboardRunLogger(TensorboardLogger):
 
     def renew(self) -> None:
         """Go on in another file, after a write that failed: what comes behind it in this one is not read."""
-        self.experiment = SummaryWriter(log_dir=self.log_dir)
+        self.experiment: Any = SummaryWriter(log_dir=self.log_dir)
 
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
         """Show the configuration as text, and the settings in the table of hyperparameters."""

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import hydra
 import torch
@@ -55,7 +56,7 @@ def launch(
             config = hydra.compose(config.algorithm, overrides)
         check_overrides(config, overrides)
         if config.resume and is_finished(config):
-            print(what_next(config, RunDirectory(Path(config.run_dir))))
+            print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
             return
         config = resolve(config)
         if config.resume and (changed := changed_settings(config)):

@@ -286,8 +286,9 @@ def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
     copied = RunDirectory(shutil.copytree(run_dir, tmp_path / "run"))
     places = (copied.config, copied.best.config, copied.overrides)
     before, left = {place: place.read_text() for place in places}, [0]
-    config = OmegaConf.to_object(recipe_module("composing.launching").saved_config("dreamer_v3", copied.path))
-    config.seed = 7
+    saved = recipe_module("composing.launching").saved_config("dreamer_v3", copied.path)
+    saved.seed = 7
+    config = OmegaConf.to_object(saved)
     write, sync = recipe_module("composing.building").write_configuration, os.fsync
 
     def killed(descriptor: int) -> None:
