@@ -124,14 +124,17 @@ class PPOLearner(BaselineLearner):
 
         Raises:
             NonFiniteLossError: If a loss or gradient is not finite.
+            ValueError: If there are fewer records than minibatches.
         """
+        if rollout.numel() < self.config.minibatches:
+            raise ValueError(f"minibatches={self.config.minibatches} of {rollout.numel()} records: they must be fewer.")
         with timed("advantages"):
             records = self.with_advantages(rollout)
         steps: list[dict[str, Tensor]] = []
         with timed("optimise"):
             for _ in range(self.config.epochs):
                 order = torch.randperm(len(records), device=self.device)
-                steps += [self._step(records[indices]) for indices in order.chunk(self.config.minibatches)]
+                steps += [self._step(records[indices]) for indices in order.tensor_split(self.config.minibatches)]
         return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
 
     @torch.no_grad()

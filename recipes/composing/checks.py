@@ -16,6 +16,7 @@ from composing.schema import (
     Collection,
     DreamerConfig,
     ExperimentConfig,
+    PPORunConfig,
     ReplayRunConfig,
     RunConfig,
     is_race,
@@ -139,6 +140,21 @@ def check_replay(config: ReplayRunConfig) -> None:
             f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
             f"prefill={config.prefill:,} asks for no whole update of {replay.records} records. "
             "Raise total_env_steps or the ratio, or lower the prefill."
+        )
+
+
+def check_ppo(config: PPORunConfig) -> None:
+    """Refuse more minibatches than a rollout has records.
+
+    Raises:
+        ValueError: the message gives the numbers and the settings to change.
+    """
+    check(config)
+    records, minibatches = config.env.num_envs * config.rollout_steps, config.ppo.minibatches
+    if minibatches > records:
+        raise ValueError(
+            f"ppo.minibatches={minibatches} are more than the {records} records of a rollout, env.num_envs="
+            f"{config.env.num_envs} times rollout_steps={config.rollout_steps}: lower the one, or raise the others."
         )
 
 

@@ -137,6 +137,18 @@ def test_networks_for_other_images_are_refused() -> None:
         learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
 
 
+@pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])
+def test_there_are_as_many_minibatches_as_were_asked_for(minibatches: int, steps: int) -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=minibatches, epochs=1), seed=0)
+    learner.update(random_rollout(num_envs=4, steps=12))  # 48 records, which 7 does not divide
+    assert {int(state["step"]) for state in learner.optimizer.state.values()} == {steps}
+
+
+def test_more_minibatches_than_records_are_refused() -> None:
+    with pytest.raises(ValueError, match="minibatches=49 of 48 records"):
+        PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=49), seed=0).update(random_rollout(num_envs=4, steps=12))
+
+
 def test_a_reward_that_is_not_finite_spoils_no_network() -> None:
     learner = PPOLearner(SMALL, NUMBERS, seed=0)
     rollout = random_rollout()

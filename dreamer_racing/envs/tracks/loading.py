@@ -174,6 +174,8 @@ class _TrackReader:
 
     def read(self, content: Any) -> Track:
         """Check the form of every field and fill in the defaults."""
+        if content is None:
+            raise TrackError(f"{self._source}: the track file is empty; it must have gates, see docs/tracks.md.")
         content = self._mapping(
             content,
             "the file",
