@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import sys
@@ -9,6 +10,12 @@ import time
 from collections.abc import Iterator
 from typing import Protocol
 
+_REMEDIES = {
+    errno.EACCES: "Ports below 1024 are the system's: choose one above.",
+    errno.EPERM: "This user may not listen there: choose a port above 1024.",
+    errno.EADDRNOTAVAIL: "This machine has no such address: 127.0.0.1 is its own, 0.0.0.0 all that it has.",
+    errno.EADDRINUSE: "Another program uses it: is another flight, or plant, still running?",
+}
 RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name
 
 
@@ -86,7 +93,8 @@ def bind(host: str, port: int) -> socket.socket:
         listening.bind((host, port))
     except (OSError, OverflowError) as error:
         listening.close()
-        raise OSError(f"cannot listen on {host}:{port}: {error}. Is another program using it?") from error
+        remedy = _REMEDIES.get(error.errno or 0, "") if isinstance(error, OSError) else ""
+        raise OSError(f"cannot listen on {host}:{port}: {error}. {remedy}".rstrip()) from error
     listening.setblocking(False)
     return listening
 

@@ -19,7 +19,7 @@ from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer
 from dreamer_racing.hil.loop import ENDING, FAREWELL
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
@@ -376,14 +376,3 @@ def test_images_of_another_camera_are_not_flown_by():
     assert "the actor's contract does not fit" in plant.fly(chain, flyer.rate, 2.0)
     assert not any(command.armed for _, command in plant.sent)
     chain.close()
-
-
-def test_a_contract_that_does_not_fit_is_refused_with_what_differs():
-    contract = ActorFlyer(AGENTS / "kidney").contract
-    check_contract(contract, "kidney", 25.0)
-    with pytest.raises(
-        ValueError, match=r"source.track is 'kidney', and track=circle; control.rate_hz is 25, and rate=50"
-    ):
-        check_contract(contract, "circle", 50.0)
-    with pytest.raises(ValueError, match=r"camera says images of \[1, 96, 64, 3\], and the input image_u8 is"):
-        check_contract({**contract, "camera": {**contract["camera"], "height_px": 96}}, "kidney")

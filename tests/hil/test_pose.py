@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import socket
 import time
 import zlib
@@ -131,3 +133,25 @@ def test_a_wall_clock_that_is_set_does_not_move_arrivals(poses, sender, monkeypa
 def test_a_port_in_use_is_said(poses):
     with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{poses.address[1]}: .*in use"):
         UdpPose(poses.address[1])
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "Ports below 1024 are the system's"),
+        (errno.EADDRINUSE, "Another program uses it"),
+        (errno.EADDRNOTAVAIL, "This machine has no such address"),
+        (errno.ENOBUFS, os.strerror(errno.ENOBUFS) + "."),
+    ],
+)
+def test_each_reason_not_to_listen_has_its_own_remedy(monkeypatch, number, remedy):
+    """Root may listen anywhere, so the kernel's answer is made up."""
+
+    class Refusing(socket.socket):
+        def bind(self, address):
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("dreamer_racing.hil.inlet.socket.socket", Refusing)
+    with pytest.raises(OSError, match=r"cannot listen on 127.0.0.1:80: ") as refused:
+        UdpPose(80)
+    assert remedy in str(refused.value) and ("Another program" in str(refused.value)) == (number == errno.EADDRINUSE)

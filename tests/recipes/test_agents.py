@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
-from dreamer_racing.training.checkpoint import CHECKSUMS
+from dreamer_racing.training.checkpoint import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
 
@@ -167,7 +167,7 @@ def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path
     state = torch.load(path, weights_only=True)
     assert state.pop("averaged")
     torch.save(state, path)
-    (checkpoint / CHECKSUMS).unlink()  # else it is a damaged one
+    write_checksums(checkpoint)  # else it is a damaged one
     config, cpu = restoring.trained_config(tmp_path / "run"), torch.device("cpu")
     with pytest.raises(ValueError, match=f"weights=averaged: {checkpoint} holds the trained weights only"):
         restoring.restore_learner(config, checkpoint, cpu, "averaged")

@@ -108,6 +108,9 @@ class UdpTransport:
             return False
         return True
 
+    def discard(self) -> None:
+        """Do nothing: datagrams leave at once, or not at all."""
+
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the datagrams that have come back, with the time now, s (``time.monotonic``).
 
