@@ -67,7 +67,7 @@ class FlownFlight:
     took: dict[str, np.ndarray]
     """(T,) s each: ``jitter``, ``render``, ``act``, ``sent``."""
     overrun: np.ndarray
-    """(T,) bool: whether the tick before missed its deadline."""
+    """(T,) int: deadlines that the tick before missed."""
     pose_age: np.ndarray
     """(T,) s from the newest pose's measurement to the tick; not-a-number without a pose."""
     poses: list[Pose]
@@ -273,7 +273,7 @@ def _read_ticks(ticks: list[dict[str, Any]], clock: PoseClock) -> dict[str, Any]
         "target_gate": np.array([out["target_gate"] for out in outputs], int),
         "passes": np.array([out["passes"] for out in outputs], int),
         "took": took,
-        "overrun": np.array([each.overrun for each in inputs], bool),
+        "overrun": np.array([each.overrun for each in inputs], int),
         "pose_age": pose_age,
         "poses": poses,
         "arrived": arrived,

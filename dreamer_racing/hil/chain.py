@@ -56,7 +56,7 @@ class Inputs(NamedTuple):
         time: s, by the loop's clock.
         received: Pose packets since the last tick, oldest first.
         operator: What the operator wants.
-        overrun: Whether the tick before took longer than its period.
+        overrun: Deadlines that the tick before missed, as it took longer than its period.
         voltages: Of the battery since the last tick, oldest first.
         dropped: Whether the command of the tick before did not go out.
     """
@@ -64,7 +64,7 @@ class Inputs(NamedTuple):
     time: float
     received: list[Received]
     operator: Operator
-    overrun: bool
+    overrun: int
     voltages: Sequence[Reading] = ()
     dropped: bool = False
 
@@ -210,7 +210,8 @@ def read_inputs(message: dict[str, Any]) -> Inputs:
         received.append(Received(arrived, packet))
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
     operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
-    return Inputs(message["time"], received, operator, message["overrun"], voltages, dropped)
+    overrun = int(message["overrun"])  # flights of old say whether
+    return Inputs(message["time"], received, operator, overrun, voltages, dropped)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

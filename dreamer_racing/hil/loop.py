@@ -78,7 +78,7 @@ class LoopStatistics:
         render: Of drawing.
         act: Of the flyer.
         busy: Of the whole tick.
-        overruns: Ticks that took longer than their period.
+        overruns: Deadlines missed by ticks that took longer than their period: a long one misses several.
         unrecorded: Whether writing or showing the flight failed on the way.
     """
 
@@ -170,7 +170,7 @@ class FlightLoop:
 
     def _run(self, duration: float | None, patience: float | None) -> str:
         began = deadline = self._clock.now()
-        overrun, flew, armed, words = False, False, False, ""
+        overrun, flew, armed, words = 0, False, False, ""
         while self._stop is None:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
@@ -202,7 +202,7 @@ class FlightLoop:
         """Log a line, and wait for nobody who is to read it."""
         self._lines.do(lambda: logger.log(level, message, *values, exc_info=error))
 
-    def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
+    def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
         operator = self._operator.poll(armed)
         inputs = Inputs(start, self._poses.poll(), operator, overrun, self._link.listen(), self._dropped)
@@ -230,13 +230,14 @@ class FlightLoop:
             self.statistics.unrecorded = True
             self._recorder, self._watchers = None, ()
 
-    def _next(self, deadline: float) -> tuple[float, bool]:
-        """Return the next deadline, on the same grid however late it is, and whether one was missed."""
+    def _next(self, deadline: float) -> tuple[float, int]:
+        """Return the next deadline, on the same grid however late it is, and how many were missed."""
         now, following = self._clock.now(), deadline + self._period
         if now < following:
-            return following, False
-        self.statistics.overruns += 1
-        return following + self._period * ((now - following) // self._period), True
+            return following, 0
+        left_out = int((now - following) // self._period)  # the one after them is late
+        self.statistics.overruns += left_out + 1
+        return following + self._period * left_out, left_out + 1
 
     def _note(self, jitter: float, inputs: Inputs, outputs: Outputs, done: float) -> None:
         noted = self.statistics

@@ -54,7 +54,7 @@ class Tick(NamedTuple):
         operator: What the operator wants; None counts as no enable.
         arm_requested: Whether the program was started with leave to arm.
         contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
-        loop_overrun: Whether the tick before took longer than its period.
+        loop_overrun: Deadlines that the tick before missed, as it took longer than its period.
         finish: Whether the flight is over.
         command_dropped: Whether the command of the tick before did not go out.
     """
@@ -66,7 +66,7 @@ class Tick(NamedTuple):
     operator: Operator | None
     arm_requested: bool
     contract_mismatch: str | None = None
-    loop_overrun: bool = False
+    loop_overrun: int = 0
     finish: bool = False
     command_dropped: bool = False
 
@@ -246,11 +246,10 @@ class Safety:
         """Ask whether the loop keeps up, and whether anybody takes its commands."""
         limits, overruns = self.limits, self._overruns
         findings: Findings = {}
-        if tick.loop_overrun:
-            overruns.append(self._now)
+        overruns.extend([self._now] * tick.loop_overrun)
         if len(overruns) == overruns.maxlen and self._now - overruns[0] <= limits.overrun_window:
             findings[Reason.OVERRUNS] = (
-                f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
+                f"the loop missed {len(overruns)} deadlines within {limits.overrun_window:g} s "
                 f"(allowed: {limits.overruns_max})"
             )
         if not tick.command_dropped:

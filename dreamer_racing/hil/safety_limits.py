@@ -41,7 +41,7 @@ class SafetyLimits:
         cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
             none, above which it cuts.
         tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still, see `hil.watchdog`.
-        overruns_max: overruns of the loop that may happen within `overrun_window`.
+        overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
         overrun_window: s.
         clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.
         speed_max: m/s; the shipped agents fly at up to 11.5 in simulation.

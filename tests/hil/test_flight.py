@@ -358,10 +358,15 @@ def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid(
                 LockStep.sleep_until(self, self.now() + 0.075)  # three periods are missed, and most of a fourth
             return sent
 
-    plant = Stalls(CIRCLE)
-    fly_hovering(plant, 1.3)
+    class Kept:
+        def tick(self, time, message):
+            missed.append(message["in"]["overrun"])
+
+    plant, missed = Stalls(CIRCLE), []
+    plant.fly(chain_of(Hover(), plant), Hover.rate, 1.3, Kept())
     moments = [moment for moment, _ in plant.sent if 0.97 < moment <= 1.17]
     assert moments == pytest.approx([0.98, 1.0, 1.075, 1.08, 1.1, 1.12, 1.14, 1.16])
+    assert [number for number in missed if number] == [3]  # those of 1.02 and 1.04, and that of 1.06 came late
 
 
 def test_images_of_another_camera_are_not_flown_by():

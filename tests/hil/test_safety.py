@@ -414,6 +414,12 @@ def test_overruns_cut_when_there_are_too_many_within_the_window():
     assert set(states) == {State.FLYING}
 
 
+@pytest.mark.parametrize(("missed", "state"), [(3, State.FLYING), (4, State.CUT), (1000, State.CUT)])
+def test_a_tick_that_misses_several_deadlines_counts_as_often(missed, state):
+    verdict = Flight(overruns_max=3).flying().tick(loop_overrun=missed)
+    assert verdict.state is state and verdict.reasons == (() if state is State.FLYING else (Reason.OVERRUNS,))
+
+
 def test_a_link_that_takes_no_command_is_cut_when_that_lasts():
     flight = Flight(cut_after=0.125).flying()
     for _ in range(3):
@@ -562,12 +568,12 @@ odd_ticks = st.builds(
     operator=operators,
     arm_requested=st.booleans(),
     contract_mismatch=st.sampled_from([None, "other"]),
-    loop_overrun=st.booleans(),
+    loop_overrun=st.integers(0, 9),
     finish=st.booleans(),
     command_dropped=st.booleans(),
 )
 small = st.builds(
-    dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.booleans()
+    dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.integers(0, 1)
 )  # what a flight survives, mostly
 
 
