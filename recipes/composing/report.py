@@ -7,7 +7,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 FAILURES = "failures"  # folder of an experiment: a file for every run that failed
-QUANTITIES = ("return", "success_rate", "gates", "lap_time")
+DRAWN = ("return", "success_rate", "gates", "lap_time")
 
 
 class DrawFigures(Callback):
@@ -23,7 +23,7 @@ class DrawFigures(Callback):
         place = Path(config.hydra.sweep.dir)
         print(f"figures: {place}/figures")
         try:
-            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(QUANTITIES)))
+            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(DRAWN)))
         except ValueError as error:
             print(f"figures: none, {error}")
         notes = sorted((place / FAILURES).glob("*.txt"))
