@@ -33,7 +33,7 @@ import tracks  # noqa: E402
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
-from dreamer_racing.training.schedule import Clock  # noqa: E402
+from dreamer_racing.training.schedule import RampClock  # noqa: E402
 
 COMMON, RECIPES = schema.RunConfig, tuple(schema.RECIPES.values())
 OTHERS = (
@@ -97,7 +97,7 @@ def rows(config: type, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
             continue
         if dataclasses.is_dataclass(kind):
             if kind is schema.Ramp and field.name in said:
-                clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in Clock)
+                clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in RampClock)
                 yield (
                     f"{name}.{', .'.join(parts.name for parts in dataclasses.fields(kind))}",
                     ", ".join(default_of(part) for part in dataclasses.fields(kind)),

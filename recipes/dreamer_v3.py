@@ -26,7 +26,7 @@ from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, computes_bfloat16
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, clock_times, make_agent, scheduled
+from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import Collection, DreamerConfig, register
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -116,7 +116,7 @@ class DreamerRun(ReplayRun):
         """Set everything that is scheduled to its value at this share of the run."""
         self.learner.actor_waits = self.lag.waits
         times = clock_times(self.config, self.counters["env_steps"], self.passes)
-        self.learner.adjust(**scheduled(self.config, times))
+        self.learner.adjust(**scheduled_numbers(self.config, times))
         ramp = self.config.schedule.start_on_line
         if ramp.to is not None:
             share = ramp.at(self.config.env.start_on_line, times)

@@ -34,13 +34,13 @@ from omegaconf import DictConfig, ListConfig
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
-RECIPES = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
 
 # Launchers send configurations to processes of theirs, which must find the modules of this folder.
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(RECIPES), os.environ.get("PYTHONPATH")]))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
 
 register()
 
@@ -107,7 +107,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     overrides = merge_overrides(chosen, [override for override in given if override_key(override) not in OWN])
     overrides += [*config.variants[config.variant], *config.overrides]
     wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
-    recipe = [sys.executable, str(RECIPES / f"{config.algorithm}.py")]
+    recipe = [sys.executable, str(FOLDER / f"{config.algorithm}.py")]
     try:
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:

@@ -22,7 +22,7 @@ from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_vi
 from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.training.directory import RunDirectory
 
 SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps the model sees, then predicts on its own, in the video
@@ -44,7 +44,7 @@ class EvaluationReport:
     def __init__(
         self,
         directory: str | Path,
-        learner: Flyer,
+        learner: Evaluable,
         worlds: dict[str, Any],
         episodes: int,
         video_steps: int = 500,
@@ -137,7 +137,13 @@ class ReturnReport:
     """
 
     def __init__(
-        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500, seed: int = 0
+        self,
+        directory: str | Path,
+        learner: Evaluable,
+        env: EnvBase,
+        episodes: int,
+        video_steps: int = 500,
+        seed: int = 0,
     ) -> None:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes

@@ -30,7 +30,7 @@ class Policy(Protocol):
         ...
 
 
-class Flyer(Protocol):
+class Evaluable(Protocol):
     """What can be evaluated: every learner, and a `ShippedAgent`.
 
     Attributes:
@@ -44,7 +44,7 @@ class Flyer(Protocol):
         ...
 
 
-class Learner(Flyer, Protocol):
+class Learner(Evaluable, Protocol):
     """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do.
 
     Attributes:

@@ -10,7 +10,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
-from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.training.run import Report
 
@@ -85,7 +85,7 @@ def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
 def make_report(
     config: RunConfig,
     directory: Path,
-    learner: Flyer,
+    learner: Evaluable,
     episodes: int,
     video_steps: int,
     start_noise: float = 0.0,

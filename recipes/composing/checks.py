@@ -32,7 +32,7 @@ from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.loggers import check_loggers
-from dreamer_racing.training.schedule import Clock
+from dreamer_racing.training.schedule import RampClock
 
 RACE_ONLY = (
     "env.control_rate",
@@ -236,7 +236,7 @@ def check_schedule(config: DreamerConfig) -> None:
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and ramp.by is Clock.passes and not is_race(config):
+        if ramp.to is not None and ramp.by is RampClock.passes and not is_race(config):
             raise ValueError(
                 f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
             )

@@ -22,18 +22,18 @@ from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
-from dreamer_racing.training.schedule import Clock
+from dreamer_racing.training.schedule import RampClock
 
 IN_CHECKPOINTS = ("min_std", "max_std")
 """Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
 
 
-def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[Clock, float]:
+def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[RampClock, float]:
     """What the clocks of schedules say after so many env_steps of a run."""
-    return {Clock.run: env_steps / config.total_env_steps, Clock.passes: passes.best}
+    return {RampClock.run: env_steps / config.total_env_steps, RampClock.passes: passes.best}
 
 
-def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, float]:
+def scheduled_numbers(config: DreamerConfig, times: dict[RampClock, float]) -> dict[str, float]:
     """Arguments of `DreamerLearner.adjust` at what the clocks say."""
     schedule, loss = config.schedule, config.loss
     ramps = {name: getattr(schedule, name) for name in LOSS_RAMPS}
