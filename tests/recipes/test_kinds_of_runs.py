@@ -136,6 +136,27 @@ def test_a_run_outlives_a_disk_that_takes_nothing_at_all(until: int, tmp_path: P
     assert env_steps_of(newest_sound(run_dir)) == 800 and (run_dir / "finished.json").exists()
 
 
+WITHOUT_A_JOURNAL = """
+from dreamer_racing.training.checkpoint import RunCheckpoints
+make = RunCheckpoints.__init__
+def older(self, run_dir, components, *rest, **named):
+    make(self, run_dir, {name: part for name, part in components.items() if name != "journal"}, *rest, **named)
+RunCheckpoints.__init__ = older
+"""
+
+
+def test_a_checkpoint_of_before_there_were_journals_is_resumed_and_says_so(tmp_path: Path) -> None:
+    options = ["env.from_pixels=false", "logger.every=64"]
+    done = recipe("dreamer_v3", *TINY, *options, "run_dir=run", cwd=tmp_path, before=WITHOUT_A_JOURNAL)
+    assert done.returncode == 0, done.stderr
+    before = [row["env_steps"] for row in rows(tmp_path / "run")]
+    done = recipe("dreamer_v3", "resume=run", "total_env_steps=280", cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.count("of an older version, without averages") == 1, done.stderr
+    assert [row["env_steps"] for row in rows(tmp_path / "run")] == [*before, "256", "288"]
+    done = recipe("dreamer_v3", "resume=run", "total_env_steps=300", cwd=tmp_path)
+    assert done.returncode == 0 and "older version" not in done.stdout, done.stderr
+
+
 def test_checkpoints_by_the_clock(tmp_path: Path) -> None:
     done = recipe("dreamer_v3", *TINY, "checkpoint.minutes=1e-6", "checkpoint.keep=9", "run_dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
