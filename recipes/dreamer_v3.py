@@ -9,7 +9,6 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar, cast
 
 from composing.arena import make_env
@@ -132,11 +131,10 @@ class DreamerRun(ReplayRun):
             assert latents is not None, "the update left them"
             self.replay.refresh(batch["index"], latents["belief"], latents["state"])
 
-    def save(self) -> Path:
-        """Take in the rollout that is under way, if there is one, and save."""
+    def settle(self) -> None:
+        """Take in the rollout that is under way, if there is one."""
         if isinstance(self.rollouts, OverlappedRollouts) and (rollout := self.rollouts.drain()) is not None:
             self.take_in(rollout)
-        return super().save()
 
     def close(self) -> None:
         """End the thread that collects, if there is one."""

@@ -5,6 +5,7 @@ Shapes: K control steps of a recorded episode.
 
 import json
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
@@ -72,7 +74,8 @@ class EvaluationReport:
 
     def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
         result = self.evaluate(deterministic)
-        self.write(name, result)
+        with self.attempt("evaluations, plots and videos"):
+            self.write(name, result)
         numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
         return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
 
@@ -130,18 +133,21 @@ class ReturnReport:
         env: batch size [N], with `pixels` or `vector`.
         episodes: episodes of an evaluation, dealt to the N worlds beforehand.
         video_steps: steps that the video shows at most.
+        seed: of the environment, anew at each evaluation: all meet the same starts, also in a run that was resumed.
     """
 
     def __init__(
-        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
+        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500, seed: int = 0
     ) -> None:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
+        self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -159,7 +165,8 @@ class ReturnReport:
                 "return_std": returns.std(correction=0).item(),
                 "episode_length": lengths.mean().item(),
             }
-            self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
+            with self.attempt("evaluations and videos"):
+                self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
             metrics |= {f"evaluation{suffix}/{name}": value for name, value in numbers.items()}
         return metrics
 
@@ -170,6 +177,7 @@ class ReturnReport:
         left = torch.tensor(deal(self.episodes, num_envs))
         total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
         returns, lengths, frames, filming = [], [], [], True
+        self._env.set_seed(self._seed)
         tensordict = self._env.reset()
         while (left > 0).any():
             if filming and "pixels" in tensordict:

@@ -29,12 +29,13 @@ from torchrl.checkpoint import (
 )
 
 from dreamer_racing.training.directory import (
-    CHECKPOINTS,
     PREFIX,
+    REPLACED,
     RunDirectory,
     complete_checkpoints,
     ensure_writable,
     is_complete,
+    stepped_aside,
 )
 
 CHECKSUMS = "checksums.json"
@@ -118,7 +119,7 @@ class RunCheckpoints:
     """
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2) -> None:
-        self.directory = Path(run_dir).absolute() / CHECKPOINTS
+        self.directory = RunDirectory(Path(run_dir).absolute()).checkpoints
         self.components = components
         self._checkpoint = _bind({**components, "random_state": RandomState()})
         self._keep_last = keep_last
@@ -159,8 +160,11 @@ class RunCheckpoints:
                 "free space and the permissions of that folder, then resume."
             ) from error
         self._last_saved = final
-        self._remove_later(final)
-        self._remove_oldest()
+        try:
+            self._remove_later(final)
+            self._remove_oldest()
+        except OSError as error:  # what was asked for is done
+            logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
         return final
 
     def load(
@@ -403,7 +407,7 @@ def _sync_tree(path: Path) -> None:
 
 def _publish(partial: Path, final: Path) -> None:
     """Renames into place. A folder cannot be renamed onto another, so an earlier one of that name steps aside."""
-    aside = final.with_name(f".{final.name}.replaced")
+    aside = final.with_name(f".{final.name}{REPLACED}")
     if final.exists():
         os.replace(final, aside)
     os.replace(partial, final)
@@ -426,8 +430,8 @@ def _remove(path: Path) -> None:
 def _remove_partial(directory: Path) -> None:
     """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
     for path in directory.glob(f".*{PREFIX}-*"):
-        final = path.with_name(path.name.removeprefix(".").removesuffix(".replaced"))
-        if path.name.endswith(".replaced") and not final.exists() and is_complete(path):
+        final = stepped_aside(path)
+        if path.name.endswith(REPLACED) and not final.exists() and is_complete(path):
             os.replace(path, final)
         else:
             logger.info("Removing the unfinished %s.", path)

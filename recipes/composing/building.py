@@ -34,11 +34,12 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import RunLogger, make_loggers
-from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
@@ -218,9 +219,9 @@ def claim(config: RunConfig) -> RunLock:
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
     """Keep what a run is started with, beside it and beside its best checkpoint."""
     for place in (directory, directory.best):
-        OmegaConf.save(OmegaConf.structured(config), place.config)
+        replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
     kept = [override for override in overrides if not override.startswith("resume=")]
-    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
+    replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
 
 
@@ -231,7 +232,7 @@ def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Rep
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
-    """Make the loggers of a run, resumed at so many env_steps if it is, and give them its configuration."""
+    """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
     asked = config.logger
     loggers = make_loggers(directory.path, asked.tensorboard, asked.wandb.value, asked.project, resumed)
     plain = OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
@@ -272,16 +273,22 @@ def assemble(
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
+    periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
+    parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep)
     clock = RunClock(counters)
     if config.resume:
-        clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
+        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
+        clock.total = saved.get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
+        if not journal.restored:
+            journal.begin_at(counters["env_steps"])
+            print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
     write_configuration(directory, config, overrides, counters["env_steps"])
-    resumed = counters["env_steps"] if config.resume else None
-    metrics = MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed)
+    resumed = journal.pending.written if config.resume else None
+    metrics = MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, journal.pending)
     print(f"run directory: {directory.path}")
     return kind(
         config=config,
@@ -294,6 +301,7 @@ def assemble(
         learner=learner,
         report=make_run_report(config, directory.path, learner),
         metrics=metrics,
+        schedule=journal.schedule,
         checkpoints=checkpoints,
         best=best,
         counters=counters,

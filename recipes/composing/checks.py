@@ -34,14 +34,14 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.loggers import check_loggers
 from dreamer_racing.training.schedule import Clock
 
-RACE_ONLY = {
-    "env.control_rate": 50.0,
-    "env.start_beyond_gate": 0.0,
-    "env.start_on_line": 0.0,
-    "env.miss_radius": 0.0,
-    "evaluation.start_noise": 0.0,
-}
-"""Settings that other suites have no use for, with the defaults at which they must be left."""
+RACE_ONLY = (
+    "env.control_rate",
+    "env.start_beyond_gate",
+    "env.start_on_line",
+    "env.miss_radius",
+    "evaluation.start_noise",
+)
+"""Settings that other suites have no use for, and that must be left at their defaults."""
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -98,8 +98,9 @@ def check(config: RunConfig) -> None:
     if is_race(config):
         check_race(config)
         return
-    for name, default in RACE_ONLY.items():
-        if (value := OmegaConf.select(values, name)) != default:
+    defaults = OmegaConf.structured(RunConfig)
+    for name in RACE_ONLY:
+        if (value := OmegaConf.select(values, name)) != (default := OmegaConf.select(defaults, name)):
             raise ValueError(f"{name}={value} is for races, and env.suite={config.env.suite}: leave it at {default}.")
 
 

@@ -31,6 +31,16 @@ def plain_errors() -> Iterator[None]:
         raise SystemExit(2) from error
 
 
+@contextmanager
+def plain_disk_errors() -> Iterator[None]:
+    """Turn what a full disk does to results into a line on stderr and exit status 1."""
+    try:
+        yield
+    except OSError as error:
+        print(f"error: {error}. What was written so far is no whole result.", file=sys.stderr)
+        raise SystemExit(1) from error
+
+
 def start_logging() -> None:
     """Show what the package chose and why, one line each."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)

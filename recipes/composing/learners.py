@@ -6,6 +6,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
+from composing.checks import steps_alone
 from composing.command_line import agent_path
 from composing.saved import read_yaml
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
@@ -23,6 +24,9 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import Clock
 
+IN_CHECKPOINTS = ("min_std", "max_std")
+"""Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
+
 
 def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[Clock, float]:
     """What the clocks of schedules say after so many env_steps of a run."""
@@ -32,9 +36,11 @@ def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dic
 def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, float]:
     """Arguments of `DreamerLearner.adjust` at what the clocks say."""
     schedule, loss = config.schedule, config.loss
-    of_losses = {name: getattr(schedule, name).at(getattr(loss, name), times) for name in LOSS_RAMPS}
+    ramps = {name: getattr(schedule, name) for name in LOSS_RAMPS}
+    moved = [name for name, ramp in ramps.items() if ramp.to is not None or name in IN_CHECKPOINTS]
+    of_losses = {name: ramps[name].at(getattr(loss, name), times) for name in moved}
     rates = {"rates": schedule.learning_rates, "world_model_rate": schedule.world_model_rate}
-    if (kl_target := loss.ppo.kl_target) is not None:
+    if (kl_target := loss.ppo.kl_target) is not None and steps_alone(loss.actor):
         of_losses["kl_target"] = schedule.kl_target.at(kl_target, times)
     return {**{name: ramp.at(1.0, times) for name, ramp in rates.items()}, **of_losses}
 

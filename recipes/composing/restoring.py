@@ -156,18 +156,21 @@ def results_of(checkpoint: Path) -> Path:
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:
-    """Return a folder to write to: the one asked for, or if it holds a result already, the first free `<name>_2`, ...
+    """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
+
+    So nothing is mixed with what an earlier evaluation left, or one that was killed.
 
     Args:
         path: the folder asked for.
         result: name of the file that is written last.
     """
     directory, number = Path(path), 1
-    while (directory / result).exists():
+    while directory.is_dir() and any(directory.iterdir()):
         number += 1
         directory = Path(f"{path}_{number}")
     if number > 1:
-        print(f"{path} holds an earlier {result}, which is kept: writing to {directory}")
+        held = f"an earlier {result}" if (Path(path) / result).exists() else f"files, but no {result}"
+        print(f"{path} holds {held}, which is kept: writing to {directory}")
     return ensure_writable(directory)
 
 

@@ -172,8 +172,40 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
 
 
+def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
+    """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
+    overrides = ["tuned=race", "schedule.wait_for_model=null", "device=cpu", "total_env_steps=100000"]
+    found = []
+    for actor in ("asymmetric_ppo", "reinforce"):
+        resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
+        moved = recipe_module("composing.learners").scheduled(
+            OmegaConf.to_object(resolved), {Clock.run: 0.0, Clock.passes: 0.0}
+        )
+        found.append(set(moved) - {"rates", "world_model_rate"})
+    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
+
+
 def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
         recipe_module("composing.checks").check_dreamer(config)
+
+
+def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
+    """Two places compose a learner: a recipe's `build`, for all to read, and `make_learner`, for what restores one."""
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
+    overrides += ["loss.actor=asymmetric_ppo", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
+    recipe, learners = recipe_module("dreamer_v3"), recipe_module("composing.learners")
+    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides)))
+    run = recipe.build(config, overrides)
+    made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
+    begun = run.learner.state_dict()
+    run.close()
+    assert begun["losses"]["world_model"] and begun["losses"]["actor"], "the losses have weights of their own"
+    for part in ({"agent": begun["agent"]}, begun["losses"]):
+        for home, weights in part.items():
+            other = made["agent"] if home == "agent" else made["losses"][home]
+            assert weights.keys() == other.keys()
+            for name, value in weights.items():
+                assert torch.equal(value, other[name]), f"{home}: {name}"

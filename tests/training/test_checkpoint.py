@@ -10,6 +10,7 @@ import random
 import shutil
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -196,6 +197,24 @@ def test_a_part_that_older_checkpoints_lack_is_left_as_it_is(saved):
     assert parts["lag"] == {"waits": 1}
 
 
+@pytest.mark.parametrize("function", ["replace", "rmtree"])
+def test_what_cannot_be_removed_does_not_end_a_run_that_is_saved(function, saved, monkeypatch, caplog):
+    run = Run(saved)
+    run.checkpoints.load(saved / "checkpoints" / "checkpoint-000000000020")
+    run.counters["env_steps"] = 25
+
+    def busy(path, *arguments, **options):
+        if "30" in str(path):  # which belongs to the future of this run
+            raise OSError(16, "Device or resource busy", str(path))
+        return original(path, *arguments, **options)
+
+    module = os if function == "replace" else shutil
+    original = getattr(module, function)
+    monkeypatch.setattr(module, function, busy)
+    assert run.save().name.endswith("25")
+    assert "could not be removed" in caplog.text and "resource busy" in caplog.text
+
+
 class Unreadable:
     def state_dict(self) -> dict:
         return {"path": Path("x")}  # loads only with arbitrary code execution allowed
@@ -317,7 +336,14 @@ def test_kill_at_each_step_of_publishing(saved, processes, function, call):
 def test_a_checkpoint_that_stepped_aside_comes_back(saved):
     newest = saved / "checkpoints" / "checkpoint-000000000030"
     newest.rename(newest.with_name(f".{newest.name}.replaced"))  # killed between the two renames of a replacement
-    assert latest_checkpoint(saved).name.endswith("20")
+    aside = latest_checkpoint(saved)
+    assert aside.name == f".{newest.name}.replaced" and newest_sound(saved) == aside
+    assert load_components(saved, {"counters": {}})["env_steps"] == 30
+    shutil.copytree(aside, newest)
+    assert latest_checkpoint(saved) == newest  # the other one has come
+    shutil.rmtree(newest)
+    shutil.rmtree(newest.with_name("checkpoint-000000000020"))
+    assert latest_checkpoint(saved) == aside  # as with checkpoint.keep=1
     Run(saved)
     assert latest_checkpoint(saved) == newest
 
@@ -336,6 +362,29 @@ def test_first_signal_sets_the_flag_second_raises(number):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_the_first_signal_is_answered_at_once(monkeypatch):
+    """Within 0.2 s, the best of some: what answers is the handler, not the loop that learns."""
+    reader, writer = os.pipe()
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    sent, answered = [], []
+
+    def send() -> None:
+        sent.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    for _ in range(5):
+        with GracefulExit("saving") as stop:
+            sender = threading.Timer(0.05, send)
+            sender.start()
+            while not stop.requested:  # as an update, which polls nothing
+                sum(range(1000))
+            assert os.read(reader, 100) == b"\nSIGINT: saving\n"
+            answered.append(time.monotonic())
+            sender.join()
+    seconds = [after - before for before, after in zip(sent, answered, strict=True)]
+    assert min(seconds) < 0.2
 
 
 def flip(file: Path) -> None:

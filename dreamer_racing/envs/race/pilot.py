@@ -1,6 +1,6 @@
 """A scripted, state-based pilot that flies N drones along a planned racing line.
 
-`ScriptedPilot` finds where on the line (`envs.racing_line`) a drone is, and steers it with position and velocity
+`ScriptedPilot` finds where on the line (`envs.race.racing_line`) a drone is, and steers it with position and velocity
 feedback, acceleration and rate feedforward, and a prediction over the command delay. It is the reference for lap times,
 and a demonstrator: it also flies from the poses in which training episodes start.
 
