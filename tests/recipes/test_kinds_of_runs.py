@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
-from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, compose, recipe, recipe_module, rows
+from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, build, compose, recipe, recipe_module, rows
 
 SLOW_DISK = """
 import runpy, sys, time
@@ -134,6 +135,24 @@ def test_a_run_outlives_a_disk_that_takes_nothing_at_all(until: int, tmp_path: P
     assert {step // 100 for step in steps} >= {4, 5, 6, 7, 8} and steps == sorted(set(steps)), "no row is missing"
     assert [row["env_steps"] for row in table if row["evaluation/return_mean"]] == ["224", "416", "608", "800"]
     assert env_steps_of(newest_sound(run_dir)) == 800 and (run_dir / "finished.json").exists()
+
+
+def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three replays are there at the peak, with checkpoint.keep=2; what a run's own checkpoints take is free for it."""
+    building = recipe_module("composing.building")
+    config = compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2")
+    free = SimpleNamespace(free=3000)
+    monkeypatch.setattr(building.shutil, "disk_usage", lambda path: free)
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    free.free = 2999
+    assert "MAY NOT BE ENOUGH, lower checkpoint.keep= or replay.capacity=" in building.disk_needed(config, 1000)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "one").write_bytes(b"x")
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    build(*TINY, f"run_dir={tmp_path / 'run'}")
+    assert "0.0 GB free: MAY NOT BE ENOUGH" in capsys.readouterr().out
 
 
 def test_checkpoints_by_the_clock(tmp_path: Path) -> None:
