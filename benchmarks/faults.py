@@ -135,7 +135,9 @@ def main() -> None:
         arena = Arena(Path(folder))
         ways: dict[str, Callable[[], Iterator[Case]]] = {
             "kill": lambda: arena.kills("kill", arguments.kills, draw),
-            "by_clock": lambda: arena.kills("kill by the clock", arguments.kills // 5, draw, "checkpoint.minutes=1e-6"),
+            "by_clock": lambda: arena.kills(
+                "kill by the clock", max(1, arguments.kills // 5), draw, "checkpoint.minutes=1e-6"
+            ),
             "early": lambda: arena.early_kills(most),
             "open": lambda: arena.kills_at_calls("open", most),
             "rename": lambda: arena.kills_at_calls("rename", most),

@@ -1,5 +1,6 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
+import math
 import random
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,6 +54,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     config.device = str(device)
     if OmegaConf.is_missing(config.env, "num_envs"):
         config.env.num_envs = num_envs
+    if not math.isfinite(config.env.control_rate):
+        raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
     if config.env.episode_steps is None:
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":

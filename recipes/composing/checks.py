@@ -19,6 +19,7 @@ from composing.schema import (
     PPORunConfig,
     ReplayRunConfig,
     RunConfig,
+    SACRunConfig,
     is_race,
 )
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
@@ -156,6 +157,16 @@ def check_ppo(config: PPORunConfig) -> None:
             f"ppo.minibatches={minibatches} are more than the {records} records of a rollout, env.num_envs="
             f"{config.env.num_envs} times rollout_steps={config.rollout_steps}: lower the one, or raise the others."
         )
+
+
+def check_sac(config: SACRunConfig) -> None:
+    """Refuse settings with which there would be no update.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    check(config)
+    check_replay(config)
 
 
 def check_dreamer(config: DreamerConfig) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
-from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, compose, recipe, recipe_module, rows
+from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, build, compose, recipe, recipe_module, rows
 
 SLOW_DISK = """
 import runpy, sys, time
@@ -155,6 +156,24 @@ def test_a_checkpoint_of_before_there_were_journals_is_resumed_and_says_so(tmp_p
     assert [row["env_steps"] for row in rows(tmp_path / "run")] == [*before, "256", "288"]
     done = recipe("dreamer_v3", "resume=run", "total_env_steps=300", cwd=tmp_path)
     assert done.returncode == 0 and "older version" not in done.stdout, done.stderr
+
+
+def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three replays are there at the peak, with checkpoint.keep=2; what a run's own checkpoints take is free for it."""
+    building = recipe_module("composing.building")
+    config = compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2")
+    free = SimpleNamespace(free=3000)
+    monkeypatch.setattr(building.shutil, "disk_usage", lambda path: free)
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    free.free = 2999
+    assert "MAY NOT BE ENOUGH, lower checkpoint.keep= or replay.capacity=" in building.disk_needed(config, 1000)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "one").write_bytes(b"x")
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    build(*TINY, f"run_dir={tmp_path / 'run'}")
+    assert "0.0 GB free: MAY NOT BE ENOUGH" in capsys.readouterr().out
 
 
 def test_checkpoints_by_the_clock(tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ REFUSED = [
     (["device=quantum"], ["device=quantum", "cpu"]),
     (["device=gpu"], ["device=gpu: there are auto, cpu, cuda and cuda:1 ... (did you mean cuda?)."]),
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
+    (["env.control_rate=inf"], ["env.control_rate=inf Hz: must be a finite number"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
