@@ -227,15 +227,20 @@ class Arena:
             yield self._verdict(f"kill at {function}", f"call {call} of {total}", name, problem)
 
     def terminations(self, number: int, draw: random.Random) -> Iterator[Case]:
-        """Ask a process to end at a random time."""
-        for _ in range(number):
-            name, at = self._name(), draw.uniform(0.05, 0.9) * self._seconds
+        """Ask a process to end at a random time; one that has ended before that is no case."""
+        cases, limit = 0, self._seconds
+        while cases < number:
+            name, at = self._name(), draw.uniform(0.05, 0.9) * limit
+            begun = time.monotonic()
             with self._start(f"run_dir={name}", *SETTINGS) as process:
                 try:
-                    printed, said = process.communicate(timeout=at)
+                    process.communicate(timeout=at)
+                    limit = min(limit, time.monotonic() - begun)
+                    continue
                 except subprocess.TimeoutExpired:
                     process.terminate()
                     printed, said = process.communicate(timeout=self._limit)
+            cases += 1
             saved = "saved; continue with resume=" in printed
             # Python's own answer to the signal while modules are still being loaded is to die of it.
             expected = 128 + signal.SIGTERM if saved or process.returncode >= 0 else -signal.SIGTERM
