@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 """Whatever serves a page is reached from this machine alone."""
+KEYS = "Space plays and pauses, comma and full stop go a step back and on; a click on a curve goes there."
 HOLD = 1.0  # s that a recording rests at its end before it begins anew
 
 
@@ -96,7 +97,7 @@ def compose(viewer: str, track: Track, flights: Sequence[ShownFlight], training:
     data = json.dumps(readings(track, flights), allow_nan=False).replace("<", "\\u003c")
     parts = (
         f"<style>{beside(STYLE)}{beside('dashboard_page.css')}</style>",
-        panel(track, flights, training),
+        panel(track, flights, [*training, KEYS]),
         f'<script type="application/json" id="flights">{data}</script>',
         f"<script>{beside('dashboard.js')}</script>",
     )

@@ -32,7 +32,7 @@ CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # of a curve's own coordinates
 HEADROOM = 0.06  # of a curve's range, above and below it
 COLOR_STOPS = 8  # of a legend's gradient
 STYLE = "dashboard.css"  # beside this module
-HINT = f"Drones are drawn {DRONE_SCALE:g} times their size. Space plays and pauses, comma and full stop step."
+LARGER = f"Drones are drawn {DRONE_SCALE:g} times their size."
 
 
 class ShownFlight(NamedTuple):
@@ -75,11 +75,11 @@ def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str])
     """Return the panel: legend, images, state, curves, notes."""
     colors = paints(len(flights))
     shown = list(zip(flights, colors, strict=True))
-    lines = [*training, *(line for flight in flights for line in missing(flight)), HINT]
+    lines = [*training, *(line for flight in flights for line in missing(flight)), LARGER]
     parts = (
         f"<header><h1>{escape(track.name)}</h1>{_legend(shown)}</header>",
         f'<section class="views">{_views(shown)}{_state(track, shown)}</section>',
-        f'<section class="curves" title="click to go there">{"".join(_curves(shown))}<i class="cursor"></i></section>',
+        f'<section class="curves">{"".join(_curves(shown))}<i class="cursor"></i></section>',
         f"<footer>{''.join(f'<p>{_with_commands(line)}</p>' for line in lines)}</footer>",
     )
     return f'<aside class="dashboard">{"".join(parts)}</aside>'
