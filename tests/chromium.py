@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import shutil
+import signal
 import subprocess
 import time
 import urllib.request
@@ -82,14 +84,15 @@ def open_page(address: str, width: int = 900, height: int = 560) -> Iterator[Pag
     assert PROGRAM is not None
     with TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [PROGRAM, *ARGUMENTS, f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen(command, **quiet, start_new_session=True)
         try:
             with connect(_socket_address(Path(profile)), max_size=None) as socket:
                 page = Page(socket)
                 page._call("Page.navigate", url=address)
                 yield page
         finally:
-            process.terminate()
+            os.killpg(process.pid, signal.SIGKILL)  # the program may be a script, whose own end leaves the browser
             process.wait(timeout=30)
 
 
