@@ -24,6 +24,7 @@ PAGE = ROOT / "docs" / "options.md"
 sys.path.append(str(ROOT / "recipes"))
 
 # Below code, because it is found only with the recipes' folder on the path.
+import dashboard  # noqa: E402
 import doctor  # noqa: E402
 import fly  # noqa: E402
 import hil  # noqa: E402
@@ -43,6 +44,7 @@ OTHERS = (
     schema.ExportConfig,
     schema.PlotConfig,
     fly.FlyConfig,
+    dashboard.DashboardConfig,
     hil.HilConfig,
     plant.PlantConfig,
     sim_to_real.SimToRealConfig,

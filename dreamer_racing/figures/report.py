@@ -17,7 +17,7 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act, with_memory
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
-from dreamer_racing.evaluation.trajectory import write_trajectory
+from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
 from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
 from dreamer_racing.figures.top_down import plot_top_down
@@ -81,20 +81,21 @@ class EvaluationReport:
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        return self._course.evaluate(self.episodes, deterministic, on_episode=self.on_episode)
+        judge = self._learner.judge()
+        return self._course.evaluate(self.episodes, deterministic, judge=judge, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
 
-        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that imagines
-        images, `<name>_dream.npz`.
+        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that sees,
+        `<name>_onboard.npz`; of one that imagines images, `<name>_dream.npz`.
         """
         into = self.directory
         for folder in (into.evaluations, into.plots, into.videos):
             folder.mkdir(parents=True, exist_ok=True)
         (into.evaluations / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
-        write_trajectory(into.evaluations / f"{name}_trajectory.csv", trajectory, self._track)
+        write_flight(into.evaluations / name, trajectory, self._track)
         plot_top_down(self._course.base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return

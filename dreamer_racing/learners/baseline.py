@@ -10,6 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from dreamer_racing.learners.finite_guard import FiniteGuard
+from dreamer_racing.learners.learner import Judge
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_layers, layers_of
 from dreamer_racing.modules import Interface
 
@@ -48,6 +49,10 @@ class BaselineLearner(ABC):
     def evaluation_policy(self) -> BaselinePolicy:
         """Return the acting step to evaluate: the one that is trained."""
         return self.policy()
+
+    def judge(self) -> Judge | None:
+        """Return what the critic makes of a state; None of learners without a critic of states."""
+        return None
 
     def check_finite(self) -> None:
         """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""

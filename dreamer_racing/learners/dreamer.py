@@ -17,15 +17,17 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, check_settings, setting
 
 
@@ -336,6 +338,10 @@ class DreamerLearner:
         """Return the acting step of `flying_agent`, which shares its parameters."""
         return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
 
+    def judge(self) -> Judge:
+        """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
+        return getattr(self.losses["actor"], "judge", None) or judge_latents(self.flying_agent.critic)
+
     @property
     def latent_format(self) -> LatentFormat:
         """How a replay keeps this learner's latents."""
@@ -460,6 +466,17 @@ def make_dreamer(
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std, losses.max_std).to(device)
         modules = make_losses(agent, losses, horizon)
     return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
+
+
+def judge_latents(critic: Critic) -> Judge:
+    """Return what a critic makes of the latents that `DreamerPolicy` has updated by what it saw."""
+
+    @torch.no_grad()
+    def value(acted: TensorDictBase) -> Tensor:
+        after = acted["next"].select("belief", "state").to(next(critic.parameters()).device)
+        return critic.value(join_features(after["belief"], after["state"]))
+
+    return value
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

@@ -15,6 +15,10 @@ Timer = Callable[[str], AbstractContextManager]
 """Context manager by the name of an activity, as ``RunClock.timed``."""
 
 
+Judge = Callable[[TensorDictBase], Tensor]
+"""What a critic expects: of records [N] that the evaluation's policy has acted on, the return from there, (N, 1)."""
+
+
 class Policy(Protocol):
     """The acting step: a module on tensordicts of batch size [N] that writes ``action``, as `BaselinePolicy` is."""
 
@@ -41,6 +45,10 @@ class Evaluable(Protocol):
 
     def evaluation_policy(self) -> Policy:
         """Return the acting step to evaluate, which may be one of averaged weights."""
+        ...
+
+    def judge(self) -> Judge | None:
+        """Return what the critic that teaches the actor makes of a state; None without one."""
         ...
 
 

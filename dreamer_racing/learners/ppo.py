@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from dreamer_racing.learners.baseline import BaselineLearner, detached
-from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -136,6 +136,15 @@ class PPOLearner(BaselineLearner):
                 order = torch.randperm(len(records), device=self.device)
                 steps += [self._step(records[indices]) for indices in order.tensor_split(self.config.minibatches)]
         return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+
+    def judge(self) -> Judge:
+        """Return what the critic makes of what is seen, in units of the reward."""
+
+        @torch.no_grad()
+        def value(acted: TensorDictBase) -> Tensor:
+            return self._judge(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
+
+        return value
 
     @torch.no_grad()
     def with_advantages(self, rollout: TensorDictBase) -> TensorDict:

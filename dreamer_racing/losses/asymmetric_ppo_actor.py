@@ -65,6 +65,12 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return super().from_config(agent, config, horizon, privileged_dim=agent.interface.privileged_dim, **own)
 
+    @torch.no_grad()
+    def judge(self, acted: TensorDictBase) -> Tensor:
+        """Return what the critic expects of states ``[N]`` that a policy has acted on, ``(N, 1)``."""
+        privileged = acted[PRIVILEGED].to(self.flown.device)
+        return self.state_critic.mean(symlog(privileged))
+
     def _steps(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         return {**super()._steps(rollout), "privileged": symlog(rollout[PRIVILEGED])}
 

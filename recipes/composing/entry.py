@@ -22,7 +22,10 @@ WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
-TEXTS = ("run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor")
+TEXTS = (
+    "run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
+    "run", "against",
+)  # fmt: skip
 """Settings that are no numbers, whatever they look like."""
 
 

@@ -428,6 +428,21 @@ def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
         assert torch.equal(value, dict(learner.averaged.named_parameters())[name]), name
 
 
+def test_evaluations_ask_the_critic_that_belongs_to_what_flies():
+    """Of latents that have seen the image, by the averaged weights."""
+    learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
+    torch.nn.init.normal_(learner.averaged.critic.head.mlp.output.weight)
+    size = learner.size
+    belief, state = (
+        torch.randn(3, size.features - size.latents * size.classes),
+        torch.randn(3, size.latents * size.classes),
+    )
+    acted = TensorDict({"belief": 0 * belief, "next": {"belief": belief, "state": state}}, [3])
+    expected = learner.averaged.critic.value(torch.cat((belief, state), -1))
+    value = learner.judge()(acted)
+    assert value.shape == (3, 1) and not value.requires_grad and torch.equal(value, expected)
+
+
 def test_without_averages_the_trained_weights_fly():
     learner = learner_of(seed=0, **CONFIG)
     assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor

@@ -90,6 +90,14 @@ def test_advantages_equal_torchrls() -> None:
         torch.testing.assert_close(records[key], oracle[key].flatten(0, 1), atol=1e-5, rtol=1e-5)
 
 
+def test_evaluations_are_told_values_in_units_of_the_reward() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(reward_scale=0.25, minibatches=2), seed=0)
+    learner.critic = TensorDictModule(Echo(), ["vector"], ["state_value"])
+    seen = torch.tensor([[1.0], [2.0], [-3.0]])
+    acted = TensorDict({"vector": seen, "action": torch.zeros(3, 1)}, [3])
+    assert torch.equal(learner.judge()(acted), 4 * seen)
+
+
 def bandit(learner: PPOLearner, rounds: int) -> float:
     """Reward −(a − 0.5)², episodes of one step; return the mean action that was learnt."""
     for _ in range(rounds):

@@ -79,7 +79,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     assert flown.returncode == 0, flown.stderr
     assert all(words in flown.stdout for words in ("gates per episode", "laps  ", "finished  ", "mine on circle"))
     assert {path.name for path in (tmp_path / "fly").iterdir()} == {
-        "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif",
+        "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif", "flight_trajectory.csv", "flight_onboard.npz",
     }  # fmt: skip
     done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -29,6 +29,7 @@ NEEDED = {
     "export": ["checkpoint=nowhere"],
     "hil": ["actor=kidney"],
     "sim_to_real": ["track=kidney"],
+    "dashboard": ["run=nowhere"],
 }
 ODD = (-1, 0, 10**30, 0.5, -math.inf, math.inf, math.nan, 1e300, "", "x" * 60, None, True, [], [1, "a"])
 MANY = 100
