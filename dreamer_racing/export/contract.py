@@ -140,9 +140,14 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
 
 
 def hash_weights(step: nn.Module) -> str:
-    """Return the SHA-256 of all weights: name, type, shape and little-endian bytes of each, in order of names."""
+    """Return the SHA-256 of all weights of a step."""
+    return hash_tensors(step.state_dict())
+
+
+def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of tensors: name, type, shape and little-endian bytes of each, in order of names."""
     digest = hashlib.sha256()
-    for name, value in sorted(step.state_dict().items()):
+    for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         digest.update(value.cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -11,7 +11,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, is_agent
 from dreamer_racing.training.checkpoint import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
@@ -174,6 +177,19 @@ def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path
     assert restoring.restore_learner(config, checkpoint, cpu)[0].averaged is None
     assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu)[0].averaged is not None
     assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
+
+
+@pytest.mark.parametrize("name", agents_in(ROOT / "agents"))
+def test_each_agent_that_ships_is_restored(name: str) -> None:
+    """Also those that were made when networks had fewer numbers."""
+    folder = ROOT / "agents" / name
+    contract = read_contract(folder / "contract.json")
+    env = DroneRacingEnv(contract["source"]["track"], 1, seed=0, control_rate=contract["control"]["rate_hz"],
+                         camera=Camera(64, 64, tilt=contract["camera"]["tilt_up_deg"]), num_threads=1)  # fmt: skip
+    try:
+        assert ShippedAgent.load(folder, env).about["track"] == name
+    finally:
+        env.close()
 
 
 def test_the_agents_that_ship_are_whole_and_small() -> None:
