@@ -230,7 +230,7 @@ def test_a_run_without_images(tmp_path: Path) -> None:
     done = recipe("evaluate", "checkpoint=run", "episodes=2", "num_envs=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(json.loads((run_dir / "evaluation" / "evaluation.json").read_text())["stochastic"]["episodes"]) == 2
-    done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", cwd=tmp_path)
+    done = recipe("dreamer_v3", "resume=run", "env.from_pixels=true", "total_env_steps=9000", cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
     assert "environment of other observations" in done.stderr
 

@@ -152,6 +152,7 @@ def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFix
 
 KILLED_BEHIND_THE_FIRST_POLICY = """
 import os, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
 from dreamer_racing.figures.report import EvaluationReport
 write = EvaluationReport.write
 EvaluationReport.write = lambda *given: (write(*given), os.kill(os.getpid(), signal.{signal}))
@@ -233,7 +234,7 @@ def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
 
 
 def test_checkpoint_of_another_size_is_refused(run_dir: Path) -> None:
-    done = recipe("dreamer_v3", f"resume='{run_dir}'", "model=cpu_small", cwd=run_dir.parent)
+    done = recipe("dreamer_v3", f"resume='{run_dir}'", "model=cpu_small", "total_env_steps=9000", cwd=run_dir.parent)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "debug" in done.stderr and "cpu_small" in done.stderr
 
