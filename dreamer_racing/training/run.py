@@ -2,6 +2,9 @@
 
 The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
 `logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
+
+Several processes may train together (`training.parallel`): they go through the loop in step, each with worlds and
+replay of its own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
 """
 
 import signal
@@ -19,10 +22,12 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
@@ -59,12 +64,12 @@ class Run:
     curriculum: BodyRateCurriculum | None
     learner: Any  # the recipe's Learner
     report: Report
-    metrics: MetricsLog
+    metrics: MetricsLog | UnwrittenMetrics
     checkpoints: RunCheckpoints
     best: BestCheckpoint
     counters: dict[str, int]  # env_steps, updates, episodes
     clock: RunClock
-    lock: RunLock
+    lock: RunLock | LockHeldByFirst
     evaluated: int = field(default=-1, init=False)  # updates at the last evaluation
     unsaved: str = field(default="", init=False)  # since when checkpoints could not be written, for the progress
 
@@ -82,10 +87,10 @@ class Run:
         """Account for the episodes that ended in a rollout, and let the curriculum set the b₂ of what comes.
 
         Returns:
-            Those episodes, batch ``[E]`` of ``EpisodeTracker.update``.
+            Those episodes, of all processes, batch ``[E]`` of ``EpisodeTracker.update``.
         """
-        self.counters["env_steps"] += rollout.numel()
-        episodes = self.tracker.update(rollout)
+        self.counters["env_steps"] += rollout.numel() * parallel.count()
+        episodes = parallel.gathered_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
         self.metrics.push(self.tracker.summary(episodes))
         if self.curriculum:
@@ -192,14 +197,14 @@ def train(run: Run) -> None:
         KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
         RunCheckpointError: at its end the run could not be saved.
     """
-    config, counters = run.config, run.counters
+    config, counters, leads = run.config, run.counters, parallel.is_first()
     schedule = Schedule(
         counters["env_steps"], log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every
     )
     minutes = Interval(config.checkpoint.minutes)
     with (
-        GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
-        Progress(config.total_env_steps, counters["env_steps"]) as progress,
+        graceful_exit() as stop,
+        Progress(config.total_env_steps, counters["env_steps"], shown=leads) as progress,
     ):
         run.report.on_episode = progress.evaluating
         if run.directory.finished_env_steps() >= config.total_env_steps:
@@ -216,27 +221,33 @@ def train(run: Run) -> None:
             if stop.signal_name:
                 break
             due = schedule.due("log", counters["env_steps"])
-            if schedule.due("evaluate", counters["env_steps"]):
+            if schedule.due("evaluate", counters["env_steps"]) and leads:
                 progress.say(run.evaluate())
                 due = True  # so that its numbers stand where they were measured
-            if due:
+            if due and leads:
                 run.measure()
                 progress.show(run.metrics.write(counters["env_steps"]), run.unsaved)
-            by_steps, by_minutes = schedule.due("save", counters["env_steps"]), minutes.due()  # both take note
+            by_steps, by_minutes = schedule.due("save", counters["env_steps"]), parallel.agreed(minutes.due())
             if (by_steps or by_minutes) and (problem := run.try_to_save()):
                 progress.say(problem)
         saved = run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
             progress.say(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
-        if not stop.requested and config.evaluation.every and run.evaluated != counters["updates"]:
+        if not stop.requested and leads and config.evaluation.every and run.evaluated != counters["updates"]:
             progress.say(run.evaluate())
         run.metrics.write(counters["env_steps"])
-        if not stop.requested:
+        if not stop.requested and leads:
             run.directory.mark_finished(counters["env_steps"])
         progress.say(f"checkpoint: {saved}")
     if stop.signal_name:
         raise SystemExit(128 + signal.Signals[stop.signal_name])
+
+
+def graceful_exit() -> GracefulExit:
+    """Make the flag that a signal raises, in all processes together; one of them answers."""
+    answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
+    return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)
 
 
 class Schedule:

@@ -24,7 +24,9 @@ from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelRewar
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
+from dreamer_racing.learners.saved_dreamer import LossState
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
@@ -32,16 +34,20 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import RunLogger, make_loggers
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
+OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
+"""Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
@@ -58,7 +64,7 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.device = worlds_device(config)
         print(f"worlds: {config.env.device} (env.device=auto)")
     if config.run_dir is None:
-        config.run_dir = str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config))))
+        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device
 
 
@@ -151,7 +157,8 @@ def make_run_replay(
     if settings.storage is Storage.tensor:
         check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
     print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
-    print(disk_needed(config, round(size * min(1.0, config.total_env_steps / settings.capacity))))
+    of_all = parallel.count()  # processes, each with a replay like this one
+    print(disk_needed(config, round(size * min(of_all, config.total_env_steps / settings.capacity))))
     return make_replay(
         settings.capacity,
         config.env.num_envs,
@@ -203,13 +210,15 @@ def make_sequence_replay(
     )
 
 
-def claim(config: RunConfig) -> RunLock:
-    """Take a run directory before anything large is made.
+def claim(config: RunConfig) -> RunLock | LockHeldByFirst:
+    """Take a run directory before anything large is made; of several processes the first one does.
 
     Raises:
         ValueError: it holds another run, or is in use by a live one.
     """
     assert config.run_dir is not None, "resolve_common() names it"
+    if not parallel.is_first():
+        return LockHeldByFirst(Path(config.run_dir))
     lock = RunDirectory(Path(config.run_dir)).claim()
     refuse_to_replace(config)
     return lock
@@ -225,7 +234,9 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
 
 
 def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Report:
-    """Make the evaluation of a run during training."""
+    """Make the evaluation of a run during training, if this is the process that makes it."""
+    if not parallel.is_first():
+        return NoReport()
     asked = config.evaluation
     return make_report(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
@@ -240,11 +251,19 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
     return loggers
 
 
+def make_metrics(config: RunConfig, directory: RunDirectory, env_steps: int) -> MetricsLog | UnwrittenMetrics:
+    """Make the metrics of a run, resumed at so many env_steps if it is, if this is the process that writes them."""
+    if not parallel.is_first():
+        return UnwrittenMetrics()
+    resumed = env_steps if config.resume else None
+    return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed)
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
     overrides: list[str],
-    lock: RunLock,
+    lock: RunLock | LockHeldByFirst,
     env: Environment,
     learner: Learner,
     collector: Collector,
@@ -267,21 +286,25 @@ def assemble(
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
     directory = RunDirectory(lock.directory)
-    tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
+    tracker = EpisodeTracker(env.batch_size.numel(), crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
-    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep)
+    if not parallel.is_first() and isinstance(learner, DreamerLearner):
+        parts["actor_loss"] = LossState(learner.losses["actor"])
+    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters)
     if config.resume:
         clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
+        if curriculum:
+            env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
-    write_configuration(directory, config, overrides, counters["env_steps"])
-    resumed = counters["env_steps"] if config.resume else None
-    metrics = MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed)
+    parallel.together(lambda: None)  # all have read what is written anew now
+    if parallel.is_first():
+        write_configuration(directory, config, overrides, counters["env_steps"])
     print(f"run directory: {directory.path}")
     return kind(
         config=config,
@@ -293,7 +316,7 @@ def assemble(
         curriculum=curriculum,
         learner=learner,
         report=make_run_report(config, directory.path, learner),
-        metrics=metrics,
+        metrics=make_metrics(config, directory, counters["env_steps"]),
         checkpoints=checkpoints,
         best=best,
         counters=counters,

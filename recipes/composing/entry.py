@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import CONFIG_DIR, override_key, plain_errors
+from composing.command_line import CONFIG_DIR, override_key, plain_errors, say_error
 from dreamer_racing.settings import shortened, suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
@@ -42,7 +42,7 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
             try:
                 main()
             except HydraException as error:
-                print(f"error: {in_plain_words(error, name, sys.argv[1:])}", file=sys.stderr)
+                say_error(in_plain_words(error, name, sys.argv[1:]))
                 raise SystemExit(2) from error
 
         return start

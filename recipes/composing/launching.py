@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from composing.checks import check_overrides
-from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
+from composing.command_line import follow_quietly, merge_overrides, override_key, plain_errors, start_logging
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import RunConfig, is_race
 from composing.usage import command
@@ -23,6 +23,7 @@ from dreamer_racing.machine import (
     keep_freed_memory,
     out_of_memory_advice,
 )
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.run import train
@@ -45,6 +46,9 @@ def launch(
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     with plain_errors():
+        parallel.join()
+        if not parallel.is_first():
+            follow_quietly()
         overrides = list(HydraConfig.get().overrides.task)
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
@@ -67,10 +71,11 @@ def launch(
     except RunCheckpointError as error:
         raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except NonFiniteLossError as error:
-        torch.save(error.batch.to("cpu").to_dict(), run.directory.nonfinite_batch)
+        kept = run.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
+        torch.save(error.batch.to("cpu").to_dict(), kept)
         raise SystemExit(
             f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
-            f"kept in {run.directory.nonfinite_batch}; {run.last_good}. Continue from there with a lower "
+            f"kept in {kept}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
     except RuntimeError as error:
@@ -79,6 +84,7 @@ def launch(
         raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
+        parallel.leave()
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
