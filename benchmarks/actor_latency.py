@@ -21,6 +21,7 @@ import torch
 from measuring import print_table, write_json
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import hash_track, load_track
 from dreamer_racing.export.actor_step import export_actor, make_step
 from dreamer_racing.export.contract import make_contract
 from dreamer_racing.export.onnx_actor import OnnxActor, measure_latency
@@ -71,6 +72,7 @@ def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:
     finally:
         env.close()
     source = {"checkpoint": "initial weights", "env_steps": 0, "weights": "initial", "track": track, "preset": PRESET}
+    source["track_sha256"] = hash_track(load_track(track))
     contract = make_contract(step, env.worlds.parameters, env.worlds.camera, **source)
     folder.mkdir(parents=True, exist_ok=True)
     export_actor(step, contract, flight, folder / ACTOR)

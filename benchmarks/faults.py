@@ -1,20 +1,31 @@
-"""What a training run survives: kills, damaged files, a disk that fills up, a reward that is not finite, a clock.
+"""What a training run survives: kills, signals, damaged files, a full disk, a reward that is not finite, a clock.
 
     OMP_NUM_THREADS=1 python benchmarks/faults.py --kills 50 --json results/faults.json
 
-Every case is a short training by `recipes/dreamer_v3.py` in a process of its own, disturbed in one way and resumed to
-its end. It *survived* if the last checkpoint then holds what that of an undisturbed run holds, bit for bit, and the
-rows of metrics.csv, wall clock aside, are the same. Kinds of faults:
+Every case is a short training by `recipes/dreamer_v3.py` in a process of its own, disturbed in one way and continued
+to its end: by the same command as long as it has no checkpoint, then by `resume=`. It *survived* if the last checkpoint
+then holds what that of an undisturbed run holds, bit for bit, the rows of metrics.csv, wall clock aside, are the same,
+no process left a traceback or another exit status than it should, and what was lost was said. Kinds of faults:
 
 * `kill`: SIGKILL at a random time after the start, as often as asked;
-* `kill at rename`, `kill at fsync`: SIGKILL just before or just after the n-th of them;
-* `damage`: 16 bytes in the middle of a file of the newest checkpoint are turned, each file in turn;
-* `full disk`: no file can grow beyond some size from the n-th checkpoint on (`RLIMIT_FSIZE`), until it is resumed;
+* `kill by the clock`: the same, saving after every rollout as `checkpoint.minutes` does;
+* `kill early`: SIGKILL just after the n-th file was opened for writing, for every n before the first checkpoint; once a
+  checkpoint is there, the same command is to name it and how to go on;
+* `kill at open`, `kill at rename`, `kill at fsync`: SIGKILL at each of them in the second half of a run, which saves,
+  replaces checkpoints, evaluates, and finishes: just after an opening, just before a rename or an fsync;
+* `SIGTERM`: at a random time, which is to end the process with the status 143;
+* `damage`: each file of the newest checkpoint in turn, with 16 bytes in its middle turned, with its second half cut
+  off, removed;
+* `full disk`: no file can grow beyond some size (`RLIMIT_FSIZE`) while checkpoints are saved, from the n-th on, or
+  from then on whatever is written, until the run is resumed;
 * `clock`: the wall clock stands still, or goes backwards;
 * `not finite`: a reward is infinite; it is to end with exit status 1 and the checkpoint before it whole.
+
+The exit status is 1 if any case was not survived, and the last lines say which.
 """
 
 import argparse
+import contextlib
 import csv
 import os
 import random
@@ -42,24 +53,43 @@ SETTINGS = [
     "evaluation.every=400", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=200",
     "checkpoint.keep=2", "logger.every=200", "logger=csv", "device=cpu", "total_env_steps=1200",
 ]  # fmt: skip
-KINDS = ("kill", "rename", "fsync", "damage", "disk", "clock", "not_finite")
+TO_THE_END = SETTINGS[-1]
+HALF_WAY = "total_env_steps=800"  # at an evaluation, so that this end leaves no row that a longer run has not
 CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
+REFUSED = 2
 COUNT_CALLS = """
-import os, signal
-def counted(function, name, last, after):
+import atexit, io, os, signal
+from dreamer_racing.training import checkpoint
+calls, before_a_checkpoint = 0, []
+def count(last={last}):
+    global calls
+    calls += 1
+    if calls == last:
+        os.kill(os.getpid(), signal.SIGKILL)
+def counted(function):
     def call(*args, **kwargs):
-        calls[name] += 1
-        if calls[name] == last and not after:
-            os.kill(os.getpid(), signal.SIGKILL)
-        result = function(*args, **kwargs)
-        if calls[name] == last:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return result
+        count()
+        return function(*args, **kwargs)
     return call
-calls = dict(replace=0, fsync=0)
-os.{name} = counted(os.{name}, "{name}", {last}, {after})
+def counted_open(file, mode="r", *args, opened=open, **kwargs):
+    result = opened(file, mode, *args, **kwargs)
+    if set(mode) & set("wax+") and isinstance(file, (str, os.PathLike)):
+        count()
+    return result
+def save(*args, saved=checkpoint.RunCheckpoints.save, **kwargs):
+    before_a_checkpoint.append(calls)
+    return saved(*args, **kwargs)
+checkpoint.RunCheckpoints.save = save
+if "{name}" == "open":
+    io.open = counted_open  # what pathlib calls
+    import builtins
+    builtins.open = counted_open
+elif "{name}" == "rename":
+    os.replace, os.rename = counted(os.replace), counted(os.rename)
+else:
+    os.fsync = counted(os.fsync)
+atexit.register(lambda: print("calls", *before_a_checkpoint[:1], calls))
 """
-PRINT_CALLS = COUNT_CALLS + "\nimport atexit\natexit.register(lambda: print('calls', calls['{name}']))\n"
 FULL = """
 import os, resource, signal
 from dreamer_racing.training import checkpoint
@@ -67,11 +97,12 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 saved = checkpoint.RunCheckpoints.save
 def save(self, *args, **kwargs):
     if {first} <= len(list(self.directory.glob("checkpoint-*"))):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, resource.RLIM_INFINITY))
     try:
         return saved(self, *args, **kwargs)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        if not {stays}:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 checkpoint.RunCheckpoints.save = save
 """
 STILL = "import time\ntime.time = lambda: 1e9\n"
@@ -85,38 +116,48 @@ def poisoned(env, tensordict):
     return data if len(steps) < 150 else data.set("reward_base", data["reward_base"] + float("inf"))
 DroneRacingEnv._step = poisoned
 """
+KINDS = ("kill", "by_clock", "early", "open", "rename", "fsync", "sigterm", "damage", "disk", "clock", "not_finite")
+Case = dict[str, Any]
 
 
 def main() -> None:
     """Disturb runs in every way."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--kills", type=int, default=50, help="at random times")
-    parser.add_argument("--calls", type=int, default=10, help="renames, and fsyncs, to be killed at")
+    parser.add_argument("--kills", type=int, default=50, help="at random times; a fifth as many by the clock")
+    parser.add_argument("--sigterms", type=int, default=10, help="at random times")
+    parser.add_argument("--most", type=int, help="of the cases of the other kinds, spread evenly; all if left out")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json")
+    parser.add_argument("--json", help="written after each kind")
     arguments = parser.parse_args()
-    draw = random.Random(arguments.seed)
+    draw, most = random.Random(arguments.seed), arguments.most
     with tempfile.TemporaryDirectory() as folder:
         arena = Arena(Path(folder))
-        ways: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {
-            "kill": lambda: arena.kills(arguments.kills, draw),
-            "rename": lambda: arena.kills_at_calls("replace", arguments.calls),
-            "fsync": lambda: arena.kills_at_calls("fsync", arguments.calls),
-            "damage": arena.damages,
+        ways: dict[str, Callable[[], Iterator[Case]]] = {
+            "kill": lambda: arena.kills("kill", arguments.kills, draw),
+            "by_clock": lambda: arena.kills(
+                "kill by the clock", max(1, arguments.kills // 5), draw, "checkpoint.minutes=1e-6"
+            ),
+            "early": lambda: arena.early_kills(most),
+            "open": lambda: arena.kills_at_calls("open", most),
+            "rename": lambda: arena.kills_at_calls("rename", most),
+            "fsync": lambda: arena.kills_at_calls("fsync", most),
+            "sigterm": lambda: arena.terminations(arguments.sigterms, draw),
+            "damage": lambda: arena.damages(most),
             "disk": arena.full_disks,
             "clock": arena.clocks,
             "not_finite": arena.not_finite,
         }
-        cases = [case for kind in arguments.faults for case in ways[kind]()]
+        cases = []
+        for kind in arguments.faults:
+            cases += list(ways[kind]())
+            write_json([{"benchmark": "faults", **case} for case in cases], arguments.json)
     all_cases = Counter(case["fault"] for case in cases)
     survived = Counter(case["fault"] for case in cases if case["survived"])
     counts = [{"fault": kind, "cases": number, "survived": survived[kind]} for kind, number in all_cases.items()]
     print_table(counts, ["fault", "cases", "survived"])
-    for case in cases:
-        if not case["survived"]:
-            print(f"{case['fault']}, {case['where']}: {case['differs']}")
-    write_json([{"benchmark": "faults", **case} for case in cases], arguments.json)
+    if failed := [f"{case['fault']}, {case['where']}: {case['differs']}" for case in cases if not case["survived"]]:
+        raise SystemExit("not survived:\n" + "\n".join(failed))
 
 
 class Arena:
@@ -125,106 +166,150 @@ class Arena:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._number = 0
-        self._whole = folder / "whole"
+        self._limit: float | None = None
         begun = time.monotonic()
-        self._run("run_dir=whole", *SETTINGS)
+        if problem := self._to_its_end("whole"):
+            raise SystemExit(f"the undisturbed run: {problem}")
         self._seconds = time.monotonic() - begun
+        self._limit = 10 * self._seconds + 60
+        self._whole = folder / "whole"
         print(f"an undisturbed run takes {self._seconds:.0f} s", flush=True)
 
-    def kills(self, number: int, draw: random.Random) -> Iterator[dict[str, Any]]:
-        """Kill so often at random times, resume after each; a run that comes to its end gives way to another."""
+    def kills(self, fault: str, number: int, draw: random.Random, *settings: str) -> Iterator[Case]:
+        """Kill so often at random times, go on after each; a run that comes to its end gives way to another."""
         killed = 0
         while killed < number:
-            name, kills = self._name(), 0  # of this run
-            while killed < number:
-                process = self._start(*self._arguments(name))
-                try:
-                    process.communicate(timeout=draw.uniform(0.3, 1.0) * self._seconds)
-                    break
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.communicate()
-                    killed, kills = killed + 1, kills + 1
-            else:
-                self._run(*self._arguments(name))
-            yield from [self._verdict("kill", f"one of {kills} kills of a run", name)] * kills
+            name, kills, problem = self._name(), 0, ""  # of this run
+            while killed < number and not problem:
+                with self._start(*self._arguments(name, *settings)) as process:
+                    try:
+                        _, said = process.communicate(timeout=draw.uniform(0.05, 1.0) * self._seconds)
+                        problem = trouble(process.returncode, said)
+                        break
+                    except subprocess.TimeoutExpired:
+                        process.kill()
+                        process.communicate()
+                        killed, kills = killed + 1, kills + 1
+            problem = problem or self._to_its_end(name, *settings)
+            if problem and not kills:
+                raise SystemExit(f"{fault}: a run that was not killed: {problem}")
+            yield from [self._verdict(fault, f"one of {kills} kills of a run", name, problem)] * kills
 
-    def kills_at_calls(self, function: str, number: int) -> Iterator[dict[str, Any]]:
-        """Kill before and after some calls of a function of `os`, spread over the run."""
+    def early_kills(self, most: int | None) -> Iterator[Case]:
+        """Kill a new run at every file it opens for writing before its first checkpoint; then repeat the command."""
         name = self._name()
-        printed = self._run(
-            *self._arguments(name), before=PRINT_CALLS.format(name=function, last=0, after=False)
-        ).stdout
-        total = int(printed.rpartition("calls ")[2].split()[0])
-        label = "kill at rename" if function == "replace" else f"kill at {function}"
-        for index in range(number):
-            last, after = 1 + index * total // number, index % 2 == 1
+        done = self._run(f"run_dir={name}", *SETTINGS, before=COUNT_CALLS.format(name="open", last=0))
+        before_a_checkpoint = int(done.stdout.rpartition("calls ")[2].split()[0])
+        for call in spread(range(1, before_a_checkpoint + 1), most):
             name = self._name()
-            before = COUNT_CALLS.format(name=function, last=last, after=after)
-            process = self._start(*self._arguments(name), before=before)
-            process.communicate()
-            was_killed = process.returncode == -signal.SIGKILL
-            self._run(*self._arguments(name))
-            where = f"{'after' if after else 'before'} call {last} of {total}"
-            yield self._verdict(label, where, name, "" if was_killed else "it was not killed")
+            killed = self._run(f"run_dir={name}", *SETTINGS, before=COUNT_CALLS.format(name="open", last=call))
+            problem = "" if killed.returncode == -signal.SIGKILL else "it was not killed"
+            problem = problem or self._to_its_end(name)
+            yield self._verdict("kill early", f"after opening {call} of {before_a_checkpoint}", name, problem)
+        name = self._half_way()
+        again = self._run(f"run_dir={name}", *SETTINGS)
+        advised = again.returncode == REFUSED and f"continue it with resume={name}" in again.stderr
+        problem = trouble(again.returncode, again.stderr, REFUSED) or ("" if advised else "it did not say how to go on")
+        problem = problem or self._to_its_end(name)
+        yield self._verdict("kill early", "the same command where a checkpoint is", name, problem)
 
-    def damages(self) -> Iterator[dict[str, Any]]:
-        """Damage each file of the newest of two checkpoints, and go on."""
-        stopped = self._name()
-        self._run(f"run_dir={stopped}", *SETTINGS, "total_env_steps=800")
-        newest = latest_checkpoint(self._folder / stopped)
+    def kills_at_calls(self, function: str, most: int | None) -> Iterator[Case]:
+        """Kill at calls of a function in the second half of a run."""
+        name = self._half_way()
+        done = self._run(f"resume={name}", TO_THE_END, before=COUNT_CALLS.format(name=function, last=0))
+        total = int(done.stdout.rpartition("calls ")[2].split()[-1])
+        for call in spread(range(1, total + 1), most):
+            name = self._half_way()
+            before = COUNT_CALLS.format(name=function, last=call)
+            killed = self._run(f"resume={name}", TO_THE_END, before=before)
+            problem = "" if killed.returncode == -signal.SIGKILL else "it was not killed"
+            problem = problem or self._to_its_end(name)
+            yield self._verdict(f"kill at {function}", f"call {call} of {total}", name, problem)
+
+    def terminations(self, number: int, draw: random.Random) -> Iterator[Case]:
+        """Ask a process to end at a random time; one that has ended before that is no case."""
+        cases, limit = 0, self._seconds
+        while cases < number:
+            name, at = self._name(), draw.uniform(0.05, 0.9) * limit
+            begun = time.monotonic()
+            with self._start(f"run_dir={name}", *SETTINGS) as process:
+                try:
+                    process.communicate(timeout=at)
+                    limit = min(limit, time.monotonic() - begun)
+                    continue
+                except subprocess.TimeoutExpired:
+                    process.terminate()
+                    printed, said = process.communicate(timeout=self._limit)
+            cases += 1
+            saved = "saved; continue with resume=" in printed
+            # Python's own answer to the signal while modules are still being loaded is to die of it.
+            expected = 128 + signal.SIGTERM if saved or process.returncode >= 0 else -signal.SIGTERM
+            problem = trouble(process.returncode, said, expected) or self._to_its_end(name)
+            where = f"after {at:.1f} of {self._seconds:.0f} s, {'saved' if saved else 'before there was a run to save'}"
+            yield self._verdict("SIGTERM", where, name, problem)
+
+    def damages(self, most: int | None) -> Iterator[Case]:
+        """Damage each file of the newest of two checkpoints in each way, and go on."""
+        newest = latest_checkpoint(self._folder / self._half_way())
         files = sorted(path.relative_to(newest) for path in newest.rglob("*") if path.is_file())
-        for file in files:
-            name = self._name()
-            shutil.copytree(self._folder / stopped, self._folder / name)
-            path = latest_checkpoint(self._folder / name) / file
-            content = bytearray(path.read_bytes())
-            middle = len(content) // 2
-            content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
-            path.write_bytes(content)
-            done = self._run(f"resume={name}", "total_env_steps=1200")
+        for way, file in spread([(way, file) for file in files for way in (turn, cut, Path.unlink)], most):
+            name = self._half_way()
+            way(latest_checkpoint(self._folder / name) / file)
+            done = self._run(f"resume={name}", TO_THE_END)
             said = done.stdout + done.stderr
-            named = "is damaged" in said or "not complete" in said
-            yield self._verdict("damage", str(file), name, "" if named else "the damage was not said")
+            named = f"{newest.name} is damaged" in said or "not a complete checkpoint" in said
+            problem = trouble(done.returncode, done.stderr) or ("" if named else "the damage was not said")
+            problem = problem or ("" if "is lost" in said else "what is lost was not said")
+            yield self._verdict("damage", f"{way.__name__} {file}", name, problem)
 
-    def full_disks(self) -> Iterator[dict[str, Any]]:
-        """Let no file grow while checkpoints are written, from the second or from the third on."""
+    def full_disks(self) -> Iterator[Case]:
+        """Let no file grow while checkpoints are written, or ever after, from the second or from the third on."""
         for first in (1, 2):
-            name = self._name()
-            done = self._start(*self._arguments(name), before=FULL.format(first=first))
-            _, printed = done.communicate()
-            said = "NOT SAVED" in printed or "could not be written" in printed
-            self._run(f"resume={name}")
-            yield self._verdict("full disk", f"from checkpoint {first + 1} on", name, "" if said else "it was not said")
+            for stays, what in ((False, "checkpoints"), (True, "any file")):
+                name = self._name()
+                size = 512 if stays else 4096
+                done = self._run(f"run_dir={name}", *SETTINGS, before=FULL.format(first=first, size=size, stays=stays))
+                problem = trouble(done.returncode, done.stderr, 1)
+                said = "NOT SAVED" in done.stdout and "could not be written" in done.stderr
+                problem = problem or ("" if said else "it was not said") or self._to_its_end(name)
+                yield self._verdict("full disk", f"{what}, from checkpoint {first + 1} on", name, problem)
 
-    def clocks(self) -> Iterator[dict[str, Any]]:
+    def clocks(self) -> Iterator[Case]:
         """Stop the wall clock, or let it go backwards."""
         for where, before in (("stands still", STILL), ("goes backwards", BACKWARDS)):
             name = self._name()
-            self._run(*self._arguments(name), before=before)
-            yield self._verdict("clock", where, name)
+            done = self._run(f"run_dir={name}", *SETTINGS, before=before)
+            yield self._verdict("clock", where, name, trouble(done.returncode, done.stderr))
 
-    def not_finite(self) -> Iterator[dict[str, Any]]:
+    def not_finite(self) -> Iterator[Case]:
         """Poison a reward; the run is to end, and its checkpoint to be continued without the poison."""
         name = self._name()
-        process = self._start(*self._arguments(name), before=INFINITE)
-        _, printed = process.communicate()
-        ended = process.returncode == 1 and "is not finite" in printed and "Traceback" not in printed
-        self._run(f"resume={name}")
-        yield self._verdict("not finite", "reward", name, "" if ended else f"exit status {process.returncode}")
+        done = self._run(f"run_dir={name}", *SETTINGS, before=INFINITE)
+        problem = trouble(done.returncode, done.stderr, 1)
+        problem = problem or ("" if "is not finite" in done.stderr else "it was not said") or self._to_its_end(name)
+        yield self._verdict("not finite", "reward", name, problem)
 
     def _name(self) -> str:
         self._number += 1
         return f"run{self._number}"
 
-    def _arguments(self, name: str) -> list[str]:
-        """Return what begins a run, or continues it once it has a checkpoint."""
-        try:
+    def _half_way(self) -> str:
+        """Make a copy of a run that was ended half way, with two checkpoints."""
+        template = self._folder / "half"
+        if not template.exists():
+            done = self._run("run_dir=half", *SETTINGS, HALF_WAY)
+            if problem := trouble(done.returncode, done.stderr):
+                raise SystemExit(f"half of an undisturbed run: {problem}")
+        name = self._name()
+        shutil.copytree(template, self._folder / name)
+        return name
+
+    def _arguments(self, name: str, *settings: str) -> list[str]:
+        """Return what begins a run, also once more where one left no checkpoint, or else continues it."""
+        with contextlib.suppress(FileNotFoundError):
             latest_checkpoint(self._folder / name)
-        except FileNotFoundError:
-            shutil.rmtree(self._folder / name, ignore_errors=True)
-            return [f"run_dir={name}", *SETTINGS]
-        return [f"resume={name}"]
+            return [f"resume={name}", TO_THE_END]
+        return [f"run_dir={name}", *SETTINGS, *settings]
 
     def _start(self, *overrides: str, before: str = "") -> subprocess.Popen[str]:
         program = [str(RECIPE)]
@@ -238,17 +323,55 @@ class Arena:
         )  # fmt: skip
 
     def _run(self, *overrides: str, before: str = "") -> subprocess.CompletedProcess[str]:
-        """Run to the end."""
-        process = self._start(*overrides, before=before)
-        printed = process.communicate()
-        if process.returncode:
-            raise RuntimeError(f"{' '.join(overrides)} ended with {process.returncode}: {printed[1][-2000:]}")
-        return subprocess.CompletedProcess([], 0, *printed)
+        """Run until it ends; one that hangs is killed, and has the status of that."""
+        with self._start(*overrides, before=before) as process:
+            try:
+                printed = process.communicate(timeout=self._limit)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                printed = process.communicate()
+                printed = (printed[0], f"{printed[1]}\nit hung for {self._limit:.0f} s")
+        return subprocess.CompletedProcess(overrides, process.returncode, *printed)
 
-    def _verdict(self, fault: str, where: str, name: str, otherwise: str = "") -> dict[str, Any]:
-        differs = otherwise or difference(self._whole, self._folder / name)
+    def _to_its_end(self, name: str, *settings: str) -> str:
+        """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""
+        done = self._run(*self._arguments(name, *settings))
+        return trouble(done.returncode, done.stderr)
+
+    def _verdict(self, fault: str, where: str, name: str, problem: str) -> Case:
+        """Compare a run that has come to its end with the undisturbed one, and forget it unless they differ."""
+        differs = problem or difference(self._whole, self._folder / name)
         print(f"{fault}, {where}: {differs or 'survived'}", flush=True)
+        if not differs:
+            shutil.rmtree(self._folder / name)
         return {"fault": fault, "where": where, "survived": not differs, "differs": differs}
+
+
+def turn(file: Path) -> None:
+    """Turn the bits of 16 bytes in the middle."""
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 16] = bytes(255 - byte for byte in content[middle : middle + 16])
+    file.write_bytes(content)
+
+
+def cut(file: Path) -> None:
+    """Cut off the second half."""
+    os.truncate(file, file.stat().st_size // 2)
+
+
+def spread(cases: Any, most: int | None) -> list[Any]:
+    """Return at most so many of some cases, evenly spread; all if nothing is asked."""
+    cases = list(cases)
+    number = len(cases) if most is None else min(most, len(cases))
+    return [cases[index * len(cases) // number] for index in range(number)]
+
+
+def trouble(returncode: int, said: str, expected: int = 0) -> str:
+    """Say in what a process did not end as it should, or nothing."""
+    if "Traceback" in said:
+        return f"a traceback: {said.strip().splitlines()[-1][:300]}"
+    return "" if returncode == expected else f"exit status {returncode}, not {expected}: {said.strip()[-300:]}"
 
 
 def difference(whole: Path, other: Path) -> str:

@@ -4,14 +4,15 @@
 
 Each kind of input has a process of its own. A case is either taken or refused by the errors that are promised for it;
 everything else fails it: another error, more than 10 s, a process that dies. An audit hook fails what starts a process,
-opens a connection or writes outside the case's folder.
+opens a connection, compiles a text of the input, or writes, renames or removes anything outside the case's folder.
 
 * `tracks`: track files with turned bytes, pieces of text moved about, and values replaced in their structure; of those
   taken, every hundredth is flown.
 * `actions`: 256 drones at once, fed float32 of random bits, NaN, infinities and huge numbers; a case is a drone's step.
 * `contracts`: `contract.json` of a shipped agent, treated as the tracks are; every twentieth with its actor.
 * `overrides`: one to three settings of `recipes/dreamer_v3.py` with values of any kind, composed, resolved and checked.
-* `checkpoints`: turned bytes and cut files in a checkpoint, half of them with checksums that fit again.
+* `checkpoints`: turned bytes, cut files and pickles that run code in a checkpoint, half of them with checksums that
+  fit again.
 """
 
 import argparse
@@ -43,11 +44,11 @@ from torchrl.envs import InitTracker, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.envs.tracks import Track, TrackError, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.export.onnx_actor import OnnxActor, read_contract
-from dreamer_racing.training.checkpoint import CHECKSUMS, RunCheckpointError, RunCheckpoints, _checksum
+from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, write_checksums
 from dreamer_racing.training.directory import latest_checkpoint
 
 ROOT = Path(__file__).parents[1]
@@ -60,21 +61,24 @@ ODD: tuple[Any, ...] = (
     None, True, "", "x" * 3000, "\0", "é", "1e400", "nan", -1, 0, 1, 2**40, 10**30, -(10**30), 1e-300, 1e300, -1e300,
     math.nan, math.inf, -math.inf, [], {}, [[[[]]]], [0.0] * 5000, {"a": {"b": None}},
 )  # fmt: skip
+MARK = "code_of_an_input"
+"""In every text that is code in some language, to know it if Python compiles it."""
 PIECES = (
+    f"!!python/object/apply:eval ['\"{MARK}\"']", f"!!python/object/apply:exec ['{MARK} = 1']", f"__import__('{MARK}')",
     "&a [*a, *a]", "!!python/object/apply:os.system ['true']", "!!python/name:os.system", "<<: *a", "? [1]", "%YAML 9",
     "---\n", "- ", ": ", "{", "}", "[", "]", "\t", "\x00", "#" * 99, "1e999", ".nan", "0x7f", "2001-01-01", "~", "'",
 )  # fmt: skip
 FORBIDDEN = (
-    "os.symlink",
-    "os.link",
-    "os.system",
-    "os.exec",
-    "os.posix_spawn",
-    "os.fork",
-    "subprocess.Popen",
-    "socket.connect",
-    "socket.bind",
-)
+    "os.symlink", "os.link", "os.system", "os.exec", "os.spawn", "os.posix_spawn", "os.fork", "os.forkpty", "os.kill",
+    "os.putenv", "os.unsetenv", "os.lockf", "pty.spawn", "subprocess.Popen", "socket.connect", "socket.bind",
+    "socket.sendto", "code.__new__",
+)  # fmt: skip
+CHANGING = {
+    "os.remove": ((0, 1),), "os.rmdir": ((0, 1),), "os.mkdir": ((0, 2),), "os.rename": ((0, 2), (1, 3)),
+    "os.truncate": ((0, None),), "os.utime": ((0, 3),), "os.chmod": ((0, 2),), "os.chown": ((0, 3),),
+    "os.setxattr": ((0, None),), "os.removexattr": ((0, None),),
+}  # fmt: skip
+"""Events that change the disk: where among their arguments stand a path and the folder that it is relative to."""
 
 
 class EscapedError(BaseException):
@@ -86,16 +90,29 @@ class HangError(BaseException):
 
 
 def watch(folder: Path) -> None:
-    """From now on fail what starts processes, opens connections or writes outside a folder."""
+    """From now on fail what starts processes, opens connections, compiles input, or changes what lies elsewhere."""
+
+    def is_inside(path: str | bytes | os.PathLike[str] | int, relative_to: int | None = -1) -> bool:
+        if isinstance(path, int):
+            return True  # opened before, which was looked at
+        place = Path(os.fsdecode(path))
+        if relative_to not in (-1, None):
+            place = Path(os.readlink(f"/proc/self/fd/{relative_to}")) / place
+        place = Path(os.path.normpath(place.absolute()))
+        return place.is_relative_to(folder) or "__pycache__" in place.parts
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event in FORBIDDEN:
             raise EscapedError(f"{event}{arguments}")
+        for index, folder_index in CHANGING.get(event, ()):
+            if not is_inside(arguments[index], None if folder_index is None else arguments[folder_index]):
+                raise EscapedError(f"{event}{arguments}")
+        if event == "compile" and MARK in str(arguments[0]):
+            raise EscapedError(f"compiles {arguments[0]!r}")
         if event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
             path, mode, flags = arguments
             writes = any(letter in (mode or "") for letter in "wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR)
-            inside = Path(os.fsdecode(path)).absolute().is_relative_to(folder)
-            if writes and not inside and os.fsdecode(path) != os.devnull and "__pycache__" not in os.fsdecode(path):
+            if writes and not is_inside(path) and os.fsdecode(path) != os.devnull:
                 raise EscapedError(f"opens {path!r} for writing")
 
     sys.addaudithook(hook)
@@ -141,6 +158,13 @@ def replace_somewhere(value: Any, draw: random.Random) -> Any:
     return value
 
 
+def fly(track: Track) -> None:
+    """Make a step on a track."""
+    worlds = RaceWorlds(track, 2, from_pixels=False)
+    worlds.reset()
+    worlds.step(torch.zeros(2, 4))
+
+
 def tracks(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
     """Yield cases that load a spoilt track file."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(TRACKS.glob("*.yaml"))]
@@ -156,11 +180,10 @@ def tracks(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
         except TrackError:
             return False
         if draw.random() < 0.01:
-            worlds = RaceWorlds(track, 2, from_pixels=False)
-            worlds.reset()
-            worlds.step(torch.zeros(2, 4))
+            fly(track)
         return True
 
+    fly(load_track("circle"))  # loads its libraries before the watch begins
     while True:
         yield case
 
@@ -250,6 +273,22 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
         yield case
 
 
+class Payload:
+    """What a pickle that calls a function looks like."""
+
+    def __init__(self, call: tuple[Any, ...]) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._call
+
+
+PAYLOADS: tuple[tuple[Any, ...], ...] = (
+    (os.system, ("true",)), (exec, (f"{MARK} = 1",)), (eval, (f"'{MARK}'",)), (os.mkdir, ("../escaped",)),
+    (open, ("../escaped", "w")), (os.remove, (__file__,)), (os.rename, (__file__, "escaped")), (os._exit, (3,)),
+)  # fmt: skip
+
+
 def checkpoints(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
     """Yield cases that restore a damaged checkpoint."""
 
@@ -271,16 +310,17 @@ def checkpoints(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool
         shutil.copytree(folder / "whole", place)
         newest = latest_checkpoint(place)
         path = newest / draw.choice(files)
+        if path.suffix == ".pt" and draw.random() < 0.3:
+            torch.save({"weight": Payload(draw.choice(PAYLOADS))}, path)
         content = bytearray(path.read_bytes())
         if draw.random() < 0.3:
             del content[draw.randrange(len(content)) :]
-        for _ in range(draw.choice((1, 1, 16))):
+        for _ in range(draw.choice((0, 1, 1, 16))):
             if content:
                 content[draw.randrange(len(content))] = draw.randrange(256)
         path.write_bytes(content)
         if draw.random() < 0.5:
-            sums = {name.as_posix(): _checksum(newest / name) for name in files if name.name != CHECKSUMS}
-            (newest / CHECKSUMS).write_text(json.dumps(sums))
+            write_checksums(newest)
         try:
             run(place).load()
         except (FileNotFoundError, RunCheckpointError):

@@ -17,8 +17,9 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
+from dreamer_racing.envs.race.flown_laps import FlownLaps, fly_laps
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import FlownLaps, ScriptedPilot, fly_laps
+from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.race.racing_line import LineLimits
 from dreamer_racing.envs.tracks import PLAIN_TRACKS
 

@@ -14,8 +14,8 @@ in ``large`` (38.4 M parameters, 5,108 GFLOP), and the peer shall not look slow 
 
 Each shape has two variants. As TorchRL has it, imagination records a graph that REINFORCE never uses, and products are
 at the highest float32 precision. ``tuned`` imagines without gradients, which TorchRL has no option for, sets
-``float32_matmul_precision`` to medium and keeps freed memory as ``learner.py`` does for ours, and on a GPU trains in
-bfloat16.
+``float32_matmul_precision`` to high, on a GPU to medium (which a CPU with AMX would take for bfloat16), and keeps freed
+memory as ``learner.py`` does for ours, and on a GPU trains in bfloat16.
 
 Shape legend: B batch, T time, H horizon.
 
@@ -120,12 +120,13 @@ def measure_stock(
         threads: Torch's threads.
         updates: How many to time, after 3 of warm-up.
         shape: Key of ``SHAPES``.
-        tuned: Imagine without gradients, at medium precision.
+        tuned: Imagine without gradients, at high or medium precision.
     """
     torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision("medium" if tuned else "highest")
-    torch.manual_seed(0)
     cuda = device.startswith("cuda")
+    precision = ("medium" if cuda else "high") if tuned else "highest"
+    torch.set_float32_matmul_precision(precision)
+    torch.manual_seed(0)
     stepper = make_stepper(SHAPES[shape], horizon, device, tuned)
     sample = make_sample(SHAPES[shape], batch, device)
     compiled, captured = stepper.resolve(torch.device(device))
@@ -147,7 +148,7 @@ def measure_stock(
     limit = matmul_speed(device, torch.bfloat16 if tuned and cuda else torch.float32)
     flops = count_flops(stepper, sample)
     backend = "+".join(name for name, used in (("compile", compiled), ("graph", captured)) if used) or "eager"
-    changes = "+no_grad+medium" + ("+bf16" if cuda else "") if tuned else ""
+    changes = f"+no_grad+{precision}" + ("+bf16" if cuda else "") if tuned else ""
     return {
         "benchmark": "learner", "size": f"torchrl {shape}", "loss": "reconstruction", "actor": "reinforce",
         "backend": backend + changes, "batch": "x".join(map(str, batch)), "horizon": horizon,

@@ -24,6 +24,7 @@ PAGE = ROOT / "docs" / "options.md"
 sys.path.append(str(ROOT / "recipes"))
 
 # Below code, because it is found only with the recipes' folder on the path.
+import dashboard  # noqa: E402
 import doctor  # noqa: E402
 import fly  # noqa: E402
 import hil  # noqa: E402
@@ -33,7 +34,7 @@ import tracks  # noqa: E402
 from composing import schema  # noqa: E402
 
 from dreamer_racing.settings import ALLOWED  # noqa: E402
-from dreamer_racing.training.schedule import Clock  # noqa: E402
+from dreamer_racing.training.schedule import RampClock  # noqa: E402
 
 COMMON, RECIPES = schema.RunConfig, tuple(schema.RECIPES.values())
 OTHERS = (
@@ -43,6 +44,7 @@ OTHERS = (
     schema.ExportConfig,
     schema.PlotConfig,
     fly.FlyConfig,
+    dashboard.DashboardConfig,
     hil.HilConfig,
     plant.PlantConfig,
     sim_to_real.SimToRealConfig,
@@ -97,7 +99,7 @@ def rows(config: type, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
             continue
         if dataclasses.is_dataclass(kind):
             if kind is schema.Ramp and field.name in said:
-                clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in Clock)
+                clocks = "`by`: " + ", ".join(f"`{clock.value}`" for clock in RampClock)
                 yield (
                     f"{name}.{', .'.join(parts.name for parts in dataclasses.fields(kind))}",
                     ", ".join(default_of(part) for part in dataclasses.fields(kind)),

@@ -119,8 +119,6 @@ def command_line() -> str:
 
 
 def _cpu() -> str:
-    from dreamer_racing.machine import available_cpus
-
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line for line in lines if line.startswith("model name")]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from composing.command_line import plain_errors
 from composing.entry import recipe
-from composing.examination import Finding, State, examine
+from composing.examination import Diagnosis, Verdict, examine
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -59,11 +59,11 @@ def main(config: DictConfig) -> None:
             print(line(finding), flush=True)
     if config.json:
         print(json.dumps([{**finding._asdict(), "state": finding.state.value} for finding in findings], indent=1))
-    if any(finding.state is State.wrong for finding in findings):
+    if any(finding.state is Verdict.wrong for finding in findings):
         raise SystemExit(1)
 
 
-def line(finding: Finding) -> str:
+def line(finding: Diagnosis) -> str:
     """Say a finding in a line, and its remedy in another."""
     remedy = f"\n{'':25}→ {finding.remedy}" if finding.remedy else ""
     return f"{finding.what:<14} {finding.state.value:<9} {finding.found}{remedy}"

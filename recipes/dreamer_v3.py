@@ -28,7 +28,7 @@ from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, computes_bfloat16
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, clock_times, make_agent, scheduled
+from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import Collection, DreamerConfig, register
 from composing.sharing import share_of
 from omegaconf import DictConfig, OmegaConf
@@ -121,7 +121,7 @@ class DreamerRun(ReplayRun):
         """Set everything that is scheduled to its value at this share of the run."""
         self.learner.actor_waits = self.lag.waits
         times = clock_times(self.config, self.counters["env_steps"], self.passes)
-        self.learner.adjust(**scheduled(self.config, times))
+        self.learner.adjust(**scheduled_numbers(self.config, times))
         ramp = self.config.schedule.start_on_line
         if ramp.to is not None:
             share = ramp.at(self.config.env.start_on_line, times)
@@ -136,10 +136,14 @@ class DreamerRun(ReplayRun):
             assert latents is not None, "the update left them"
             self.replay.refresh(batch["index"], latents["belief"], latents["state"])
 
-    def save(self) -> Path:
-        """Take in the rollout that is under way, if there is one, and save."""
+    def settle(self) -> None:
+        """Take in the rollout that is under way, if there is one."""
         if isinstance(self.rollouts, OverlappedRollouts) and (rollout := self.rollouts.drain()) is not None:
             self.take_in(rollout)
+
+    def save(self) -> Path:
+        """Save everything, if the processes' networks are still the same."""
+        self.learner.check_finite()  # first: weights that are no numbers are never the same
         parallel.check_same([*self.learner.agent.parameters()])
         return super().save()
 

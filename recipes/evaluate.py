@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from composing.arena import make_report, worlds_of
-from composing.command_line import plain_errors, start_logging
+from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
 from composing.schema import EvaluateConfig, register
@@ -30,10 +30,9 @@ from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import EVALUATION, RunDirectory, replace_text
 
 PROTOCOLS = ("nominal", "full")
-RESULT = "evaluation.json"
 
 register()
 
@@ -48,19 +47,20 @@ def main(config: DictConfig) -> None:
         check(settings)
         restored = restore(settings)
         StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
-        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, RESULT)
+        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
-    if report:
-        written = evaluate_nominal(report)
-    else:
-        results = evaluate_fully(settings, restored, directory)
-        written = describe(results, restored.trained.env.preset)
-    written["provenance"] = restored.provenance(settings, time.monotonic() - started)
-    written["provenance"]["start_noise"] = settings.start_noise
-    if not report:
-        write_markdown(directory, results, written["provenance"])
-    (directory / RESULT).write_text(json.dumps(written, indent=2, allow_nan=False) + "\n")
+    with plain_disk_errors():
+        if report:
+            written = evaluate_nominal(report)
+        else:
+            results = evaluate_fully(settings, restored, directory)
+            written = describe(results, restored.trained.env.preset)
+        written["provenance"] = restored.provenance(settings, time.monotonic() - started)
+        written["provenance"]["start_noise"] = settings.start_noise
+        if not report:
+            write_markdown(directory, results, written["provenance"])
+        replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
     print(f"\nwritten to {directory}")
 
 
@@ -111,8 +111,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     if config.episodes < EPISODES:
         print(f"note: the protocol asks for {EPISODES} episodes of each condition; episodes={config.episodes}")
     trained = restored.trained
-    worlds = {**worlds_of(trained), "from_pixels": trained.env.from_pixels}
-    policy = restored.flyer.evaluation_policy()
+    policy, worlds = restored.flyer.evaluation_policy(), worlds_of(trained)
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)

@@ -24,21 +24,23 @@ from composing.checks import check_variant
 from composing.command_line import merge_overrides, override_key
 from composing.entry import in_plain_words, recipe
 from composing.report import FAILURES
+from composing.saved import read_yaml
 from composing.schema import ExperimentConfig, RunConfig, register
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig
 
+from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
-RECIPES = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
 
 # Launchers send configurations to processes of theirs, which must find the modules of this folder.
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(RECIPES), os.environ.get("PYTHONPATH")]))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
 
 register()
 
@@ -105,7 +107,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     overrides = merge_overrides(chosen, [override for override in given if override_key(override) not in OWN])
     overrides += [*config.variants[config.variant], *config.overrides]
     wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
-    recipe = [sys.executable, str(RECIPES / f"{config.algorithm}.py")]
+    recipe = [sys.executable, str(FOLDER / f"{config.algorithm}.py")]
     try:
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:
@@ -122,7 +124,7 @@ def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
     """The override that a run's recipe chose for tuned=auto, which brings a length of its own."""
     if "tuned" in settings_of(overrides):
         return None
-    saved = settings_of(OmegaConf.load(RunDirectory(run_dir).overrides))
+    saved = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig))
     return f"tuned={saved['tuned']}" if "tuned" in saved else None
 
 
@@ -132,7 +134,7 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
     Raises:
         ValueError: the message names the overrides that differ.
     """
-    saved, wanted = settings_of(OmegaConf.load(RunDirectory(run_dir).overrides)), settings_of(overrides)
+    saved, wanted = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
     if differing:
@@ -146,8 +148,17 @@ def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
 
 
 def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
-    """Overrides by name, their values as YAML understands them; without those that do not change what a run is."""
-    values = {override_key(str(override)): yaml.safe_load(str(override).partition("=")[2]) for override in overrides}
+    """Overrides by name, their values as YAML understands them; without those that do not change what a run is.
+
+    Raises:
+        ValueError: a value is no YAML.
+    """
+    values = {}
+    for override in map(str, overrides):
+        try:
+            values[override_key(override)] = yaml.safe_load(override.partition("=")[2])
+        except yaml.YAMLError as error:
+            raise ValueError(f"The override {shortened(override)} has no value that can be read.") from error
     return {name: value for name, value in values.items() if name not in ("run_dir", "total_env_steps")}
 
 

@@ -22,13 +22,14 @@ from composing.arena import worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
-from composing.saved import trained_config
+from composing.saved import read_yaml, trained_config
 from composing.schema import DreamerConfig, ExportConfig, is_race, register
 from composing.usage import command
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
@@ -111,7 +112,6 @@ def prepare(
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
         num_envs=1,
-        from_pixels=trained.env.from_pixels,
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         num_threads=1,
@@ -137,6 +137,7 @@ def prepare(
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
         track=trained.track,
+        track_sha256=hash_track(load_track(worlds_of(trained)["track"])),
         preset=trained.env.preset,
     )
     return step, contract, flight
@@ -187,24 +188,19 @@ def describe(
 
 def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
     """Return a run's starts before a checkpoint of so many env_steps, overrides without what is of one machine."""
-    run_dir = config_folder(checkpoint)
-    starts = RunDirectory(run_dir).read_starts() or RunDirectory(run_dir.parent).read_starts()  # best/ lies in the run
     return [
         start | {"overrides": [text for text in start["overrides"] if override_key(text) not in OF_A_MACHINE]}
-        for start in starts
+        for start in RunDirectory(config_folder(checkpoint)).run.read_starts()
         if start["env_steps"] < env_steps
     ]
 
 
 def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
     """Return the command that trains such an agent, without what is of one machine; None if the run did not keep it."""
-    run_dir = config_folder(checkpoint)
-    # The best of a run lies inside of it.
-    kept = [RunDirectory(folder).overrides for folder in (run_dir, run_dir.parent)]
-    path = next((path for path in kept if path.exists()), None)
-    if path is None:
+    path = RunDirectory(config_folder(checkpoint)).run.overrides
+    if not path.exists():
         return None
-    overrides = [text for text in map(str, OmegaConf.load(path)) if override_key(text) not in OF_A_MACHINE]
+    overrides = [text for text in map(str, read_yaml(path, ListConfig)) if override_key(text) not in OF_A_MACHINE]
     return f"{command(trained.algorithm)} {shlex.join(overrides)}"
 
 
@@ -217,7 +213,7 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track; the message says how to make one.
     """
-    path = Path(config.evaluation or RunDirectory(results_of(checkpoint)).evaluation / "evaluation.json")
+    path = Path(config.evaluation or RunDirectory(results_of(checkpoint)).evaluation_file)
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")

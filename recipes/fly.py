@@ -35,9 +35,11 @@ from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandPolicy, PygameSticks, check_by_hand
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.protocol import fly as fly_races
+from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.training.directory import EVALUATION
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
@@ -124,7 +126,7 @@ def fly(config: FlyConfig) -> None:
     write(Path(config.run_dir), track, result)
 
 
-def fly_pilot(config: FlyConfig) -> tuple[Track, Evaluation]:
+def fly_pilot(config: FlyConfig) -> tuple[str | Track, Evaluation]:
     """Fly by the true state."""
     pilot, preset = config.pilot or PILOT, config.preset or PRESET
     camera = Camera()
@@ -143,7 +145,7 @@ def fly_pilot(config: FlyConfig) -> tuple[Track, Evaluation]:
     else:
         result = evaluate(env, PILOTS[pilot](env.track, env.worlds.parameters), episodes=1)
     env.close()
-    return env.track, result
+    return config.track or TRACK, result
 
 
 def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
@@ -160,7 +162,7 @@ def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
         sticks.close()
 
 
-def fly_agent(config: FlyConfig) -> tuple[Track, Evaluation]:
+def fly_agent(config: FlyConfig) -> tuple[str | Track, Evaluation]:
     """Fly the deterministic policy of a trained agent."""
     with plain_errors():
         race = EvaluateConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
@@ -171,19 +173,22 @@ def fly_agent(config: FlyConfig) -> tuple[Track, Evaluation]:
                 raise ValueError(
                     f"{name}={given}: {config.agent} was trained with {name}={trained}, and flies with nothing else."
                 )
-        worlds = worlds_of(restored.trained) | {"from_pixels": restored.trained.env.from_pixels, "seed": config.seed}
+        worlds = worlds_of(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
-    return track, fly_races(restored.flyer.evaluation_policy(), worlds, episodes=1)
+    policy, judge = restored.flyer.evaluation_policy(), restored.flyer.judge()
+    return worlds["track"], fly_races(policy, worlds, episodes=1, judge=judge)
 
 
-def write(directory: Path, track: Track, result: Evaluation) -> None:
+def write(directory: Path, named: str | Track, result: Evaluation) -> None:
     """Write numbers, plot and, of flights with images, video and GIF, and say where."""
-    trajectory = result.trajectories[0]
-    (directory / "evaluation.json").write_text(result.to_json())
+    track, trajectory = load_track(named), result.trajectories[0]
+    (directory / EVALUATION).write_text(result.to_json())
+    stored = write_flight(directory / "flight", trajectory, track.name if isinstance(named, Track) else named)
     plot_top_down(track, trajectory, directory / "top_down.png")
+    files = f"{directory}: {EVALUATION}, {', '.join(stored)}, top_down.png"
     if trajectory.pixels is None:
-        print(f"{'files':<18} {directory}: evaluation.json, top_down.png (there is no video: the agent sees numbers)")
+        print(f"{'files':<18} {files} (there is no video: the agent sees numbers)")
         return
     words = race_words(track, trajectory)
     film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
@@ -192,7 +197,7 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
     frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
     gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
     size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
-    print(f"{'files':<18} {directory}: evaluation.json, top_down.png, onboard.mp4, onboard.gif ({size / 1e6:.2f} MB)")
+    print(f"{'files':<18} {files}, onboard.mp4, onboard.gif ({size / 1e6:.2f} MB)")
 
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:

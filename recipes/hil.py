@@ -16,103 +16,38 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_type_hints
+from typing import Any, NamedTuple, cast
 
-from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
+from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
+from composing.flight import (
+    HilConfig,
+    check,
+    check_flight,
+    link_config,
+    make_chain,
+    make_flyer,
+    make_operator,
+    pose_config,
+    stamping_of,
+)
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
-from dreamer_racing.hil.battery import STALE, BatteryConfig
-from dreamer_racing.hil.betaflight import rate_map
-from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import ChainConfig, FlightChain, Outputs, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
-from dreamer_racing.hil.links import HEARING, LinkConfig, make_link
+from dreamer_racing.hil.battery import STALE
+from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
+from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
-from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
 from dreamer_racing.hil.pose import PoseSource
-from dreamer_racing.hil.pose_sources import PoseConfig, make_poses
+from dreamer_racing.hil.pose_sources import make_poses
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
-from dreamer_racing.hil.safety import SafetyLimits
-from dreamer_racing.hil.stamping import Stamping
-from dreamer_racing.hil.sticks import ThrustMap
 from dreamer_racing.hil.view import LiveView
-from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
 
-PILOT = "pilot"
-PILOT_RATE = 50.0  # Hz
-SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
 STATISTICS = "statistics.json"
-
-
-LimitsConfig = make_dataclass(
-    "LimitsConfig",
-    [
-        (name, float | None if kind in (float, int) else list[float] | None, field(default=None))
-        for name, kind in get_type_hints(SafetyLimits).items()
-    ],
-)
-"""`SafetyLimits` by their names; null: the default, or what the track says."""
-
-
-@dataclass
-class HilConfig:
-    """`recipes/hil.py`."""
-
-    actor: str | None = None  # pilot, an agent that ships by its name, or the path of an .onnx file or an agent
-    track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
-    arm: bool = False  # whether the vehicle may be armed at all
-    laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
-    duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
-    patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
-    rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
-    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
-    run_dir: str | None = None  # null: runs/hil_<track>_<time>
-    replay: str | None = None  # a flight to play through the chain again
-    report: str | None = None  # a flight to draw and to sum up
-    against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to draw beside it
-
-    pose: str = "udp"  # udp | mavlink | ros2
-    pose_host: str = "127.0.0.1"  # to listen on
-    pose_port: int = setting(9100, Range(1, 65535))
-    pose_device: str | None = None  # pose=mavlink: a serial port instead
-    pose_baud: int | None = setting(None, Range(1))  # of it; null: 57600
-    pose_topic: str | None = None  # pose=ros2
-    pose_message: str | None = None  # which kind of message; null: ODOMETRY, or PoseStamped
-    smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities where poses come without
-    # a pose's time: receive (arrival less latency) | sender (its stamp); null: receive over UDP, else sender
-    stamping: Stamping | None = None
-    latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
-
-    operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
-    operator_host: str = "127.0.0.1"  # to listen on
-    operator_port: int = setting(9102, Range(1, 65535))
-
-    link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
-    link_host: str = "127.0.0.1"  # to send to
-    link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
-    device: str | None = None  # serial port
-    baud: int | None = setting(None, Range(1))  # null: the protocol's own
-    arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
-    mass: float | None = setting(None, POSITIVE)  # kg, with battery
-    full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
-    reference_voltage: float | None = setting(None, POSITIVE)  # V
-    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now; until a link that hears of it says more
-    voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
-    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
-
-    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
-    renderer: str = "auto"  # auto | egl | osmesa
-    record: bool = True  # write the flight to a file
-    view: int | None = setting(None, Range(1, 65535))  # port of a page on this machine that shows what the actor sees
-
 
 ConfigStore.instance().store(name="hil_schema", node=HilConfig)
 
@@ -137,37 +72,6 @@ def plainly() -> Iterator[None]:
             yield
         except ImportError as error:
             raise ValueError(str(error)) from error
-
-
-def check(config: HilConfig) -> None:
-    """Refuse what does not go together.
-
-    Raises:
-        ValueError: the message names the field and what is allowed.
-    """
-    check_settings(config)
-    wanted = [name for name in ("actor", "replay", "report") if getattr(config, name) is not None]
-    if len(wanted) != 1:
-        raise ValueError(
-            f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
-            "agent that ships, actor=pilot track=kidney the scripted pilot."
-        )
-    if config.operator not in ("auto", *OPERATORS):
-        raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
-    if config.operator == "timed" and config.link not in SIMULATED:
-        raise ValueError(
-            f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
-        )
-    by_itself = config.operator in ("auto", "timed") and config.link in SIMULATED
-    if by_itself and not config.link_host.startswith("127."):
-        raise ValueError(
-            f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
-        )
-    if config.against and not config.report:
-        raise ValueError(f"against={config.against} is for report=.")
-
-
-OPERATORS = ("keyboard", "udp", "timed")
 
 
 def fly(config: HilConfig) -> int:
@@ -203,6 +107,8 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     config.stamping = stamping_of(config)
     flyer, contract = make_flyer(config)
     track = load_track(config.track or contract["source"]["track"])
+    for note in check_flight(config, contract, track):
+        print(f"note: {note}")
     chain = make_chain(config, flyer, track)
     opened.callback(chain.close)
     folder = Path(config.run_dir) if config.run_dir else new_run_dir("hil", track.name)
@@ -239,127 +145,6 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
     if config.record:
         (flight.folder / STATISTICS).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
-
-
-def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
-    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
-
-    Args:
-        config: Says who.
-        track: That a pilot is to fly; None: the one of its name.
-    """
-    assert config.actor is not None, "checked"
-    if config.actor == PILOT:
-        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
-
-        if config.track is None:
-            raise ValueError("track= is missing: actor=pilot has none of its own.")
-        rate = config.rate or PILOT_RATE
-        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config.track)
-    path = agent_path(config.actor)
-    flyer = ActorFlyer(path)
-    check_contract(flyer.contract, config.track or flyer.contract["source"]["track"], config.rate)
-    return flyer, flyer.contract
-
-
-def pilot_contract(track: str) -> dict[str, Any]:
-    """Return what an actor's contract would say of the pilot."""
-    drone = QuadrotorParameters()
-    channels = [
-        {"name": f"body_rate_{axis}", "unit": "rad/s", "offset": 0.0, "scale": rate}
-        for axis, rate in zip("xyz", drone.body_rate_max, strict=True)
-    ]
-    scale = drone.collective_thrust_scale
-    thrust = {"name": "collective_thrust", "unit": "m/s^2", "offset": scale, "scale": scale}
-    return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
-
-
-def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
-    """Make the chain of a flyer."""
-    given = {name: value for name, value in vars(config.limits).items() if value is not None}
-    limits = SafetyLimits.of_track(track, **given)
-    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config))
-    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
-    return FlightChain(flyer, track, settings, camera)
-
-
-def stamping_of(config: HilConfig) -> Stamping:
-    """Return how poses are stamped: what is read when the loop comes to it looks younger than it is."""
-    if config.stamping is not None:
-        return config.stamping
-    kernel = config.pose == "udp" or (config.pose == "mavlink" and config.pose_device is None)
-    return Stamping.receive if kernel else Stamping.sender
-
-
-def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> LinkConfig:
-    """Return what the link needs: sticks as `dreamer_racing.hil.betaflight` has the flight controller set."""
-    numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
-    missing = [name for name, number in numbers.items() if number is None]
-    if missing and config.link not in ("simulated", "udp"):
-        raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
-    thrust = None if missing else ThrustMap(**numbers)
-    if thrust is not None:
-        check_battery(config, thrust)
-    port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
-    return LinkConfig(
-        config.link,
-        config.link_host,
-        port,
-        config.device,
-        config.baud,
-        rate_map(contract),
-        thrust,
-        config.arm_channel,
-        rate,
-    )
-
-
-def battery_config(config: HilConfig) -> BatteryConfig | None:
-    """Return what is known of the battery; None where nothing more comes to be known."""
-    if config.link not in HEARING or config.voltage is None:
-        return None
-    return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
-
-
-def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
-    """Refuse to believe voltages that the thrust map cannot reckon with: in flight nothing may be refused.
-
-    Raises:
-        ValueError: The message names the setting and the voltage.
-    """
-    battery = battery_config(config)
-    for voltage in () if battery is None else battery.limits:
-        try:
-            replace(thrust, voltage=voltage)
-        except ValueError as error:
-            raise ValueError(
-                f"voltage_tolerance={config.voltage_tolerance:g}: with it {voltage:.4g} V would be believed. {error}"
-            ) from error
-
-
-def pose_config(config: HilConfig) -> PoseConfig:
-    """Return where poses come from."""
-    return PoseConfig(
-        name=config.pose,
-        host=config.pose_host,
-        port=config.pose_port,
-        device=config.pose_device,
-        baud=config.pose_baud,
-        topic=config.pose_topic,
-        message=config.pose_message,
-        smoothing=config.smoothing,
-    )
-
-
-def make_operator(config: HilConfig) -> OperatorSource:
-    """Open where the operator's word comes from, and say which it is if that was left open."""
-    name = config.operator
-    if name == "auto":
-        name = "timed" if config.link in SIMULATED else "keyboard"
-        print(f"operator: {name} (operator=auto, link={config.link})")
-    if name == "udp":
-        return UdpOperator(config.operator_port, config.operator_host)
-    return TimedOperator() if name == "timed" else KeyboardOperator()
 
 
 def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from composing.arena import worlds_of
-from composing.command_line import plain_errors, start_logging
+from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
 from composing.schema import PerceptionConfig, RunConfig, register
@@ -29,6 +29,7 @@ from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import check_settings
+from dreamer_racing.training.directory import replace_text
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"
@@ -54,7 +55,8 @@ def main(config: DictConfig) -> None:
     looked = fly_and_look(settings, restored, tracks)
     lesions = {noise: fly_lesioned(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
     provenance = restored.provenance(settings, time.monotonic() - started)
-    write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
+    with plain_disk_errors():
+        write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
     print(f"\nwritten to {directory}")
 
 
@@ -144,7 +146,7 @@ def write(
         ],
         "provenance": provenance,
     }
-    (directory / RESULT).write_text(json.dumps(numbers, indent=2, allow_nan=False) + "\n")
+    replace_text(directory / RESULT, json.dumps(numbers, indent=2, allow_nan=False) + "\n")
 
 
 def to_markdown(

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from composing.arena import make_env
 from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
-from composing.checks import check
+from composing.checks import check_ppo
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
@@ -60,7 +60,7 @@ def resolve(config: DictConfig) -> DictConfig:
 
 def build(config: PPORunConfig, overrides: list[str]) -> PPORun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
-    check(config)
+    check_ppo(config)
     lock = claim(config)
     env = make_env(config)
     learner = make_learner(config, Interface.of(env), config.device)

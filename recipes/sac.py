@@ -20,7 +20,7 @@ from composing.building import (
     resolve_baseline,
     seed_generators,
 )
-from composing.checks import check, check_replay
+from composing.checks import check_sac
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
@@ -60,8 +60,7 @@ def resolve(config: DictConfig) -> DictConfig:
 
 def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
-    check(config)
-    check_replay(config)
+    check_sac(config)
     lock = claim(config)
     env = make_env(config)
     learner = make_learner(config, Interface.of(env), config.device)

@@ -2,6 +2,7 @@
 
     python recipes/sim_to_real.py actor=kidney preset=easy
     python recipes/sim_to_real.py actor=pilot track=figure8 flights=10 processes=2
+    python recipes/sim_to_real.py actor=kidney preset=easy beside=pilot      # both, in one picture
 
 Flies the whole chain of recipes/hil.py (images, actor, safety, packets) against the plant of recipes/plant.py, without
 a clock: commands 0 to 100 ms late, mass and thrust 20 % off, noisy poses, few poses. Writes sim_to_real.json and .png.
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
@@ -24,14 +25,14 @@ from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.figures.sim_to_real import plot_study
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
 from dreamer_racing.settings import COUNT, Range, check_settings, setting
 
 PILOT = "pilot"
-RESULT = "sim_to_real.json"
+RESULT, RESULT_BESIDE = "sim_to_real.json", "sim_to_real_pilot.json"
 
 
 @dataclass
@@ -45,7 +46,8 @@ class SimToRealConfig:
     flights: int = setting(5, COUNT)  # of each value, with different noise
     sweeps: list[str] | None = None  # of what is changed; null: all
     processes: int | None = setting(None, COUNT)  # that fly at a time; null: one for each core
-    beside: str | None = None  # sim_to_real.json of another study, to be drawn in the same picture
+    # in the same picture: pilot flies the same too; or sim_to_real.json of another study
+    beside: str | None = None
     run_dir: str | None = None  # null: runs/sim_to_real_<track>_<time>
 
 
@@ -61,19 +63,30 @@ def main(config: DictConfig) -> None:
         track, make_flyer = check(settings)
         folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track)
         folder.mkdir(parents=True, exist_ok=True)
-        others = [json.loads(Path(settings.beside).read_text(encoding="utf-8"))] if settings.beside else []
-    sweeps = settings.sweeps or list(SWEEPS)
-    processes = settings.processes or available_cpus()
+        studies = [(settings.actor, make_flyer)]
+        others = []
+        if settings.beside == PILOT:
+            studies.append((PILOT, pilot_on(track, settings)))
+        elif settings.beside:
+            others.append(json.loads(Path(settings.beside).read_text(encoding="utf-8")))
+    results = [fly(actor, make, track, settings) for actor, make in studies]
+    for result, name in zip(results, (RESULT, RESULT_BESIDE), strict=False):
+        (folder / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    plot_study([*results, *others], folder / RESULT.replace("json", "png"))
+    print(f"written to {folder}")
+
+
+def fly(actor: str, make_flyer: Callable[[], Flyer], track: str, config: SimToRealConfig) -> dict[str, Any]:
+    """Fly every value of every sweep, print what came of each flight, and return all with where it comes from."""
     flown = []
-    for flight in study(make_flyer, track, settings.preset, settings.flights, sweeps, processes):
+    sweeps, processes = config.sweeps or list(SWEEPS), config.processes or available_cpus()
+    for flight in study(make_flyer, track, config.preset, config.flights, sweeps, processes):
         flown.append(flight._asdict())
         lap = "–" if flight.lap_time is None else f"{flight.lap_time:.2f} s"
-        print(f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}", flush=True)
-    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": settings.actor, "track": track}
-    result = {"provenance": {**made, "preset": settings.preset, "flights": settings.flights}, "flights": flown}
-    (folder / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    plot_study([result, *others], folder / RESULT.replace("json", "png"))
-    print(f"written to {folder}")
+        words = f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}"
+        print(f"{actor}: {words}", flush=True)
+    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": actor, "track": track}
+    return {"provenance": {**made, "preset": config.preset, "flights": config.flights}, "flights": flown}
 
 
 def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
@@ -90,10 +103,20 @@ def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
     if config.actor == PILOT:
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
-        return config.track, partial(PilotFlyer, load_track(config.track), config.preset, config.rate)
+        if config.beside == PILOT:
+            raise ValueError("beside=pilot and actor=pilot: it would fly the same twice; leave one out.")
+        return config.track, pilot_on(config.track, config)
     path = agent_path(config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
-    return config.track or contract["source"]["track"], partial(ActorFlyer, path)
+    track = config.track or contract["source"]["track"]
+    if note := check_contract(contract, load_track(track)):
+        print(f"note: {note}")
+    return track, partial(ActorFlyer, path)
+
+
+def pilot_on(track: str, config: SimToRealConfig) -> Callable[[], Flyer]:
+    """Return what makes the pilot."""
+    return partial(PilotFlyer, load_track(track), config.preset, config.rate)
 
 
 if __name__ == "__main__":

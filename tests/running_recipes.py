@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import csv
 import importlib
+import os
+import select
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
+from typing import Self
 
 import hydra
 from omegaconf import OmegaConf
@@ -67,3 +72,50 @@ def build(*overrides: str) -> None:
     with command_line.plain_errors():
         config = dreamer.resolve(compose("dreamer_v3", "model=debug", "env.from_pixels=false", *overrides))
         dreamer.build(OmegaConf.to_object(config), list(overrides)).close()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Process:
+    """A recipe, or another program by its path, that runs, and what it has said so far."""
+
+    def __init__(self, name: str, *overrides: str) -> None:
+        path = Path(name) if name.endswith(".py") else ROOT / "recipes" / f"{name}.py"
+        command = [sys.executable, str(path), *overrides]
+        self.running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0)
+        self.said = ""
+
+    def listen(self, seconds: float) -> None:
+        stdout = self.running.stdout
+        assert stdout is not None
+        if select.select([stdout], [], [], seconds)[0]:
+            self.said += os.read(stdout.fileno(), 65536).decode()
+
+    def wait_for(self, text: str, other: Process | None = None) -> None:
+        """Wait until it has said that; fail if it takes too long, or the other one ends meanwhile."""
+        deadline = time.monotonic() + 90
+        while text not in self.said:
+            assert time.monotonic() < deadline and self.running.poll() is None, self.said
+            assert other is None or other.running.poll() is None, other.end()
+            self.listen(0.2)
+
+    def end(self) -> str:
+        """Wait for its end; return all that it said."""
+        deadline = time.monotonic() + 60
+        while self.running.poll() is None and time.monotonic() < deadline:
+            self.listen(0.2)
+        while self.running.stdout is not None and (rest := self.running.stdout.read()):
+            self.said += rest.decode()
+        return self.said
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.running.kill()
+        self.running.wait()
+        self.running.stdout.close()

@@ -20,6 +20,12 @@ def test_a_dependency_has_a_lower_and_an_upper_bound(requirement: Requirement) -
     assert operators in (["<", ">="], ["=="]), f"{requirement}: write >=LOWEST,<NEXT, or =="
 
 
+def test_the_page_on_installing_names_every_extra() -> None:
+    page = (ROOT / "docs" / "installation.md").read_text(encoding="utf-8")
+    named = page.partition("Extras:")[2].partition("\n\n")[0]
+    assert {extra for extra in PROJECT["optional-dependencies"] if f"`{extra}`" not in named} == {"dev"}
+
+
 def test_a_dependency_of_several_extras_has_the_same_bounds_in_all() -> None:
     bounds = {requirement.name: requirement.specifier for requirement in REQUIREMENTS}
     assert {str(found) for found in REQUIREMENTS if found.specifier != bounds[found.name]} == set()

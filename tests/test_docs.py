@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import sys
 from pathlib import Path
@@ -36,6 +37,12 @@ def script(name: str) -> ModuleType:
 def options() -> ModuleType:
     """The generator of the page of options."""
     return script("options")
+
+
+@pytest.fixture(scope="module")
+def reliability() -> ModuleType:
+    """What fills the last column of the page on faults."""
+    return script("reliability")
 
 
 @pytest.fixture(scope="module")
@@ -160,3 +167,32 @@ def test_pages_outside_docs_are_found_again(site_links):
     for page in PAGES:
         assert site_links.page_source(site_links.place_of(page)) == page
     assert ROOT / "results" / "pilot.json" in set(site_links.linked(ROOT / "docs" / "simulation.md"))
+
+
+def test_what_attacks_measured_is_up_to_date(reliability: ModuleType) -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    assert page == reliability.fill(page, reliability.read_results(ROOT / "results")), "run python docs/reliability.py"
+
+
+def test_every_attack_of_the_benchmarks_is_in_a_row_and_what_was_not_measured_says_so(
+    reliability: ModuleType, tmp_path: Path
+) -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    records = [{"fault": "damage", "survived": index != 1, "commit": "abc"} for index in range(3)]
+    (tmp_path / "faults.json").write_text(json.dumps(records))
+    filled = reliability.fill(page, reliability.read_results(tmp_path))
+    assert "damage: 2 of 3 survived (abc); checkpoints: not measured |" in filled
+    attacks = {kind for kinds in reliability.ATTACKS.values() for kind in kinds}
+    faults, fuzz = ((ROOT / "benchmarks" / f"{name}.py").read_text(encoding="utf-8") for name in ("faults", "fuzz"))
+    named = set(re.findall(r'(?:_verdict|arena\.kills)\(\s*f?"([^"]+)"', faults))
+    named = named - {"kill at {function}"} | {f"kill at {name}" for name in ("open", "rename", "fsync")}
+    kinds = set(re.findall(r'^    "(\w+)": \w+,$', fuzz, re.MULTILINE))
+    assert len(named) > 8 and len(kinds) == 5 and attacks == named | kinds
+
+
+def test_tests_that_promises_name_are_there() -> None:
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    named = set(re.findall(r"`(test_\w+)`", page))
+    assert named and {name for name in named if f"def {name}" not in tests} == set()
+    assert {path for path in re.findall(r"`(tests/[\w/.]+)`", page) if not (ROOT / path).exists()} == set()

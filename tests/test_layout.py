@@ -31,7 +31,7 @@ def imported(module: str) -> set[str]:
             assert node.level == 0, f"{module} imports relatively"
             inner = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {name if name in MODULES else str(node.module) for name in inner}
-    return (found & MODULES.keys()) - {module}
+    return found & MODULES.keys()
 
 
 def circles(graph: dict[str, set[str]]) -> Iterator[list[str]]:
@@ -52,6 +52,7 @@ def circles(graph: dict[str, set[str]]) -> Iterator[list[str]]:
 
 def test_circles_are_found():
     assert list(circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}})) == [["b", "c", "b"]]
+    assert list(circles({"a": {"a"}})) == [["a", "a"]]
     assert list(circles({"a": {"b", "c"}, "b": {"c"}, "c": set()})) == []
 
 

@@ -236,7 +236,7 @@ class Physics(mujoco.Physics):
         self._path = collections.deque((self.position(),), maxlen=steps + 1)
 
 
-class NoseCamera:
+class OnboardView:
     """The drone's own view, drawn by dm_control's renderer, the drone itself hidden.
 
     Args:
@@ -310,7 +310,7 @@ class DroneRace(base.Task):
         self._starts = StartSampler(track, self._generator, dtype=torch.float64)
         self._invalid_action = False
         self._camera = camera
-        self._view: NoseCamera | None = None
+        self._view: OnboardView | None = None
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
@@ -357,7 +357,7 @@ class DroneRace(base.Task):
             target_gate=self.race.target_gate.numpy().copy(),
         )
         if self._camera is not None:
-            self._view = self._view or NoseCamera(physics, self._camera)
+            self._view = self._view or OnboardView(physics, self._camera)
             observation["pixels"] = self._view.image()
         return observation
 

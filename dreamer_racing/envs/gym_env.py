@@ -214,8 +214,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        worlds: further arguments of `RaceWorlds`: `evaluation`, `episode_steps`, `weights`, `renderer`, `camera`,
-            `num_threads`, `control_rate`, `start_on_line`.
+        worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -306,7 +305,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`) or parameters.
         max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
-        worlds: further arguments of `RaceWorlds`, as for `DroneRaceGymEnv`.
+        worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.

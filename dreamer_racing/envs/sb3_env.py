@@ -38,7 +38,7 @@ class DroneRaceVecEnv(VecEnv):
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`) or parameters.
-        worlds: further arguments of `RaceWorlds`, as for `DroneRaceGymEnv`.
+        worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.

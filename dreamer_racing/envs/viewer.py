@@ -29,7 +29,7 @@ def view(
         track: name of a built-in track, path to a YAML file, or a `Track`.
         preset: physics preset (`easy`, `faithful`) or parameters.
         policy: maps a dm_env `TimeStep` to an action (4,); None hovers.
-        arguments: further arguments of `envs.task.load`.
+        arguments: further arguments of `envs.load`.
 
     Raises:
         ViewerUnavailableError: no window can be opened here.
@@ -41,7 +41,7 @@ def view(
 
 
 def launch_viewer(env: Any, policy: Callable[[Any], np.ndarray] | None = None) -> None:
-    """Open `dm_control.viewer` on an environment made by `envs.task.load`; return when the window is closed.
+    """Open `dm_control.viewer` on an environment made by `envs.load`; return when the window is closed.
 
     Args:
         env: the environment, or a function without arguments that makes it.

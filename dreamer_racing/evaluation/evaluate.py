@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.evaluation.trajectory import CRASHES, FINISHED, TIMEOUT, Trajectory, TrajectoryRecorder
+from dreamer_racing.learners.learner import Judge
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,7 @@ def evaluate(
     num_trajectories: int = 1,
     max_recorded_steps: int = 1000,
     record_pixels: bool = True,
+    judge: Judge | None = None,
     on_episode: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Fly exactly this many whole episodes.
@@ -238,6 +240,7 @@ def evaluate(
         num_trajectories: the first episode of this many environments is recorded.
         max_recorded_steps: a recording stops here, K at most.
         record_pixels: whether recordings keep images, 12 KB a step.
+        judge: what says the value of each recorded state, after the policy has acted on it; None: recordings have none.
         on_episode: is told after each step in which one ended how many have, and of how many.
 
     Returns:
@@ -259,12 +262,13 @@ def evaluate(
     flown: list[list[Episode]] = [[] for _ in range(num_envs)]
     with set_exploration_type(exploration_type):
         tensordict = env.reset()
-        recorder = TrajectoryRecorder(
-            tensordict, min(num_trajectories, num_envs, episodes), max_recorded_steps, record_pixels
-        )
+        recorded = min(num_trajectories, num_envs, episodes)
+        recorder = TrajectoryRecorder(tensordict, recorded, max_recorded_steps, record_pixels)
         action = torch.zeros(env.action_spec.shape, device=env.device)
         while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
-            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            acted = policy(tensordict)
+            value = judge(acted[:recorded]) if judge and recorder.running else None
+            tensordict, following = env.step_and_maybe_reset(acted)
             action, action_before = _as_flown(tensordict["action"]), action
             steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))
             before = sum(map(len, flown))
@@ -273,11 +277,13 @@ def evaluate(
                     flown[index] += log.add(step)
             if on_episode and (ended := sum(map(len, flown))) > before:
                 on_episode(ended, episodes)
-            recorder.add(tensordict, [_outcome(step) for step in steps])
+            recorder.add(tensordict, [_outcome(step) for step in steps], value)
             tensordict = following
     waves = range(max(shares))
     ordered = [flown[index][wave] for wave in waves for index in range(num_envs) if wave < shares[index]]
-    return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt))
+    seen = env.observation_spec.keys()
+    tilt = env.worlds.camera.tilt if "pixels" in seen else None
+    return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt, tilt))
 
 
 def deal(episodes: int, worlds: int) -> list[int]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dreamer_racing.envs.drone import parameters
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
 from dreamer_racing.evaluation.course import Course
@@ -18,7 +19,7 @@ from dreamer_racing.learners.learner import Policy
 EPISODES = 100
 """The fewest episodes of each condition that the protocol asks for."""
 
-PRESETS = ("easy", "faithful")
+PRESETS = tuple(parameters.PRESETS)
 MODES = ("deterministic", "stochastic")
 
 

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import csv
 import os
+import zipfile
+import zlib
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -29,8 +33,13 @@ STATE = {
 }
 """Columns of each field, in SI units, beside the time ``t`` and the action ``a0`` …"""
 
-
 HEAD = ("track", "control_dt", "outcome")
+TILT = "camera_tilt"
+"""Line above the columns, after those of `HEAD`; only in files of flights whose camera is known."""
+VALUE = "value"
+"""Column of what a critic expected, behind the action; only in files of flights that one judged."""
+NUMBERS, IMAGES = "_trajectory.csv", "_onboard.npz"
+"""Ends of the names of a stored flight's two files."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,10 @@ class Trajectory:
     """Duration of a step, s."""
     outcome: str | None
     """How the episode ended; None if the recording was stopped before its end."""
+    value: Tensor | None = None
+    """(K,): the return that a critic expected from row k on, discounted as in training; None if none judged."""
+    camera_tilt: float | None = None
+    """Of the camera that it was flown by, upwards from the body's x axis, degrees; None without one, or unknown."""
 
     @property
     def speed(self) -> Tensor:
@@ -69,6 +82,8 @@ class Trajectory:
             pixels=None if self.pixels is None else self.pixels[first : last + 1],
             control_dt=self.control_dt,
             outcome=self.outcome if last >= len(self.position) - 1 else None,
+            value=None if self.value is None else self.value[first:last],
+            camera_tilt=self.camera_tilt,
         )
 
     @property
@@ -97,16 +112,24 @@ class TrajectoryRecorder:
         if count:
             self._observe(root)
 
-    def add(self, step: TensorDictBase, outcomes: Sequence[str | None]) -> None:
+    @property
+    def running(self) -> bool:
+        """Whether there is an episode still to be recorded."""
+        return any(self._running)
+
+    def add(self, step: TensorDictBase, outcomes: Sequence[str | None], value: Tensor | None = None) -> None:
         """Record a step, its action at the root and its observation under ``next``.
 
         Args:
             step: batch size [N].
             outcomes: how the episode of each of the N environments ended in this step; None if it goes on.
+            value: what a critic made of the root, (N, 1); given at every step or at none.
         """
-        if not any(self._running):
+        if not self.running:
             return
         self._rows["action"].append(self._copy(step["action"].float()))
+        if value is not None:
+            self._rows[VALUE].append(self._copy(value.float().squeeze(-1)))
         self._observe(step["next"])
         for index, outcome in enumerate(outcomes[: len(self._running)]):
             if self._running[index]:
@@ -114,16 +137,21 @@ class TrajectoryRecorder:
                 self._outcomes[index] = outcome
                 self._running[index] = outcome is None and self._lengths[index] < self._max_steps
 
-    def trajectories(self, control_dt: float) -> list[Trajectory]:
-        """Return the M recordings; ``control_dt`` is the duration of a step, s."""
+    def trajectories(self, control_dt: float, camera_tilt: float | None = None) -> list[Trajectory]:
+        """Return the M recordings.
+
+        Args:
+            control_dt: duration of a step, s.
+            camera_tilt: as recordings have it.
+        """
         rows = {name: torch.stack(values) for name, values in self._rows.items()}  # each (K [+ 1], M, ...)
         cut = []
         for index, (length, outcome) in enumerate(zip(self._lengths, self._outcomes, strict=True)):
-            own = {
-                name: values[: length + (name != "action"), index].clone() for name, values in rows.items()
+            own: dict[str, Any] = {
+                name: values[: length + (name not in ("action", VALUE)), index].clone() for name, values in rows.items()
             }  # clones, so that one recording does not keep all alive
-            pixels = own.pop("pixels", None)
-            cut.append(Trajectory(**own, pixels=pixels, control_dt=control_dt, outcome=outcome))
+            own = {"pixels": None, **own, "outcome": outcome}
+            cut.append(Trajectory(**own, control_dt=control_dt, camera_tilt=camera_tilt))
         return cut
 
     def _observe(self, tensordict: TensorDictBase) -> None:
@@ -142,7 +170,8 @@ class TrajectoryRecorder:
 def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> None:
     """Write an episode as CSV: a row an observation, K + 1 of them, the action beside the one it was taken at.
 
-    Images are left out; every other number is kept to the last bit. Lines with `#` say what there is besides rows.
+    So is the value, where a critic judged. Images are left out; every other number is kept to the last bit. Lines with
+    `#` say what there is besides rows.
 
     Args:
         path: the file; missing folders are made.
@@ -150,15 +179,20 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> No
         track: name or YAML file of its track.
     """
     fields = [getattr(trajectory, name).reshape(len(trajectory.position), -1).tolist() for name in STATE]
-    actions = [*trajectory.action.tolist(), [""] * trajectory.action.shape[1]]  # none at the last observation
+    steps, names = trajectory.action, [f"a{index}" for index in range(trajectory.action.shape[1])]
+    if trajectory.value is not None:
+        steps, names = torch.cat((steps, trajectory.value[:, None]), dim=1), [*names, VALUE]
+    actions = [*steps.tolist(), [""] * len(names)]  # none at the last observation
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     partial = Path(path).with_name(f".{Path(path).name}.partial")
     with partial.open("w", newline="", encoding="utf-8") as file:
         head = (track, repr(trajectory.control_dt), trajectory.outcome or "none")
         file.writelines(f"# {name}: {value}\n" for name, value in zip(HEAD, head, strict=True))
+        if trajectory.camera_tilt is not None:
+            file.write(f"# {TILT}: {trajectory.camera_tilt!r}\n")
         writer = csv.writer(file, lineterminator="\n")
         columns = [column for names in STATE.values() for column in names]
-        writer.writerow(["t", *columns, *(f"a{index}" for index in range(trajectory.action.shape[1]))])
+        writer.writerow(["t", *columns, *names])
         for index, row in enumerate(zip(*fields, actions, strict=True)):
             writer.writerow([f"{index * trajectory.control_dt:.6g}", *(_text(cell) for cells in row for cell in cells)])
     os.replace(partial, path)
@@ -191,20 +225,80 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, str]:
         raise ValueError(f"{path} was cut short: the last row, which has no action, is missing.")
     try:
         numbers = {name: _columns(rows, [header.index(column) for column in names]) for name, names in STATE.items()}
-        action = _columns(rows[:-1], list(range(len(expected), len(header))))
-        control_dt = float(head["control_dt"])
+        steps = _columns(rows[:-1], list(range(len(expected), len(header))))
+        control_dt, tilt = float(head["control_dt"]), float(head[TILT]) if TILT in head else None
     except ValueError as error:
         raise ValueError(f"{path} holds a cell that is no number: {error}.") from error
     gate = numbers.pop("target_gate").flatten().long()
+    judged = header[-1] == VALUE
     trajectory = Trajectory(
         **numbers,
         target_gate=gate,
-        action=action,
+        action=steps[:, :-1] if judged else steps,
         pixels=None,
         control_dt=control_dt,
         outcome=None if head["outcome"] == "none" else head["outcome"],
+        value=steps[:, -1] if judged else None,
+        camera_tilt=tilt,
     )
     return trajectory, head["track"]
+
+
+def write_flight(stem: str | Path, trajectory: Trajectory, track: str) -> list[str]:
+    """Write an episode with its images: `<stem>_trajectory.csv` and, of one that has some, `<stem>_onboard.npz`.
+
+    Args:
+        stem: folder and beginning of both files' names.
+        trajectory: the episode.
+        track: name or YAML file of its track.
+
+    Returns:
+        The files' names.
+    """
+    numbers, images = _files(stem)
+    images.unlink(missing_ok=True)  # of an earlier flight: it must not be taken for this one's
+    write_trajectory(numbers, trajectory, track)
+    if trajectory.pixels is None:
+        return [numbers.name]
+    partial = images.with_name(f".{images.name}.partial.npz")
+    np.savez_compressed(partial, pixels=trajectory.pixels.numpy())
+    os.replace(partial, images)
+    return [numbers.name, images.name]
+
+
+def read_flight(path: str | Path) -> tuple[Trajectory, str]:
+    """Read what `write_flight` or `write_trajectory` wrote.
+
+    Args:
+        path: of the numbers, `*_trajectory.csv`.
+
+    Returns:
+        The episode, with images if they lie beside it, and its track.
+
+    Raises:
+        ValueError: a file is none of these, was cut short, or the images are not those of the flight.
+        OSError: it cannot be read.
+    """
+    trajectory, track = read_trajectory(path)
+    _, images = _files(Path(path).with_name(Path(path).name.removesuffix(NUMBERS)))
+    if not str(path).endswith(NUMBERS) or not images.is_file():
+        return trajectory, track
+    try:
+        with np.load(images) as file:
+            pixels = torch.from_numpy(file["pixels"])
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{images} holds no images of a flight, or half of them: {error}.") from error
+    if pixels.ndim != 4 or len(pixels) != len(trajectory.position) or pixels.dtype != torch.uint8:
+        raise ValueError(
+            f"{images} holds {tuple(pixels.shape)} {pixels.dtype}, but {path} has {len(trajectory.position)} rows: "
+            "these files are of two flights."
+        )
+    return replace(trajectory, pixels=pixels), track
+
+
+def _files(stem: str | Path) -> tuple[Path, Path]:
+    """Where the numbers and the images of a flight are kept."""
+    return Path(f"{stem}{NUMBERS}"), Path(f"{stem}{IMAGES}")
 
 
 def _columns(rows: list[list[str]], columns: list[int]) -> torch.Tensor:

@@ -25,7 +25,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
         step: The step.
         parameters: Of the drone that the agent was trained with.
         camera: Through which it saw.
-        source: Where it comes from, JSON values: checkpoint, env_steps, track, preset.
+        source: Where it comes from, JSON values: checkpoint, env_steps, track and its `hash_track`, preset.
 
     Returns:
         What contract.json holds, but for ``files`` and ``verification``.

@@ -139,6 +139,9 @@ class ShippedAgent:
         """Return the acting step, which shares the agent's parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor)
 
+    def judge(self) -> None:
+        """Return None: the critic does not ship."""
+
 
 def load_networks(folder: Path, agent: Agent) -> None:
     """Load what ships into the networks that fly: encoder, RSSM and actor.

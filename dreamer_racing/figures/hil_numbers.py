@@ -67,7 +67,7 @@ class FlownFlight:
     took: dict[str, np.ndarray]
     """(T,) s each: ``jitter``, ``render``, ``act``, ``sent``."""
     overrun: np.ndarray
-    """(T,) bool: whether the tick before missed its deadline."""
+    """(T,) int: deadlines that the tick before missed."""
     pose_age: np.ndarray
     """(T,) s from the newest pose's measurement to the tick; not-a-number without a pose."""
     poses: list[Pose]
@@ -115,7 +115,7 @@ def read_flown(path: Path) -> FlownFlight:
     try:
         config = flight.about.get("config") or {}
         track = flight.track()
-        clock = PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)))
+        clock = _clock_of(config)
         arrays = _read_ticks(flight.ticks, clock)
     except TrackError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -125,6 +125,13 @@ def read_flown(path: Path) -> FlownFlight:
     return FlownFlight(
         path, flight.about, flight.whole, flight.holds_track, track, out_of_order=clock.out_of_order, **arrays
     )
+
+
+def _clock_of(config: dict[str, Any]) -> PoseClock:
+    """Return the clock that a flight's poses were stamped by."""
+    drift = (config.get("limits") or {}).get("clock_drift_max")
+    given = {} if drift is None else {"drift_max": float(drift)}
+    return PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)), **given)
 
 
 def latencies(flight: FlownFlight) -> dict[str, Any]:
@@ -266,7 +273,7 @@ def _read_ticks(ticks: list[dict[str, Any]], clock: PoseClock) -> dict[str, Any]
         "target_gate": np.array([out["target_gate"] for out in outputs], int),
         "passes": np.array([out["passes"] for out in outputs], int),
         "took": took,
-        "overrun": np.array([each.overrun for each in inputs], bool),
+        "overrun": np.array([each.overrun for each in inputs], int),
         "pose_age": pose_age,
         "poses": poses,
         "arrived": arrived,

@@ -32,14 +32,19 @@ def race_words(track: Track, trajectory: Trajectory) -> list[str]:
         track: that is flown.
         trajectory: from the start of an episode on; what `Trajectory.part` cuts out would count from its own beginning.
     """
-    gate = trajectory.target_gate.numpy()
-    begun = np.concatenate(([0], np.cumsum((gate[1:] == 0) & (gate[:-1] != 0))))  # laps completed
-    rows = zip(trajectory.speed.tolist(), gate.tolist(), begun.tolist(), strict=True)
+    completed = laps_completed(trajectory).tolist()
+    rows = zip(trajectory.speed.tolist(), trajectory.target_gate.tolist(), completed, strict=True)
     return [
         f"{row * trajectory.control_dt:5.2f} s  {_speed(speed)}  gate {target + 1}/{track.num_gates}  "
         f"lap {min(laps + 1, track.laps)}/{track.laps}"
         for row, (speed, target, laps) in enumerate(rows)
     ]
+
+
+def laps_completed(trajectory: Trajectory) -> np.ndarray:
+    """Count the laps behind a drone at every row of a flight from its start on, (K + 1,)."""
+    gate = trajectory.target_gate.numpy()
+    return np.concatenate(([0], np.cumsum((gate[1:] == 0) & (gate[:-1] != 0))))
 
 
 def _speed(speed: float) -> str:

@@ -5,6 +5,7 @@ Shapes: K control steps of a recorded episode.
 
 import json
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,12 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act, with_memory
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
-from dreamer_racing.evaluation.trajectory import write_trajectory
+from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
 from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.training.directory import RunDirectory
 
 SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps the model sees, then predicts on its own, in the video
@@ -43,7 +44,7 @@ class EvaluationReport:
     def __init__(
         self,
         directory: str | Path,
-        learner: Flyer,
+        learner: Evaluable,
         worlds: dict[str, Any],
         episodes: int,
         video_steps: int = 500,
@@ -54,6 +55,7 @@ class EvaluationReport:
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         track = worlds["track"]
         self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
@@ -72,26 +74,28 @@ class EvaluationReport:
 
     def _one(self, name: str, prefix: str, deterministic: bool) -> dict[str, float]:
         result = self.evaluate(deterministic)
-        self.write(name, result)
+        with self.attempt("evaluations, plots and videos"):
+            self.write(name, result)
         numbers = {key: value for key, value in result.to_dict().items() if isinstance(value, (int, float))}
         return {f"{prefix}/{key}": float(value) for key, value in numbers.items()}
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        return self._course.evaluate(self.episodes, deterministic, on_episode=self.on_episode)
+        judge = self._learner.judge()
+        return self._course.evaluate(self.episodes, deterministic, judge=judge, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.
 
-        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that imagines
-        images, `<name>_dream.npz`.
+        Beside the numbers, figures of later find the flight in `<name>_trajectory.csv` and, of an agent that sees,
+        `<name>_onboard.npz`; of one that imagines images, `<name>_dream.npz`.
         """
         into = self.directory
         for folder in (into.evaluations, into.plots, into.videos):
             folder.mkdir(parents=True, exist_ok=True)
         (into.evaluations / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
-        write_trajectory(into.evaluations / f"{name}_trajectory.csv", trajectory, self._track)
+        write_flight(into.evaluations / name, trajectory, self._track)
         plot_top_down(self._course.base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return
@@ -130,18 +134,27 @@ class ReturnReport:
         env: batch size [N], with `pixels` or `vector`.
         episodes: episodes of an evaluation, dealt to the N worlds beforehand.
         video_steps: steps that the video shows at most.
+        seed: of the environment, anew at each evaluation: all meet the same starts, also in a run that was resumed.
     """
 
     def __init__(
-        self, directory: str | Path, learner: Flyer, env: EnvBase, episodes: int, video_steps: int = 500
+        self,
+        directory: str | Path,
+        learner: Evaluable,
+        env: EnvBase,
+        episodes: int,
+        video_steps: int = 500,
+        seed: int = 0,
     ) -> None:
         self.directory = RunDirectory(Path(directory))
         self.episodes = episodes
         self.video_steps = video_steps
         self.on_episode: Callable[[int, int], None] | None = None
+        self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         self._policy = learner.evaluation_policy()
         self._env = with_memory(env, self._policy)
+        self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -159,7 +172,8 @@ class ReturnReport:
                 "return_std": returns.std(correction=0).item(),
                 "episode_length": lengths.mean().item(),
             }
-            self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
+            with self.attempt("evaluations and videos"):
+                self._write(f"{env_steps:09d}{suffix}", {**numbers, "returns": returns.tolist()}, frames)
             metrics |= {f"evaluation{suffix}/{name}": value for name, value in numbers.items()}
         return metrics
 
@@ -170,6 +184,7 @@ class ReturnReport:
         left = torch.tensor(deal(self.episodes, num_envs))
         total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
         returns, lengths, frames, filming = [], [], [], True
+        self._env.set_seed(self._seed)
         tensordict = self._env.reset()
         while (left > 0).any():
             if filming and "pixels" in tensordict:

@@ -7,7 +7,8 @@ The first prints lines for the flight controller's CLI. The second reads what ``
 and exits with status 1 if a setting differs or is missing, 2 if there is nothing to compare.
 
 Reference: https://betaflight.com/docs/wiki/guides/current/Betaflight-2025.12-CLI-commands and the same page of 4.5:
-names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like.
+names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like;
+src/main/flight/pid.h, src/main/pg/rx.c and src/main/sensors/gyro.c: defaults of feedforward, smoothing, spin recovery.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from dreamer_racing.hil.sticks import RateMap, ThrustMap
 logger = logging.getLogger(__name__)
 
 AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
-LINKS = ("crsf", "sbus", "msp")
+LINKS = ("crsf", "sbus", "msp", "betaflight_sitl")
 
 _STEP = math.radians(10.0)  # rad/s: the unit of rc_rate and srate under ACTUAL rates
 _LARGEST = 199  # of these: setpoints end at 1998 deg/s
@@ -150,6 +151,27 @@ def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
     return findings
 
 
+def require_dump(path: Path, contract: dict[str, Any], link: str) -> int:
+    """Refuse to fly with a flight controller whose settings are not those of an actor; return how many were compared.
+
+    Args:
+        path: The text that ``dump all`` or ``diff all`` gave.
+        contract: As `read_contract` returns it.
+        link: One of `LINKS`.
+
+    Raises:
+        ValueError: Settings differ or are missing, and the message has a line for each; or as `check_dump`.
+        OSError: There is no such file.
+    """
+    findings = check_dump(path.read_text(encoding="utf-8", errors="replace"), contract, link)
+    if wrong := [str(finding) for finding in findings if finding.status is not Status.OK]:
+        raise ValueError(
+            f"betaflight_dump={path}: {len(wrong)} of {len(findings)} settings of the flight controller are not those "
+            "of this actor:\n" + "\n".join(wrong)
+        )
+    return len(findings)
+
+
 def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tuple[int, int] | None]:
     """Return values by name, of the profiles selected at the end, and the firmware's release where it is said."""
     version = re.search(r"^#\s*(\w+) ?/.* (\d+)\.(\d+)\.\d+", text, re.MULTILINE)
@@ -169,6 +191,8 @@ def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tup
                 values[name, selected[sections.get(name, "")]] = " ".join(value)
             case ["feature", name]:
                 values[f"feature {name.removeprefix('-')}", ""] = "OFF" if name.startswith("-") else "ON"
+            case ["rxfail", channel, *mode]:
+                values[f"rxfail {channel}", ""] = " ".join(mode)
             case ["map", order]:
                 values["map", ""] = order
             case ["aux", slot, *mode]:
@@ -194,6 +218,8 @@ def _receiver(link: str) -> list[Wanted]:
     """Return what makes the flight controller listen to a link."""
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
+    if link == "betaflight_sitl":
+        return []  # channels come over UDP, whichever receiver is set: see docs/hil.md
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
     rx_serial = Wanted("feature RX_SERIAL", "ON" if serial else "OFF", "a receiver at a UART: see the Ports tab", "ON")
@@ -261,8 +287,25 @@ _MASTER = (
     Wanted("feature AIRMODE", "ON", "rates are followed at least throttle too", "ON"),
     Wanted("failsafe_delay", "5", "motors stop 0.5 s after the last message: the last line of defence", "15"),
     Wanted("failsafe_procedure", "DROP", "a drone in a room falls rather than flies on", "DROP"),
+    *(
+        Wanted(f"rxfail {channel}", "a", f"{stick} when the radio falls silent: sticks centred, throttle low", "a",
+               line=f"rxfail {channel} a")
+        for channel, stick in enumerate(("roll", "pitch", "yaw", "throttle"))
+    ),
+    Wanted("rc_smoothing", "OFF", "a rate counts at once; this filter is the slower, the rarer commands are", "ON"),
+    Wanted("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts what tumbles", "AUTO"),
 )  # fmt: skip
 _PROFILE = (
+    *(
+        Wanted(
+            f"f_{axis}",
+            "0",
+            "no feedforward: each command is a step, and would kick",
+            default,
+            "profile",
+        )
+        for axis, default in (("roll", "120"), ("pitch", "125"), ("yaw", "120"))
+    ),
     Wanted("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile"),
     Wanted("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
     Wanted("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),

@@ -56,15 +56,17 @@ class Inputs(NamedTuple):
         time: s, by the loop's clock.
         received: Pose packets since the last tick, oldest first.
         operator: What the operator wants.
-        overrun: Whether the tick before took longer than its period.
+        overrun: Deadlines that the tick before missed, as it took longer than its period.
         voltages: Of the battery since the last tick, oldest first.
+        dropped: Whether the command of the tick before did not go out.
     """
 
     time: float
     received: list[Received]
     operator: Operator
-    overrun: bool
+    overrun: int
     voltages: Sequence[Reading] = ()
+    dropped: bool = False
 
 
 class Outputs(NamedTuple):
@@ -72,10 +74,10 @@ class Outputs(NamedTuple):
 
     Args:
         verdict: State, command and reasons.
-        setpoint: What the flyer wanted; None without a pose.
+        setpoint: What the flyer wanted; None without a pose, or if it was not asked: it is cut anyway.
         pose: For which it was chosen: the newest one, extrapolated to the tick.
         measured: When that was measured, s; not a number without a pose.
-        image: What the flyer saw; None if it has no camera.
+        image: What the flyer saw; None if it has no camera, or was not asked.
         target_gate: Index of the gate that comes next.
         passes: Gates passed in this flight.
         render_s: s that drawing the image took.
@@ -113,7 +115,7 @@ class FlightChain:
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
         self.progress = GateProgress(track)
-        self.clock = PoseClock(config.stamping, config.latency)
+        self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)
         self.battery = None if config.battery is None else Battery(config.battery)
         self._flyer, self._camera, self._config = flyer, camera, config
@@ -141,21 +143,23 @@ class FlightChain:
                 self.progress.update(pose)
                 self._newest = pose
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
-        setpoint, image, render_s, act_s = self._choose(pose)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
-        verdict = self.safety.step(
-            Tick(
-                now=inputs.time,
-                pose=self._newest,
-                pose_age=np.inf if self._newest is None else inputs.time - self._newest.time,
-                setpoint=setpoint,
-                operator=inputs.operator,
-                arm_requested=self._config.arm,
-                contract_mismatch=self._mismatch,
-                loop_overrun=inputs.overrun,
-                finish=finish,
-            )
+        tick = Tick(
+            now=inputs.time,
+            pose=self._newest,
+            pose_age=np.inf if self._newest is None else inputs.time - self._newest.time,
+            setpoint=None,
+            operator=inputs.operator,
+            arm_requested=self._config.arm,
+            contract_mismatch=self._mismatch,
+            loop_overrun=inputs.overrun,
+            finish=finish,
+            command_dropped=inputs.dropped,
         )
+        findings = self.safety.examine(tick)
+        # What is cut anyway does not wait for drawing and choosing.
+        setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
+        verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
         self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
@@ -193,18 +197,21 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "operator": list(inputs.operator),
         "overrun": inputs.overrun,
         "voltages": [list(reading) for reading in inputs.voltages],
+        "dropped": inputs.dropped,
     }
 
 
 def read_inputs(message: dict[str, Any]) -> Inputs:
-    """Return what came in from what `describe_inputs` made of it; flights of old say nothing of voltages."""
+    """Return what came in from what `describe_inputs` made of it; flights of old say less."""
     received = []
     for arrived, sequence, stamp, *numbers in message["received"]:
         values = np.array(numbers)
         packet = PosePacket(sequence, stamp, values[:3], values[3:7], values[7:10], values[10:])
         received.append(Received(arrived, packet))
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
-    return Inputs(message["time"], received, Operator(*message["operator"]), message["overrun"], voltages)
+    operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
+    overrun = int(message["overrun"])  # flights of old say whether
+    return Inputs(message["time"], received, operator, overrun, voltages, dropped)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

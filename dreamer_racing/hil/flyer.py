@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import Track, hash_track
 from dreamer_racing.export.onnx_actor import OnnxActor
 from dreamer_racing.hil.camera import camera_of
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose, Setpoint
 
 
@@ -65,22 +68,30 @@ class ActorFlyer:
         return Setpoint(float(thrust), np.array(rates))
 
 
-def check_contract(contract: dict[str, Any], track: str, rate: float | None = None) -> None:
+def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:
     """Refuse an actor that was trained for something else than what it is to fly.
 
     Args:
         contract: Of the actor.
-        track: Name of the track.
+        track: On which it is to fly: it must be the one of the contract by its geometry, under whatever name.
         rate: Hz, of the loop; None for the actor's own.
+
+    Returns:
+        What the contract, an older one, does not say and so was not compared; None if it says all.
 
     Raises:
         ValueError: The message names the fields that differ, with both values.
     """
-    trained = contract.get("source", {}).get("track")
-    own_rate = contract["control"]["rate_hz"]
     differing = []
-    if trained is not None and trained != track:
-        differing.append(f"source.track is {trained!r}, and track={track}")
+    source, own_rate = contract.get("source", {}), contract["control"]["rate_hz"]
+    trained, geometry, found = source.get("track"), source.get("track_sha256"), hash_track(track)
+    if geometry is not None and geometry != found:
+        differing.append(
+            f"source.track is {trained!r}, whose gates, start and bounds have the hash {str(geometry)[:12]} "
+            f"(source.track_sha256), and those of track={track.name} have {found[:12]}"
+        )
+    elif geometry is None and trained is not None and Path(str(trained)).stem != track.name:
+        differing.append(f"source.track is {trained!r}, and track={track.name}")
     if rate is not None and abs(rate - own_rate) > 1e-6:
         differing.append(f"control.rate_hz is {own_rate:g}, and rate={rate:g}")
     image = contract["inputs"][0]
@@ -90,3 +101,44 @@ def check_contract(contract: dict[str, Any], track: str, rate: float | None = No
             differing.append(f"camera says images of {described}, and the input {image['name']} is {image['shape']}")
     if differing:
         raise ValueError(f"The actor's contract does not fit: {'; '.join(differing)}.")
+    if geometry is None:
+        return f"the contract has no source.track_sha256: {track.name} was compared by its name only, not by its gates"
+    return None
+
+
+def check_ranges(contract: dict[str, Any], limits: SafetyLimits, meant: Collection[str] = ()) -> list[str]:
+    """Refuse an actor that asks for more than safety lets through: what is clipped is not what it chose.
+
+    Args:
+        contract: Of the actor.
+        limits: Of safety.
+        meant: Names of limits that a person has set: such a one may clip, and is said.
+
+    Returns:
+        What such limits clip, in words.
+
+    Raises:
+        ValueError: A limit that nobody set clips; the message names it, both values, and what to set.
+    """
+    asked = {
+        channel["name"]: abs(channel["offset"]) + abs(channel["scale"]) for channel in contract["action"]["channels"]
+    }
+    rates = [asked.get(f"body_rate_{axis}", 0.0) for axis in "xyz"]
+    thrust = asked.get("collective_thrust", 0.0)
+    compared = [
+        ("rate_max", [round(rate, 6) for rate in rates], list(limits.rate_max), "rad/s about x, y, z"),
+        ("thrust_max", [round(thrust, 6)], [limits.thrust_max], "m/s²"),
+    ]
+    clipped = []
+    for name, wanted, most, unit in compared:
+        if all(want <= limit + 1e-6 for want, limit in zip(wanted, most, strict=True)):
+            continue
+        words = f"limits.{name}={_listed(most)} clips the actor, which asks for up to {_listed(wanted)} {unit}"
+        if name not in meant:
+            raise ValueError(f"{words}. Set limits.{name}={_listed(wanted)}, or a smaller one if that is meant.")
+        clipped.append(words)
+    return clipped
+
+
+def _listed(numbers: list[float]) -> str:
+    return f"{numbers[0]:g}" if len(numbers) == 1 else f"[{','.join(f'{number:g}' for number in numbers)}]"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import sys
@@ -9,6 +10,12 @@ import time
 from collections.abc import Iterator
 from typing import Protocol
 
+_REMEDIES = {
+    errno.EACCES: "Ports below 1024 are the system's: choose one above.",
+    errno.EPERM: "This user may not listen there: choose a port above 1024.",
+    errno.EADDRNOTAVAIL: "This machine has no such address: 127.0.0.1 is its own, 0.0.0.0 all that it has.",
+    errno.EADDRINUSE: "Another program uses it: is another flight, or plant, still running?",
+}
 RECEIVED_AT = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python's socket does not name
 
 
@@ -53,6 +60,7 @@ class UdpInlet:
     _SIZE = 2048  # bytes; more than an Ethernet frame holds
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._arrivals = Arrivals()
         self._socket = bind(host, port)
         self.address: tuple[str, int] = self._socket.getsockname()
         if RECEIVED_AT is not None:
@@ -61,11 +69,13 @@ class UdpInlet:
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield datagrams."""
         for _ in range(self._MOST):
+            began = time.monotonic()
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(self._SIZE, 64)
             except (BlockingIOError, ConnectionRefusedError):
+                self._arrivals.emptied(began)
                 return
-            yield arrival(ancillary), data
+            yield self._arrivals.of(ancillary), data
 
     def close(self) -> None:
         """Close the socket."""
@@ -83,17 +93,45 @@ def bind(host: str, port: int) -> socket.socket:
         listening.bind((host, port))
     except (OSError, OverflowError) as error:
         listening.close()
-        raise OSError(f"cannot listen on {host}:{port}: {error}. Is another program using it?") from error
+        remedy = _REMEDIES.get(error.errno or 0, "") if isinstance(error, OSError) else ""
+        raise OSError(f"cannot listen on {host}:{port}: {error}. {remedy}".rstrip()) from error
     listening.setblocking(False)
     return listening
 
 
-def arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Return when the kernel received a packet, by the monotonic clock; now, if it does not say."""
-    now = time.monotonic()
+class Arrivals:
+    """Puts the kernel's times of arrival, which are the wall clock's, on the monotonic clock; the first may be set.
+
+    What arrived did so after the queue was last empty. A time that the wall clock of now puts before that, or into the
+    future, was stamped before the clock was set: there the difference of the clocks as it was then counts.
+    """
+
+    _SLACK = 1e-3  # s, to which the two clocks can be compared [choice]: reading both may be interrupted
+
+    def __init__(self) -> None:
+        self.emptied(time.monotonic())
+
+    def emptied(self, since: float) -> None:
+        """Say that nothing was waiting any more at a time, s (``time.monotonic``)."""
+        self._since = since
+        self._ahead = time.time() - time.monotonic()  # s, of the wall clock before the monotonic one
+
+    def of(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+        """Return when a datagram that was read just now arrived; now, if the kernel does not say."""
+        now = time.monotonic()
+        stamp = kernel_stamp(ancillary)
+        if stamp is None:
+            return now
+        arrived = stamp - (time.time() - now)
+        if not self._since - self._SLACK <= arrived <= now + self._SLACK:
+            arrived = stamp - self._ahead
+        return min(max(arrived, self._since), now)
+
+
+def kernel_stamp(ancillary: list[tuple[int, int, bytes]]) -> float | None:
+    """Return when the kernel received a datagram, s by the wall clock; None if it does not say."""
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == RECEIVED_AT and len(data) >= 16:
             seconds, nanoseconds = struct.unpack_from("@ll", data)
-            age = time.time() - (seconds + 1e-9 * nanoseconds)
-            return now - min(max(age, 0.0), 1.0)  # a stepped wall clock must not make it older than it can be
-    return now
+            return seconds + 1e-9 * nanoseconds
+    return None

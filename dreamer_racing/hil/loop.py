@@ -14,12 +14,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dreamer_racing.hil.aside import Aside
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import OperatorSource
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
 from dreamer_racing.hil.vehicle import Link, at_rest
+from dreamer_racing.hil.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +30,12 @@ FAREWELL = 1.0
 
 FAREWELL_RATE = 50.0
 """Hz of those frames [choice]."""
+
+LINES_MOST = 64
+"""Lines of the log that may wait for a terminal or a pipe [choice]; further ones are left out."""
+
+LINES_PATIENCE = 1.0
+"""s for which the end of a flight waits for them [choice]; motors are off by then."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
@@ -70,7 +78,7 @@ class LoopStatistics:
         render: Of drawing.
         act: Of the flyer.
         busy: Of the whole tick.
-        overruns: Ticks that took longer than their period.
+        overruns: Deadlines missed by ticks that took longer than their period: a long one misses several.
         unrecorded: Whether writing or showing the flight failed on the way.
     """
 
@@ -131,7 +139,10 @@ class FlightLoop:
         self._period = 1.0 / rate
         self._recorder, self._watchers = recorder, watchers
         self._clock = clock or MonotonicClock()
+        self._watchdog = Watchdog(link, chain.safety.limits.tick_max, self._clock.now)
+        self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
+        self._dropped = False  # whether the command of the tick before was
         self._reasons: tuple[Reason, ...] = ()
 
     def stop(self, reason: str) -> None:
@@ -154,10 +165,12 @@ class FlightLoop:
                 return self._run(duration, patience)
             finally:
                 self._say_farewell()
+                self._watchdog.close()
+                self._lines.close(LINES_PATIENCE)
 
     def _run(self, duration: float | None, patience: float | None) -> str:
         began = deadline = self._clock.now()
-        overrun, flew, armed, words = False, False, False, ""
+        overrun, flew, armed, words = 0, False, False, ""
         while self._stop is None:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
@@ -167,28 +180,37 @@ class FlightLoop:
             if armed and not flew:
                 flew, began = True, start
             deadline, overrun = self._next(deadline)
+            if self._watchdog.acted:
+                longest = self._chain.safety.limits.tick_max
+                return f"cut: no command for more than {longest:g} s: the watchdog disarmed the vehicle"
             if flew and not armed:
                 return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
-            longest = duration if flew else patience
-            if longest is not None and start - began >= longest:
-                return f"{longest:g} s are over" + ("" if flew else f"; not armed: {words}")
+            most = duration if flew else patience
+            if most is not None and start - began >= most:
+                return f"{most:g} s are over" + ("" if flew else f"; not armed: {words}")
         return self._stop + ("" if flew else f"; not armed: {words}")
 
     def _say_why_not(self, outputs: Outputs) -> str:
         """Log what speaks against arming, when it changes; return it. In flight nothing is written."""
         words = "; ".join(outputs.verdict.words)
         if not outputs.verdict.command.armed and outputs.verdict.reasons != self._reasons:
-            logger.info("not armed: %s", words)
+            self._log(logging.INFO, "not armed: %s", words)
         self._reasons = outputs.verdict.reasons
         return words
 
-    def _tick(self, start: float, deadline: float, overrun: bool, armed: bool) -> Outputs:
+    def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:
+        """Log a line, and wait for nobody who is to read it."""
+        self._lines.do(lambda: logger.log(level, message, *values, exc_info=error))
+
+    def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
-        inputs = Inputs(start, self._poses.poll(), self._operator.poll(armed), overrun, self._link.listen())
+        operator = self._operator.poll(armed)
+        inputs = Inputs(start, self._poses.poll(), operator, overrun, self._link.listen(), self._dropped)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
-        sent = self._link.send(outputs.verdict.command)
+        sent = self._watchdog.send(outputs.verdict.command)
+        self._dropped = not sent
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
@@ -203,26 +225,28 @@ class FlightLoop:
                 self._recorder.tick(inputs.time, message)
             for watch in self._watchers:
                 watch(outputs)
-        except Exception:
-            logger.exception("the flight goes on, and is neither recorded nor shown any longer")
+        except Exception as error:
+            self._log(logging.ERROR, "the flight goes on, and is neither recorded nor shown any longer", error=error)
             self.statistics.unrecorded = True
             self._recorder, self._watchers = None, ()
 
-    def _next(self, deadline: float) -> tuple[float, bool]:
-        """Return the next deadline, on the same grid however late it is, and whether one was missed."""
+    def _next(self, deadline: float) -> tuple[float, int]:
+        """Return the next deadline, on the same grid however late it is, and how many were missed."""
         now, following = self._clock.now(), deadline + self._period
         if now < following:
-            return following, False
-        self.statistics.overruns += 1
-        return following + self._period * ((now - following) // self._period), True
+            return following, 0
+        left_out = int((now - following) // self._period)  # the one after them is late
+        self.statistics.overruns += left_out + 1
+        return following + self._period * left_out, left_out + 1
 
     def _note(self, jitter: float, inputs: Inputs, outputs: Outputs, done: float) -> None:
         noted = self.statistics
         noted.jitter.append(jitter)
         noted.busy.append(done - inputs.time)
-        if outputs.pose is not None:
+        if outputs.setpoint is not None:
             noted.render.append(outputs.render_s)
             noted.act.append(outputs.act_s)
+        if outputs.pose is not None:
             noted.pose_age.append(done - outputs.measured)
         if inputs.received:
             noted.latency.append(done - inputs.received[-1].time)
@@ -232,10 +256,10 @@ class FlightLoop:
         deadline, failed = self._clock.now(), False
         for _ in range(round(FAREWELL * FAREWELL_RATE)):
             try:
-                self._link.send(at_rest())
+                self._watchdog.send(at_rest())
             except Exception as error:  # whatever it is, the next one may get through
                 if not failed:
-                    logger.error("the link does not take the disarm frame: %s", error)
+                    self._log(logging.ERROR, "the link does not take the disarm frame: %s", error)
                 failed = True
             deadline += 1.0 / FAREWELL_RATE
             self._clock.sleep_until(deadline)

@@ -1,8 +1,9 @@
 """Every flight is a file: what came in at each tick and what went out, in the order in which it happened.
 
 The file is MCAP, which robotics tools read (https://mcap.dev): messages in JSON on ``/flight`` (once: everything that
-the flight was begun with) and ``/tick``. Each message is written at once, so that a flight whose loop is killed
-is there up to its last tick. Floats are written so that reading gives the same bits.
+the flight was begun with) and ``/tick``. Each message is written at once, so that a flight whose loop is killed is
+there up to its last ticks; by a thread, so that a disk that stalls holds up no flight. Floats are written so that
+reading gives the same bits.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,12 +20,19 @@ from typing import Any, Self
 import numpy as np
 
 from dreamer_racing.envs.tracks import Track, load_track, read_track
+from dreamer_racing.hil.aside import Aside
 
 FLIGHT, TICK = "/flight", "/tick"
 FILE = "flight.mcap"
 TRACK = "track_as_flown"
 """Of what a flight is begun with: the content of its track's file, as `describe_track` writes it."""
 FORMAT_VERSION = 1
+
+WAITING_MOST = 256
+"""Ticks that may wait for the disk [choice]: 5 s at 50 Hz, of some kilobytes each."""
+
+CLOSING = 10.0
+"""s for which the end of a recording waits for the disk [choice]."""
 
 
 class FlightRecorder:
@@ -49,24 +59,46 @@ class FlightRecorder:
             for topic in (FLIGHT, TICK)
         }
         self._sequence = 0
-        self._write(FLIGHT, 0.0, {"format_version": FORMAT_VERSION, **about})
+        self._path, self._aside, self._failed = path, Aside(WAITING_MOST), False
+        self._write(FLIGHT, 0.0, _encode({"format_version": FORMAT_VERSION, **about}))
 
     def tick(self, time: float, message: dict[str, Any]) -> None:
-        """Write what happened in a tick at a time, s by the loop's clock."""
-        self._write(TICK, time, message)
+        """Have written what happened in a tick at a time, s by the loop's clock; wait for no disk.
 
-    def _write(self, topic: str, time: float, message: dict[str, Any]) -> None:
+        Raises:
+            OSError: A tick before could not be written, or the disk has taken none for long; the file ends there.
+        """
+        data = _encode(message)  # now: what it speaks of may change
+        if not self._aside.do(partial(self._write, TICK, time, data)):
+            self._fail()
+
+    def _write(self, topic: str, time: float, data: bytes) -> None:
         nanoseconds = int(time * 1e9)
-        data = json.dumps(message, default=_plain).encode()
         self._writer.add_message(self._channels[topic], nanoseconds, data, nanoseconds, self._sequence)
         self._file.flush()
         self._sequence += 1
 
+    def _fail(self) -> None:
+        self._failed = True
+        raise self._aside.error or OSError(f"{self._path}: the disk does not take what is to be written.")
+
     def close(self) -> None:
-        """Finish the file; may be called twice."""
-        if not self._file.closed:
+        """Finish the file; may be called twice.
+
+        Raises:
+            OSError: Something could not be written, and `tick` has not said so.
+        """
+        if self._file.closed:
+            return
+        written, said = self._aside.close(CLOSING), self._failed
+        if written and not said:
             self._writer.finish()
             self._file.close()
+        elif written or self._aside.error is not None:  # else the disk would not take the end either
+            with suppress(OSError):  # which has been said, or is below
+                self._file.close()
+        if not written and not said:
+            self._fail()
 
     def __enter__(self) -> Self:
         """Go on recording."""
@@ -142,6 +174,10 @@ class Flight:
                 return  # the loop was killed while it flew
             except (exceptions.McapError, ValueError, KeyError) as error:
                 raise ValueError(f"{path} is no flight, or damaged ({type(error).__name__}: {error}).") from error
+
+
+def _encode(message: dict[str, Any]) -> bytes:
+    return json.dumps(message, default=_plain).encode()
 
 
 def _plain(value: Any) -> Any:

@@ -20,8 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dreamer_racing.hil.odometer import Odometer
+from dreamer_racing.hil.motion import Motion, read_pose
 from dreamer_racing.hil.operator import Operator
+from dreamer_racing.hil.reasons import Findings, Reason
 from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, is_within, to_number, to_numbers
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, at_rest, hover
 
@@ -35,36 +36,6 @@ class State(enum.Enum):
     CUT = "cut"
 
 
-class Reason(enum.Enum):
-    """Why a vehicle is in its state, or does not arm."""
-
-    KILL = "kill"
-    NO_ENABLE = "no enable"
-    NOT_RELEASED = "enable not released before"
-    NOT_REQUESTED = "arming not requested"
-    CONTRACT = "contract"
-    CLOCK = "clock"
-    OVERRUNS = "overruns"
-    NOT_FINITE = "pose not finite"
-    POSE_JUMP = "pose jump"
-    POSE_CONTRADICTION = "pose contradiction"
-    POSE_STALE = "pose stale"
-    POSE_LOST = "pose lost"
-    GEOFENCE = "geofence"
-    SPEED = "speed"
-    TILT = "tilt"
-    STRANDED = "stranded"
-    NO_SETPOINT = "no setpoint"
-    SETPOINT_LOST = "setpoint lost"
-    OUTSIDE_START_BOX = "outside start box"
-    TURNED_AT_START = "turned at start"
-    TILTED_AT_START = "tilted at start"
-    MOVING_AT_START = "moving at start"
-    ARMING = "arming"
-    FINISHED = "finished"
-
-
-Findings = dict[Reason, str]
 _HOLDING = {Reason.POSE_STALE, Reason.NO_SETPOINT}
 _OVER = "the flight is over"
 # Rates of zero, not such as would level it: a hold lasts 0.1 s, in which levelling would save some decimetres a second,
@@ -83,8 +54,9 @@ class Tick(NamedTuple):
         operator: What the operator wants; None counts as no enable.
         arm_requested: Whether the program was started with leave to arm.
         contract_mismatch: What of the actor's contract does not fit the vehicle; None if it fits.
-        loop_overrun: Whether the tick before took longer than its period.
+        loop_overrun: Deadlines that the tick before missed, as it took longer than its period.
         finish: Whether the flight is over.
+        command_dropped: Whether the command of the tick before did not go out.
     """
 
     now: float
@@ -94,8 +66,9 @@ class Tick(NamedTuple):
     operator: Operator | None
     arm_requested: bool
     contract_mismatch: str | None = None
-    loop_overrun: bool = False
+    loop_overrun: int = 0
     finish: bool = False
+    command_dropped: bool = False
 
 
 class Verdict(NamedTuple):
@@ -117,32 +90,6 @@ class Verdict(NamedTuple):
     def refusals(self) -> tuple[str, ...]:
         """Why it does not arm, in words; empty where it is armed."""
         return () if self.command.armed else self.words
-
-
-class _Seen(NamedTuple):
-    """A pose in plain numbers: as `Pose`, with an attitude of unit length."""
-
-    time: float
-    position: Vector
-    attitude: Vector
-    velocity: Vector
-
-    @property
-    def speed(self) -> float:
-        """m/s."""
-        return math.hypot(*self.velocity)
-
-    @property
-    def tilt_degrees(self) -> float:
-        """Angle between body z and world z."""
-        _, x, y, _ = self.attitude
-        return math.degrees(2.0 * math.asin(min(1.0, math.hypot(x, y))))
-
-    @property
-    def yaw_degrees(self) -> float:
-        """Direction of body x from world x, left."""
-        w, x, y, z = self.attitude
-        return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 class Safety:
@@ -182,9 +129,22 @@ class Safety:
 
     def step(self, tick: Tick) -> Verdict:
         """Judge a tick."""
+        return self.judge(tick, self.examine(tick))
+
+    def examine(self, tick: Tick) -> Findings:
+        """Take in a tick, all of it but its setpoint: the first half of `step`, before the actor has chosen."""
         findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
-        findings |= self._take_pose(tick) | self._check_flight()
-        if self.armed:
+        return findings | self._take_pose(tick) | self._check_flight()
+
+    def cuts(self, findings: Findings) -> bool:
+        """Whether they cut a vehicle that flies, whatever it is that the actor would choose."""
+        return self.armed and bool(findings.keys() - _HOLDING)
+
+    def judge(self, tick: Tick, findings: Findings) -> Verdict:
+        """Judge a tick by what was found in it: the second half of `step`."""
+        if self.cuts(findings):
+            self.state = State.CUT
+        elif self.armed:
             findings |= self._check_setpoint(tick)
             self._fly_on(findings, tick.finish)
         else:
@@ -201,7 +161,7 @@ class Safety:
         return self.armed and self._now - self._armed_at < self.limits.arm_time
 
     def _fly_on(self, findings: Findings, finish: bool) -> None:
-        if findings.keys() - _HOLDING:
+        if self.cuts(findings):
             self.state = State.CUT
         elif finish:
             self.state = State.DISARMED
@@ -215,7 +175,7 @@ class Safety:
         elif not findings:
             self.state = State.FLYING
             self._armed_at = self._wanted_at = self._now
-            self._moved_at = self._now + self.limits.lift_off_time - self.limits.still_time
+            self._left_at = math.inf
 
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
@@ -239,14 +199,14 @@ class Safety:
 
     def _forget(self) -> None:
         """Drop whatever was measured by a clock that cannot be trusted, or that has only begun."""
-        self._seen: _Seen | None = None
-        self._odometer = Odometer(self.limits.velocity_window)
+        self._motion = Motion(self.limits)
         self._measured_at = -math.inf
         self._overruns.clear()
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
-        self._upright_at = self._wanted_at = self._armed_at = self._now
-        self._moved_at = math.inf  # when it was last seen to move in this flight; as if, until it must have
+        self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._now
+        self._left_at = math.inf  # when it was first seen to move in this flight
+        self._moved_at = -math.inf  # when it was last
 
     def _check_clock(self, tick: Tick) -> Findings:
         now = to_number(tick.now)
@@ -283,50 +243,37 @@ class Safety:
         return findings
 
     def _check_loop(self, tick: Tick) -> Findings:
+        """Ask whether the loop keeps up, and whether anybody takes its commands."""
         limits, overruns = self.limits, self._overruns
-        if tick.loop_overrun:
-            overruns.append(self._now)
+        findings: Findings = {}
+        overruns.extend([self._now] * tick.loop_overrun)
         if len(overruns) == overruns.maxlen and self._now - overruns[0] <= limits.overrun_window:
-            return {
-                Reason.OVERRUNS: f"the loop overran {len(overruns)} times within {limits.overrun_window:g} s "
+            findings[Reason.OVERRUNS] = (
+                f"the loop missed {len(overruns)} deadlines within {limits.overrun_window:g} s "
                 f"(allowed: {limits.overruns_max})"
-            }
-        return {}
+            )
+        if not tick.command_dropped:
+            self._delivered_at = self._now
+        silent = self._now - self._delivered_at
+        if silent > limits.cut_after:
+            findings[Reason.LINK_LOST] = f"the link has taken no command for {silent:.3g} s"
+        return findings
 
     def _take_pose(self, tick: Tick) -> Findings:
         """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""
         if tick.pose is None:
             return {}
-        seen = _read_pose(tick.pose)
+        seen, last = read_pose(tick.pose), self._motion.newest
         if seen is None:
             return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an attitude that is none"}
-        last, limits = self._seen, self.limits
-        if seen.time > self._now + limits.hold_after or (last is not None and seen.time <= last.time):
+        if seen.time > self._now + self.limits.hold_after or (last is not None and seen.time <= last.time):
             return {}
         age = to_number(tick.pose_age)
-        self._seen = seen
         self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
-        return self._check_motion(seen, last)
-
-    def _check_motion(self, seen: _Seen, last: _Seen | None) -> Findings:
-        """Refuse poses that no vehicle went through: one after the other, and by the velocities that they claim."""
-        limits = self.limits
-        mismatch = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
-        findings: Findings = {}
-        if last is not None:
-            moved = math.dist(seen.position, last.position)
-            allowed = limits.speed_max * (seen.time - last.time) + limits.jump_tolerance
-            if not moved <= allowed:
-                findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"
-        if mismatch is not None and not mismatch <= limits.velocity_tolerance:
-            findings[Reason.POSE_CONTRADICTION] = (
-                f"velocities and positions of poses differ by {mismatch:.3g} m/s (allowed: "
-                f"{limits.velocity_tolerance:g})"
-            )
-        return findings
+        return self._motion.take(seen)
 
     def _check_flight(self) -> Findings:
-        limits, seen = self.limits, self._seen
+        limits, seen = self.limits, self._motion.newest
         age = self._now - self._measured_at
         findings: Findings = {}
         if age > limits.hold_after:
@@ -346,7 +293,22 @@ class Safety:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° (allowed: {limits.tilt_max_degrees:g})"
         if seen.speed > limits.start_speed:
             self._moved_at = self._now
-        elif self.armed and self._now - self._moved_at > limits.still_time:
+            self._left_at = min(self._left_at, self._now)
+        return findings | self._check_stillness()
+
+    def _check_stillness(self) -> Findings:
+        """Find poses that are the same to the last digit while it flies, and what is held fast, or lies somewhere."""
+        limits, motion, now = self.limits, self._motion, self._now
+        if not self.armed:
+            return {}
+        findings: Findings = {}
+        frozen = now - max(motion.changed_at, self._left_at)
+        if motion.repeats and frozen > limits.cut_after:
+            findings[Reason.POSE_FROZEN] = (
+                f"poses have been the same for {frozen:.3g} s (allowed: {limits.cut_after:g})"
+            )
+        has_left = math.isfinite(self._left_at)
+        if now - self._moved_at > limits.still_time if has_left else now - self._armed_at > limits.lift_off_time:
             findings[Reason.STRANDED] = "it does not move: is it held fast, or lying somewhere?"
         return findings
 
@@ -360,7 +322,7 @@ class Safety:
 
     def _check_start(self, tick: Tick) -> Findings:
         """Return what else speaks against arming: an enable that is not new, a finished flight, or a vehicle astray."""
-        limits, seen = self.limits, self._seen
+        limits, seen = self.limits, self._motion.newest
         findings: Findings = {}
         if tick.finish:
             findings[Reason.FINISHED] = _OVER
@@ -379,21 +341,6 @@ class Safety:
             if value > limit:
                 findings[reason] = f"{text.format(value)} (allowed: {limit:g})"
         return findings
-
-
-def _read_pose(pose: Pose) -> _Seen | None:
-    """Return a pose in plain numbers; None if one is not finite, or the attitude is none."""
-    time = to_number(pose.time)
-    position, velocity, rates = (
-        to_numbers(value, 3) for value in (pose.position, pose.linear_velocity, pose.body_rates)
-    )
-    attitude = to_numbers(pose.attitude, 4)
-    if position is None or velocity is None or rates is None or attitude is None or not math.isfinite(time):
-        return None
-    length = math.hypot(*attitude)
-    if not 0.9 < length < 1.1:
-        return None
-    return _Seen(time, position, tuple(value / length for value in attitude), velocity)
 
 
 def _read_setpoint(setpoint: Setpoint | None) -> Vector | None:

@@ -38,12 +38,16 @@ class SafetyLimits:
         release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
         arm_time: s after arming in which the least thrust is sent: Betaflight arms at low throttle only.
         hold_after: s, age of a pose above which it holds.
-        cut_after: s, age of a pose, or time without a setpoint, above which it cuts.
-        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still.
-        overruns_max: overruns of the loop that may happen within `overrun_window`.
+        cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
+            none, above which it cuts.
+        tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still, see `hil.watchdog`.
+        overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
         overrun_window: s.
+        clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.
         speed_max: m/s; the shipped agents fly at up to 11.5 in simulation.
         jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
+        turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
+        turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
         velocity_tolerance: m/s by which the velocities that poses claim may differ from those of their positions.
         velocity_window: s over which they are compared, see `hil.odometer`.
         tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
@@ -72,8 +76,11 @@ class SafetyLimits:
     tick_max: float = setting(0.200, _SECONDS)
     overruns_max: int = setting(3, Range(0, 1000))
     overrun_window: float = setting(1.0, Range(0, 60, open_below=True))
+    clock_drift_max: float = setting(200.0, Range(0, 1e5))
     speed_max: float = setting(15.0, _MOST)
     jump_tolerance: float = setting(0.1, _TOLERANCE)
+    turn_rate_max: float = setting(15.0, _MOST)
+    turn_tolerance_degrees: float = setting(20.0, _DEGREES)
     velocity_tolerance: float = setting(4.0, _MOST)
     velocity_window: float = setting(0.075, _SECONDS)
     tilt_max_degrees: float = setting(100.0, _DEGREES)
@@ -122,6 +129,10 @@ class SafetyLimits:
                 "start_position: must be in the fence",
             ),
             (min(self.rate_max) <= 0.0, f"rate_max={self.rate_max}: must be above 0 about each axis"),
+            (
+                not max(self.rate_max) <= self.turn_rate_max,
+                f"turn_rate_max={self.turn_rate_max}: must be at least the largest of rate_max={self.rate_max}",
+            ),
             (not self.thrust_min < GRAVITY, f"thrust_min={self.thrust_min}: must be below {GRAVITY} (hover)"),
             (not self.thrust_max > GRAVITY, f"thrust_max={self.thrust_max}: must be above {GRAVITY} (hover)"),
         ):

@@ -6,16 +6,13 @@ is when a packet arrived; what is wanted is when it was measured.
 
 from __future__ import annotations
 
-from collections import deque
+import math
 from enum import Enum
 
 from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.pose import Received
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
-
-WINDOW = 200
-"""Packets over which the least delay is sought [choice]: a second at 200 Hz, in which clocks drift by some 20 µs."""
-
 
 SILENCE = 0.5
 """s without a packet after which a sender may begin anew, with lower numbers [choice]; the vehicle is cut by then."""
@@ -25,7 +22,7 @@ class Stamping(Enum):
     """What a pose's time is."""
 
     receive = "receive"  # when it arrived, less a fixed latency
-    sender = "sender"  # the sender's stamp, put on our clock by the least delay of the newest packets
+    sender = "sender"  # the sender's stamp, put on our clock by the least delay so far
 
 
 class PoseClock:
@@ -34,42 +31,50 @@ class PoseClock:
     Args:
         stamping: How.
         latency: s, of the least delayed packet from measurement to arrival: what no stamp shows.
+        drift_max: ppm, by which the sender's clock may go slower than ours. The least delay is forgotten no faster
+            than this accounts for: what grows faster is delay, and poses become that much older.
 
     Attributes:
         out_of_order: Packets so far that were older than one before, or the same again; they are left out.
     """
 
-    def __init__(self, stamping: Stamping, latency: float) -> None:
+    def __init__(self, stamping: Stamping, latency: float, drift_max: float = SafetyLimits.clock_drift_max) -> None:
         self.stamping = stamping
         self.latency = latency
         self.out_of_order = 0
-        self._offsets: deque[float] = deque(maxlen=WINDOW)  # arrival less stamp, s
+        self._drift_max = 1e-6 * drift_max
+        self._offset = math.inf  # s, arrival less stamp of the least delayed packet
         self._newest: Received | None = None
+        self._latest = -math.inf  # s, of the poses so far
 
     def read(self, received: Received) -> Pose | None:
-        """Return the pose of a packet; None if it is not newer than the newest one.
+        """Return the pose of a packet; None if its number is not newer than the newest one's, or its time is older.
 
         Only after a silence may numbers and stamps begin anew: else a replayed packet would be taken for a new sender.
         """
         packet = received.packet
         if self._newest is not None:
             newer = 0 < (packet.sequence - self._newest.packet.sequence) % 2**32 < 2**31
-            if not newer and received.time - self._newest.time < SILENCE:
+            waited = received.time - self._newest.time
+            if waited < 0.0 or (not newer and waited < SILENCE):
                 self.out_of_order += 1
                 return None
-            if packet.stamp < self._newest.packet.stamp:
-                self._offsets.clear()
+            if waited >= SILENCE or packet.stamp < self._newest.packet.stamp:
+                self._offset = math.inf  # it may be another clock
+            self._offset += self._drift_max * waited
         self._newest = received
-        return Pose(
-            self._measured(received), packet.position, packet.attitude, packet.linear_velocity, packet.body_rates
-        )
+        measured = self._measured(received)
+        if measured < self._latest:  # a packet that was delayed less tells more of the clocks; its pose is an older one
+            self.out_of_order += 1
+            return None
+        self._latest = measured
+        return Pose(measured, packet.position, packet.attitude, packet.linear_velocity, packet.body_rates)
 
     def _measured(self, received: Received) -> float:
         if self.stamping is Stamping.receive:
             return received.time - self.latency
-        self._offsets.append(received.time - received.packet.stamp)
-        measured = received.packet.stamp + min(self._offsets) - self.latency
-        return min(measured, received.time - self.latency)
+        self._offset = min(self._offset, received.time - received.packet.stamp)
+        return min(received.packet.stamp + self._offset, received.time) - self.latency
 
 
 def extrapolate(pose: Pose, time: float) -> Pose:

@@ -70,7 +70,7 @@ class Link(Protocol):
     """Carries commands to a vehicle, and back what it says of its battery."""
 
     def send(self, command: Command) -> bytes:
-        """Send a command now, without waiting; return the bytes that went out, for the record."""
+        """Send a command now, without waiting; return the bytes that went out, none if it was dropped."""
         ...
 
     def listen(self) -> list[Reading]:

@@ -10,7 +10,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_size, size_of
+from dreamer_racing.learners.learner import Judge
+from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_layers, layers_of
 from dreamer_racing.modules import Interface
 
 
@@ -38,7 +39,7 @@ class BaselineLearner(ABC):
         self.device = torch.device(device)
         self.updates = 0
         self._keys = interface.observation_keys
-        self._size = size_of(size, interface)
+        self._size = layers_of(size, interface)
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
 
     def policy(self, deterministic: bool = False) -> BaselinePolicy:
@@ -48,6 +49,10 @@ class BaselineLearner(ABC):
     def evaluation_policy(self) -> BaselinePolicy:
         """Return the acting step to evaluate: the one that is trained."""
         return self.policy()
+
+    def judge(self) -> Judge | None:
+        """Return what the critic makes of a state; None of learners without a critic of states."""
+        return None
 
     def check_finite(self) -> None:
         """Wait for the latest updates; raise ``NonFiniteLossError`` if one of them was not finite."""
@@ -64,7 +69,7 @@ class BaselineLearner(ABC):
         Raises:
             ValueError: If it is that of networks of another size; nothing is changed then.
         """
-        check_size(state_dict["size"], self._size)
+        check_layers(state_dict["size"], self._size)
         for name, module in self._modules().items():
             module.load_state_dict(state_dict[name])
         rate = self.optimizer.param_groups[0]["lr"]

@@ -17,14 +17,17 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
+from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, check_settings, setting
 from dreamer_racing.training import parallel
 
@@ -144,7 +147,6 @@ class DreamerLearner:
         self._networks = trained_parameters(agent, losses)
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(losses["actor"], "optimizer", None)
         self._rates = [group["lr"] for group in self._groups]
-        self._timed: Timer = untimed
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
         self._compiled = torch.compile(self.compute_losses, dynamic=False) if self.config.compile else None
         self._graph = self._make_graph() if self.config.cuda_graph else None
@@ -189,13 +191,12 @@ class DreamerLearner:
                 this batch; on a CUDA device this is noticed two updates late, because waiting for the device would
                 stall it.
         """
-        self._timed = untimed if self.config.compile else timed  # a clock would break the compiled graph in pieces
         batch = batch.to(self.device, non_blocking=True)
         if self._actor_optimizer is not None:
             cast(ActorLoss, self.losses["actor"]).prepare(self._number_of_starts(batch))
-        metrics = self._backward(batch) if self._graph is None else self._graph(batch)
+        metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
         if parallel.count() > 1:
-            metrics = self._of_all_processes(metrics)
+            metrics = self._of_all_processes(metrics, timed)
         self._guard.check(metrics, batch)
         with timed("optimise"):
             self.optimizer.step()
@@ -244,10 +245,11 @@ class DreamerLearner:
             kl_target: Of `ActorPPOConfig`.
             min_std: Smallest standard deviation of actions, of the networks' own.
             max_std: Largest.
-            numbers: Others of `LossConfig`, by name, set in all losses that have an attribute of it.
+            numbers: Others of `LossConfig`, set in all losses that have an attribute of the name.
 
         Raises:
             TypeError: If `LossConfig` has no number of such a name.
+            ValueError: If none of the losses has it as an attribute.
         """
         if unknown := numbers.keys() - {field.name for field in fields(LossConfig)}:
             raise TypeError(f"adjust({', '.join(sorted(unknown))}=...): LossConfig has no such number.")
@@ -265,12 +267,15 @@ class DreamerLearner:
                     agent.actor.get_buffer(name).fill_(bound)
 
     def _set_in_losses(self, name: str, value: float) -> None:
-        """Set a number of all losses that have it, as a scalar in place or, in losses of a user's own, as a number."""
-        for loss in self.losses.values():
-            setting = getattr(loss, name, None)
-            if isinstance(setting, Tensor):
-                setting.fill_(value)
-            elif setting is not None:
+        """Set a number of all losses that have it: a scalar in place, a plain number or None anew."""
+        numbers = (Tensor, float, int, type(None))
+        if not (having := [loss for loss in self.losses.values() if isinstance(getattr(loss, name, ""), numbers)]):
+            losses = ", ".join(type(loss).__name__ for loss in self.losses.values())
+            raise ValueError(f"adjust({name}=...): none of {losses} has a number of that name that could move.")
+        for loss in having:
+            if isinstance(present := getattr(loss, name), Tensor):
+                present.fill_(value)
+            else:
                 setattr(loss, name, value)
 
     def check_finite(self) -> None:
@@ -291,12 +296,13 @@ class DreamerLearner:
             raise ValueError(f"cuda_graph=True needs a CUDA device, but the learner is on {str(self.device)!r}.")
         return GraphedStep(self._backward, nn.ModuleList([self.agent, self.losses]))
 
-    def _backward(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _backward(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
         with self.autocast():
-            metrics = self.compute_losses(batch) if self._compiled is None else self._compiled(batch)
+            # Without a clock where it is compiled, which would break the graph in pieces.
+            metrics = self.compute_losses(batch, timed) if self._compiled is None else self._compiled(batch)
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
-        with self._timed("optimise"):
+        with timed("optimise"):
             total.backward()
             norms = self._gradient_norms()
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
@@ -309,23 +315,23 @@ class DreamerLearner:
             if any(parameter.grad is not None for parameter in parameters)  # none, where the actor steps alone
         }
 
-    def _of_all_processes(self, metrics: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
         """Turn gradients and metrics of this process's share of the batch into those of the joint batch.
 
         One exchange of a flat tensor between backward and the optimiser's step, behind a captured graph, and not
         ``DistributedDataParallel``: gradients come from one backward through several losses, and a metric that is not
         finite reaches all processes with them, so that all stop at the same update.
         """
-        with self._timed("exchange"):
+        with timed("exchange"):
             networks = (parameter for parameters in self._networks.values() for parameter in parameters)
             metrics = parallel.average_gradients(networks, metrics)
             return metrics | self._gradient_norms()
 
-    def compute_losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def compute_losses(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""
-        with self._timed("world_model"):
+        with timed("world_model"):
             model: TensorDict = self.losses["world_model"](batch)
-        with self._timed("imagine"):
+        with timed("imagine"):
             behavior = self._behavior_losses(model.pop("replay_context"), batch)
         return {key: value for part in (model, behavior) for key, value in part.items()}
 
@@ -351,6 +357,10 @@ class DreamerLearner:
     def evaluation_policy(self) -> DreamerPolicy:
         """Return the acting step of `flying_agent`, which shares its parameters."""
         return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
+
+    def judge(self) -> Judge:
+        """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
+        return getattr(self.losses["actor"], "judge", None) or judge_latents(self.flying_agent.critic)
 
     @property
     def latent_format(self) -> LatentFormat:
@@ -449,7 +459,7 @@ def make_dreamer(
     losses: LossConfig | None = None,
     config: LearnerConfig | None = None,
     *,
-    horizon: int = 16,
+    horizon: int = HORIZON,
     device: torch.device | str = "cpu",
     seed: int | None = None,
 ) -> DreamerLearner:
@@ -476,6 +486,17 @@ def make_dreamer(
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std, losses.max_std).to(device)
         modules = make_losses(agent, losses, horizon)
     return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
+
+
+def judge_latents(critic: Critic) -> Judge:
+    """Return what a critic makes of the latents that `DreamerPolicy` has updated by what it saw."""
+
+    @torch.no_grad()
+    def value(acted: TensorDictBase) -> Tensor:
+        after = acted["next"].select("belief", "state").to(next(critic.parameters()).device)
+        return critic.value(join_features(after["belief"], after["state"]))
+
+    return value
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:

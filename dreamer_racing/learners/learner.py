@@ -15,6 +15,10 @@ Timer = Callable[[str], AbstractContextManager]
 """Context manager by the name of an activity, as ``RunClock.timed``."""
 
 
+Judge = Callable[[TensorDictBase], Tensor]
+"""What a critic expects: of records [N] that the evaluation's policy has acted on, the return from there, (N, 1)."""
+
+
 class Policy(Protocol):
     """The acting step: a module on tensordicts of batch size [N] that writes ``action``, as `BaselinePolicy` is."""
 
@@ -30,7 +34,7 @@ class Policy(Protocol):
         ...
 
 
-class Flyer(Protocol):
+class Evaluable(Protocol):
     """What can be evaluated: every learner, and a `ShippedAgent`.
 
     Attributes:
@@ -43,8 +47,12 @@ class Flyer(Protocol):
         """Return the acting step to evaluate, which may be one of averaged weights."""
         ...
 
+    def judge(self) -> Judge | None:
+        """Return what the critic that teaches the actor makes of a state; None without one."""
+        ...
 
-class Learner(Flyer, Protocol):
+
+class Learner(Evaluable, Protocol):
     """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do.
 
     Attributes:

@@ -193,16 +193,16 @@ class BaselinePolicy(TensorDictModuleBase):
         return Compose()
 
 
-def size_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
+def layers_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
     """Return what a checkpoint says of its networks: their hidden layers, and the images that they see."""
     return {**asdict(size), "image_size": interface.image_size if interface.pixels else None}
 
 
-def check_size(saved: dict[str, Any], present: dict[str, Any]) -> None:
+def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
     """Refuse the state of networks of another size, or for other images.
 
     Args:
-        saved: ``size_of`` the networks of the checkpoint.
+        saved: ``layers_of`` the networks of the checkpoint.
         present: And of the learner that loads it.
 
     Raises:

@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from dreamer_racing.learners.baseline import BaselineLearner, detached
-from dreamer_racing.learners.learner import Timer, seeded, untimed
+from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -124,15 +124,27 @@ class PPOLearner(BaselineLearner):
 
         Raises:
             NonFiniteLossError: If a loss or gradient is not finite.
+            ValueError: If there are fewer records than minibatches.
         """
+        if rollout.numel() < self.config.minibatches:
+            raise ValueError(f"minibatches={self.config.minibatches} of {rollout.numel()} records: they must be fewer.")
         with timed("advantages"):
             records = self.with_advantages(rollout)
         steps: list[dict[str, Tensor]] = []
         with timed("optimise"):
             for _ in range(self.config.epochs):
                 order = torch.randperm(len(records), device=self.device)
-                steps += [self._step(records[indices]) for indices in order.chunk(self.config.minibatches)]
+                steps += [self._step(records[indices]) for indices in order.tensor_split(self.config.minibatches)]
         return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+
+    def judge(self) -> Judge:
+        """Return what the critic makes of what is seen, in units of the reward."""
+
+        @torch.no_grad()
+        def value(acted: TensorDictBase) -> Tensor:
+            return self._judge(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
+
+        return value
 
     @torch.no_grad()
     def with_advantages(self, rollout: TensorDictBase) -> TensorDict:

@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.losses.actor import ActorLoss, DynamicsActorLoss, ReinforceLoss
 from dreamer_racing.losses.asymmetric_ppo_actor import AsymmetricPPOActorLoss
-from dreamer_racing.losses.config import ActorPPOConfig, LossConfig
+from dreamer_racing.losses.config import HORIZON, ActorPPOConfig, LossConfig
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
@@ -80,7 +80,7 @@ def find_loss(registry: Mapping[str, T], name: str) -> T:
     return registry[name]
 
 
-def make_losses(agent: Agent, config: LossConfig, horizon: int = 16) -> dict[str, LossModule]:
+def make_losses(agent: Agent, config: LossConfig, horizon: int = HORIZON) -> dict[str, LossModule]:
     """Make the three losses of an agent, by their names, on its device.
 
     Args:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
-from dreamer_racing.losses.config import LossConfig
+from dreamer_racing.losses.config import HORIZON, LossConfig
 from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
 from dreamer_racing.modules.actor import Actor
@@ -93,12 +93,12 @@ class ActorLoss(LossModule):
         actor: Actor,
         critic: Critic,
         *,
-        horizon: int = 16,
-        discount: float = 0.997,
-        lambda_: float = 0.95,
-        entropy_scale: float = 3e-4,
-        return_decay: float = 0.99,
-        continuation: bool = True,
+        horizon: int = HORIZON,
+        discount: float = LossConfig.discount,
+        lambda_: float = LossConfig.lambda_,
+        entropy_scale: float = LossConfig.entropy_scale,
+        return_decay: float = LossConfig.return_decay,
+        continuation: bool = LossConfig.continuation,
     ) -> None:
         super().__init__()
         self.world_model = world_model
@@ -112,7 +112,7 @@ class ActorLoss(LossModule):
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = HORIZON, **own: Any) -> Self:
         """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return cls(
             agent.world_model,

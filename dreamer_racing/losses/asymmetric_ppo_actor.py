@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dreamer_racing.losses.config import LossConfig
+from dreamer_racing.losses.config import HORIZON, LossConfig
 from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.agent import Agent
@@ -61,9 +61,15 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         self.optimizer.add_param_group(critic)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = HORIZON, **own: Any) -> Self:
         """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return super().from_config(agent, config, horizon, privileged_dim=agent.interface.privileged_dim, **own)
+
+    @torch.no_grad()
+    def judge(self, acted: TensorDictBase) -> Tensor:
+        """Return what the critic expects of states ``[N]`` that a policy has acted on, ``(N, 1)``."""
+        privileged = acted[PRIVILEGED].to(self.flown.device)
+        return self.state_critic.mean(symlog(privileged))
 
     def _steps(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         return {**super()._steps(rollout), "privileged": symlog(rollout[PRIVILEGED])}

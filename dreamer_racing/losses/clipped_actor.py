@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.losses.actor import ActorLoss
-from dreamer_racing.losses.config import ActorPPOConfig, LossConfig
+from dreamer_racing.losses.config import HORIZON, ActorPPOConfig, LossConfig
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training import parallel
@@ -77,7 +77,7 @@ class ClippedActorLoss(ActorLoss):
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
 
     @classmethod
-    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = 16, **own: Any) -> Self:
+    def from_config(cls, agent: Agent, config: LossConfig, horizon: int = HORIZON, **own: Any) -> Self:
         """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return super().from_config(agent, config, horizon, ppo=config.ppo, **own)
 

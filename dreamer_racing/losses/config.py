@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from dreamer_racing.modules.actor import MAX_STD, MIN_STD
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
+
+HORIZON = 16
+"""H, imagined actions from each start, where nobody says; in recipes ``model.imagination_horizon`` does.
+Reference: DreamerV3, Table 4."""
 
 
 @dataclass
@@ -81,8 +86,8 @@ class LossConfig:
     lambda_: float = setting(0.95, SHARE)
     entropy_scale: float = setting(3e-4, NOT_NEGATIVE)
     return_decay: float = setting(0.99, SHARE)
-    min_std: float = setting(0.1, POSITIVE_SHARE)
-    max_std: float = setting(1.0, POSITIVE_SHARE)
+    min_std: float = setting(MIN_STD, POSITIVE_SHARE)
+    max_std: float = setting(MAX_STD, POSITIVE_SHARE)
     dynamics_scale: float = setting(1.0, NOT_NEGATIVE)
     representation_scale: float = setting(0.1, NOT_NEGATIVE)
     free_nats: float = setting(1.0, NOT_NEGATIVE)

@@ -70,10 +70,10 @@ class CriticLoss(LossModule):
         critic: The module to train.
         discount: γ.
         lambda_: λ of the replayed returns.
-        slow_scale: Weight of the regression on the slow copy's mean.
-        replay_scale: Weight of the replayed returns.
-        replay_gradient: Whether the replayed returns' loss reaches whatever graph ``belief`` and ``state`` carry, and
-            so trains the world model too.
+        slow_critic_scale: Weight of the regression on the slow copy's mean.
+        replay_value_scale: Weight of the replayed returns.
+        replay_value_gradient: Whether the replayed returns' loss reaches whatever graph ``belief`` and ``state`` carry,
+            and so trains the world model too.
 
     Reads ``imagination`` as ``ActorLoss`` writes it, or goes without, and a batch ``[B, T]`` of ``belief``, ``state``,
     ``reward``, ``is_init``, ``terminated``, ``truncated``, with an optional ``bootstrap`` ``(B, T, 1)``: values of the
@@ -90,19 +90,19 @@ class CriticLoss(LossModule):
         self,
         critic: Critic,
         *,
-        discount: float = 0.997,
-        lambda_: float = 0.95,
-        slow_scale: float = 1.0,
-        replay_scale: float = 0.3,
-        replay_gradient: bool = True,
+        discount: float = LossConfig.discount,
+        lambda_: float = LossConfig.lambda_,
+        slow_critic_scale: float = LossConfig.slow_critic_scale,
+        replay_value_scale: float = LossConfig.replay_value_scale,
+        replay_value_gradient: bool = LossConfig.replay_value_gradient,
     ) -> None:
         super().__init__()
         self.critic = critic
         self.discount = scheduled(discount)
         self.lambda_ = lambda_
-        self.slow_scale = slow_scale
-        self.replay_scale = replay_scale
-        self.replay_gradient = replay_gradient
+        self.slow_critic_scale = slow_critic_scale
+        self.replay_value_scale = replay_value_scale
+        self.replay_value_gradient = replay_value_gradient
 
     @classmethod
     def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
@@ -111,16 +111,16 @@ class CriticLoss(LossModule):
             agent.critic,
             discount=config.discount,
             lambda_=config.lambda_,
-            slow_scale=config.slow_critic_scale,
-            replay_scale=config.replay_value_scale,
-            replay_gradient=config.replay_value_gradient,
+            slow_critic_scale=config.slow_critic_scale,
+            replay_value_scale=config.replay_value_scale,
+            replay_value_gradient=config.replay_value_gradient,
             **own,
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the losses; keys in the class's docstring."""
         require_keys(self, tensordict, self.in_keys)
-        losses = TensorDict({"loss_replay_critic": self.replay_scale * self._replay(tensordict)}, [])
+        losses = TensorDict({"loss_replay_critic": self.replay_value_scale * self._replay(tensordict)}, [])
         if (imagination := tensordict.get("imagination", None)) is not None:
             losses.update(self._imagined(imagination))
         return losses
@@ -142,7 +142,7 @@ class CriticLoss(LossModule):
     def _replay(self, tensordict: TensorDictBase) -> Tensor:
         """Return the unscaled loss on the replayed records, a scalar."""
         features = join_features(tensordict.get("belief"), tensordict.get("state"))
-        features = features if self.replay_gradient else features.detach()
+        features = features if self.replay_value_gradient else features.detach()
         logits = self.critic(features)
         bootstrap = tensordict.get("bootstrap", None)
         if bootstrap is None:
@@ -163,4 +163,4 @@ class CriticLoss(LossModule):
         two_hot, log_probabilities = self.critic.two_hot, logits.log_softmax(-1)
         slow_value = self.critic.slow_value(features)
         loss = two_hot.cross_entropy(log_probabilities, returns)
-        return loss + self.slow_scale * two_hot.cross_entropy(log_probabilities, slow_value)
+        return loss + self.slow_critic_scale * two_hot.cross_entropy(log_probabilities, slow_value)

@@ -78,7 +78,12 @@ class PrivilegedLoss(WorldModelLoss):
     represent_keys: ClassVar[tuple[str, ...]] = ("loss_privileged", "privileged_error")
 
     def __init__(
-        self, world_model: WorldModel, privileged_dim: int, *, privileged_scale: float = 1.0, **kwargs: Any
+        self,
+        world_model: WorldModel,
+        privileged_dim: int,
+        *,
+        privileged_scale: float = LossConfig.privileged_scale,
+        **kwargs: Any,
     ) -> None:
         super().__init__(world_model, **kwargs)
         if privileged_dim < 1:
@@ -170,7 +175,7 @@ class DecoderFreeLoss(WorldModelLoss):
         self,
         world_model: WorldModel,
         *,
-        barlow_scale: float = 0.05,
+        barlow_scale: float = LossConfig.barlow_scale,
         off_diagonal_scale: float = 5e-4,
         **kwargs: Any,
     ) -> None:

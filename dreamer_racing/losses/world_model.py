@@ -38,7 +38,7 @@ KL_MODES: dict[str, Callable[[Tensor, float], Tensor]] = {"separate": separate_k
 
 
 def kl_losses(
-    posterior_logits: Tensor, prior_logits: Tensor, free_nats: float, unimix: float, mode: str = "separate"
+    posterior_logits: Tensor, prior_logits: Tensor, free_nats: float, unimix: float, mode: str = LossConfig.kl_mode
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the two KL losses between posterior and prior.
 
@@ -100,10 +100,10 @@ class WorldModelLoss(LossModule):
         self,
         world_model: WorldModel,
         *,
-        dynamics_scale: float = 1.0,
-        representation_scale: float = 0.1,
-        free_nats: float = 1.0,
-        kl_mode: str = "separate",
+        dynamics_scale: float = LossConfig.dynamics_scale,
+        representation_scale: float = LossConfig.representation_scale,
+        free_nats: float = LossConfig.free_nats,
+        kl_mode: str = LossConfig.kl_mode,
     ) -> None:
         super().__init__()
         if kl_mode not in KL_MODES:

@@ -16,6 +16,8 @@ from dreamer_racing.modules.heads import MLP
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 STD_SHIFT = 2.0
 """What is added to the raw deviation, so that a fresh network's is large. Reference: ``heads.bounded_normal``."""
+MIN_STD, MAX_STD = 0.1, 1.0
+"""Bounds of the deviation. Reference: danijar/dreamerv3, ``configs.yaml``."""
 FIRST_STD = 0.6
 """Deviation to begin with where it does not depend on the state, as the PPO baseline's [choice]."""
 
@@ -88,8 +90,8 @@ class Actor(nn.Module):
         layers: int,
         units: int,
         norm: str = "rms",
-        min_std: float = 0.1,
-        max_std: float = 1.0,
+        min_std: float = MIN_STD,
+        max_std: float = MAX_STD,
         state_std: bool = True,
     ) -> None:
         super().__init__()

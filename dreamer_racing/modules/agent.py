@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import nn
 
-from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.actor import MAX_STD, MIN_STD, Actor
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.sizes import ModelSize
@@ -30,7 +30,12 @@ class Agent(nn.Module):
     """
 
     def __init__(
-        self, size: ModelSize, interface: Interface, decode: bool = True, min_std: float = 0.1, max_std: float = 1.0
+        self,
+        size: ModelSize,
+        interface: Interface,
+        decode: bool = True,
+        min_std: float = MIN_STD,
+        max_std: float = MAX_STD,
     ) -> None:
         super().__init__()
         head = (size.actor_critic_layers, size.units, size.norm)

@@ -14,12 +14,13 @@ have of their own is read back if they are as many as before; else the replay is
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +29,25 @@ from tensordict import TensorDict
 from torchrl.checkpoint import (
     Checkpoint,
     CheckpointError,
-    CheckpointRotation,
     GlobalRNGState,
     StateDictCheckpointAdapter,
 )
 
 from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import (
-    CHECKPOINTS,
     PREFIX,
+    REPLACED,
     RunDirectory,
     complete_checkpoints,
     ensure_writable,
     is_complete,
+    stepped_aside,
 )
 
 CHECKSUMS = "checksums.json"
 """The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
+HAS_CHECKSUMS = "checksums"
+"""In the metadata of a checkpoint that was saved with that file: if it is not there, it was lost."""
 PROCESS, PROCESSES = "process-", "processes"
 """Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
 
@@ -128,11 +131,12 @@ class RunCheckpoints:
     def __init__(
         self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2, own: Collection[str] = ()
     ) -> None:
-        self.directory = Path(run_dir).absolute() / CHECKPOINTS
+        self.directory = RunDirectory(Path(run_dir).absolute()).checkpoints
         self.components = components
+        self._own_names = frozenset(own)  # also of parts that the other processes alone have
         self._own = {name: components[name] for name in own if name in components}
         self._checkpoint = _bind({**components, "random_state": RandomState()})
-        self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, prefix=PREFIX)
+        self._keep_last = keep_last
         self._last_saved: Path | None = None
         if parallel.is_first():
             ensure_writable(self.directory)
@@ -159,7 +163,7 @@ class RunCheckpoints:
             return final
         partial = self.directory / f".{final.name}.partial"
         processes = {PROCESSES: parallel.count()} if self._own and parallel.count() > 1 else {}
-        about = {**(metadata or {}), "env_steps": env_steps, **processes}
+        about = {**(metadata or {}), "env_steps": env_steps, **processes, HAS_CHECKSUMS: True}
         first = parallel.is_first()
         try:
             self._step(lambda: self._checkpoint.save(partial, metadata=about), of_this_process=first)
@@ -174,8 +178,11 @@ class RunCheckpoints:
             ) from error
         self._last_saved = final
         if first:
-            self._remove_later(final)
-            self._rotation.prune()
+            try:
+                self._remove_later(final)
+                self._remove_oldest()
+            except OSError as error:  # what was asked for is done
+                logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
         return final
 
     def _step(self, action: Callable[[], object], of_this_process: bool) -> None:
@@ -216,7 +223,8 @@ class RunCheckpoints:
         parts = {**self.components, "random_state": RandomState()}
         if not self._own:
             return load_components(self.directory if path is None else path, parts, map_location, may_lack)
-        source = Path(parallel.agreed(_path_of_sound(self.directory if path is None else path, parts)))
+        looked_at = {*parts, *self._own_names}
+        source = Path(parallel.agreed(_path_of_sound(self.directory if path is None else path, looked_at)))
         metadata = Checkpoint.manifest(source)["metadata"]
         own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
         if (saved := metadata.get(PROCESSES, 1)) != parallel.count():
@@ -252,13 +260,18 @@ class RunCheckpoints:
         )
 
     def _remove_later(self, newest: Path) -> None:
-        for path in self._rotation.checkpoints():
+        for path in self._complete():
             if path.name > newest.name:
                 logger.warning("Removing %s: the run was resumed from before it.", path)
-                tombstone = path.with_name(f".{path.name}.removed")
-                shutil.rmtree(tombstone, ignore_errors=True)
-                os.replace(path, tombstone)
-                shutil.rmtree(tombstone)
+                _remove(path)
+
+    def _remove_oldest(self) -> None:
+        for path in self._complete()[: -self._keep_last]:
+            _remove(path)
+
+    def _complete(self) -> list[Path]:
+        """Return the complete checkpoints, oldest first."""
+        return [path for path in sorted(self.directory.glob(f"{PREFIX}-*")) if is_complete(path)]
 
 
 class BestCheckpoint:
@@ -409,7 +422,7 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
 def _complete(partial: Path, final: Path) -> None:
     """Makes a checkpoint of what was written beside its place."""
     _check_loadable(partial)
-    _write_checksums(partial)
+    write_checksums(partial)
     _sync_tree(partial)
     _publish(partial, final)
 
@@ -420,28 +433,51 @@ def _check_loadable(path: Path) -> None:
         torch.load(file, map_location="cpu", mmap=True, weights_only=True)
 
 
-def _write_checksums(path: Path) -> None:
-    """Notes the checksum of every file, the manifest's too."""
-    files = sorted(file for file in path.rglob("*") if file.is_file())
+def write_checksums(path: Path) -> None:
+    """Notes the checksum of every other file of a checkpoint, the manifest's too."""
+    files = sorted(file for file in path.rglob("*") if file.is_file() and file.name != CHECKSUMS)
     sums = {file.relative_to(path).as_posix(): _checksum(file) for file in files}
     (path / CHECKSUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
 
 
 def _damage(path: Path, parts: Collection[str] | None) -> str | None:
     """Says which file of some parts is not as it was saved; None if all are, or if an older version noted no sums."""
+    manifest = Checkpoint.manifest(path)
     try:
         sums = json.loads((path / CHECKSUMS).read_text(encoding="utf-8"))
     except FileNotFoundError:
+        metadata = manifest.get("metadata")
+        if not isinstance(metadata, dict) or metadata.get(HAS_CHECKSUMS):
+            return f"{CHECKSUMS} is missing"
+        _warn_of_no_checksums(path)
         return None
-    except ValueError:
+    except (ValueError, OSError):
+        sums = None
+    if not isinstance(sums, dict):
         return f"{CHECKSUMS} cannot be read"
-    folders = {name: record["path"] for name, record in Checkpoint.manifest(path)["components"].items()}
-    read = tuple(f"{folder}/" for name, folder in folders.items() if parts is None or name in parts)
-    for name, saved in sums.items():
-        inner = name.partition("/")[2] if name.startswith(PROCESS) else name
-        if ("/" not in inner or inner.startswith(read)) and _checksum(path / name) != saved:
+    for name in _files_of(path, parts):
+        if name not in sums:
+            return f"{CHECKSUMS} lacks {name}"
+        if _checksum(path / name) != sums[name]:
             return f"{name} is not what was saved"
     return None
+
+
+def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
+    """Names the files of some parts, of every process; a manifest comes first, to be compared before it is read."""
+    yield "manifest.json"
+    manifest = Checkpoint.manifest(path)
+    for part, record in manifest["components"].items():
+        if parts is None or part in parts:
+            yield from (f"{record['path']}/{file}" for file in record["files"])
+    for rank in range(1, (manifest.get("metadata") or {}).get(PROCESSES, 1)):
+        folder = f"{PROCESS}{rank}"
+        yield from (f"{folder}/{name}" for name in _files_of(path / folder, parts))
+
+
+@functools.cache  # once for a checkpoint, however often it is read
+def _warn_of_no_checksums(path: Path) -> None:
+    logger.warning("%s was saved by a version without checksums: whether it is damaged cannot be told.", path)
 
 
 def _checksum(file: Path) -> int | None:
@@ -467,7 +503,7 @@ def _sync_tree(path: Path) -> None:
 
 def _publish(partial: Path, final: Path) -> None:
     """Renames into place. A folder cannot be renamed onto another, so an earlier one of that name steps aside."""
-    aside = final.with_name(f".{final.name}.replaced")
+    aside = final.with_name(f".{final.name}{REPLACED}")
     if final.exists():
         os.replace(final, aside)
     os.replace(partial, final)
@@ -479,11 +515,19 @@ def _publish(partial: Path, final: Path) -> None:
         os.close(descriptor)
 
 
+def _remove(path: Path) -> None:
+    """Removes a checkpoint: under another name first, so that a kill meanwhile leaves none of that name incomplete."""
+    tombstone = path.with_name(f".{path.name}.removed")
+    shutil.rmtree(tombstone, ignore_errors=True)
+    os.replace(path, tombstone)
+    shutil.rmtree(tombstone)
+
+
 def _remove_partial(directory: Path) -> None:
     """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
     for path in directory.glob(f".*{PREFIX}-*"):
-        final = path.with_name(path.name.removeprefix(".").removesuffix(".replaced"))
-        if path.name.endswith(".replaced") and not final.exists() and is_complete(path):
+        final = stepped_aside(path)
+        if path.name.endswith(REPLACED) and not final.exists() and is_complete(path):
             os.replace(path, final)
         else:
             logger.info("Removing the unfinished %s.", path)

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from dreamer_racing.training.lock import RunLock
 
@@ -20,6 +20,10 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "checkpoints"
 PREFIX = "checkpoint"
+REPLACED = ".replaced"
+"""End of the hidden name under which a checkpoint waits until another of its name is there."""
+EVALUATION = "evaluation.json"
+"""Numbers of an evaluation, in whichever folder it is written to."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,13 @@ class RunDirectory:
     def best(self) -> RunDirectory:
         """Networks as they were at the best evaluation, with the configuration."""
         return RunDirectory(self.path / "best")
+
+    @property
+    def run(self) -> RunDirectory:
+        """That of the run, where this is its best checkpoint's; else this one."""
+        around = RunDirectory(self.path.parent)
+        is_run = around.config.exists() or around.starts.exists()
+        return around if self == around.best and is_run else self
 
     @property
     def config(self) -> Path:
@@ -93,8 +104,13 @@ class RunDirectory:
 
     @property
     def evaluation(self) -> Path:
-        """Folder of an evaluation after training, with ``evaluation.json``."""
+        """Folder of an evaluation after training."""
         return self.path / "evaluation"
+
+    @property
+    def evaluation_file(self) -> Path:
+        """Numbers of that evaluation."""
+        return self.evaluation / EVALUATION
 
     @property
     def nonfinite_batch(self) -> Path:
@@ -121,9 +137,7 @@ class RunDirectory:
 
     def mark_finished(self, env_steps: int) -> None:
         """Note that all is done."""
-        partial = self.finished.with_name(f".{self.finished.name}.partial")
-        partial.write_text(json.dumps({"env_steps": env_steps}) + "\n", encoding="utf-8")
-        os.replace(partial, self.finished)
+        replace_text(self.finished, json.dumps({"env_steps": env_steps}) + "\n")
 
     def finished_env_steps(self) -> int:
         """Return the env_steps that the run was finished at; 0 if it was not, or if nobody can tell."""
@@ -160,6 +174,8 @@ class RunDirectory:
 def complete_checkpoints(path: str | Path) -> list[Path]:
     """Finds the complete checkpoints, newest first. Folders that a killed process left incomplete are passed over.
 
+    One that had stepped aside for another of its name, which never came, is among them.
+
     Args:
         path: run directory, folder of checkpoints, or one checkpoint.
 
@@ -170,12 +186,14 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
     if is_complete(path):
         return [path]
     for directory in (path / CHECKPOINTS, path):
-        found = []
-        for candidate in sorted(directory.glob(f"{PREFIX}-*"), reverse=True):
-            if is_complete(candidate):
-                found.append(candidate)
-            else:
-                logger.warning("Passing over %s: it is not a complete checkpoint.", candidate)
+        aside = [path for path in directory.glob(f".{PREFIX}-*{REPLACED}") if not stepped_aside(path).exists()]
+        candidates = sorted([*directory.glob(f"{PREFIX}-*"), *aside], key=env_steps_of, reverse=True)
+        found = [candidate for candidate in candidates if is_complete(candidate)]
+        for candidate in candidates:
+            if candidate not in found:
+                newer = found and env_steps_of(candidate) > env_steps_of(found[0])
+                lost = f"; what came after {found[0].name} is lost" if newer else ""
+                logger.warning("Passing over %s: it is not a complete checkpoint%s.", candidate, lost)
         if found:
             return found
     state = "exists, but holds none" if path.exists() else "does not exist"
@@ -185,9 +203,30 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
     )
 
 
+def stepped_aside(path: Path) -> Path:
+    """Return the name that a checkpoint had before it stepped aside."""
+    return path.with_name(path.name.removeprefix(".").removesuffix(REPLACED))
+
+
+def env_steps_of(checkpoint: Path) -> int:
+    """Return the env_steps that a checkpoint's name tells; -1 of a name that tells none."""
+    number = stepped_aside(checkpoint).name.rpartition("-")[2]
+    return int(number) if number.isdecimal() else -1
+
+
 def latest_checkpoint(path: str | Path) -> Path:
     """Finds the newest complete checkpoint, as ``complete_checkpoints`` does."""
     return complete_checkpoints(path)[0]
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file so that, whatever happens meanwhile, it is as it was or as it is to be."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
 
 
 def ensure_writable(directory: str | Path) -> Path:
@@ -216,7 +255,10 @@ def ensure_writable(directory: str | Path) -> Path:
 
 def is_complete(path: Path) -> bool:
     """Whether the manifest, which is written last, is there with every file it lists (a copy may have lost some)."""
-    if not path.is_dir() or not Checkpoint.is_checkpoint(path):
+    if not path.is_dir():
         return False
-    parts = Checkpoint.manifest(path)["components"].values()
+    try:
+        parts = Checkpoint.manifest(path)["components"].values()
+    except (CheckpointError, OSError, TypeError, ValueError, AttributeError):  # the last for JSON that is no object
+        return False
     return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from torch import Tensor
@@ -32,13 +33,12 @@ class UnwrittenMetrics:
     def push(self, metrics: Mapping[str, Tensor | float]) -> None:
         """Do nothing."""
 
-    def write(self, env_steps: int) -> dict[str, float]:
+    def close_row(self, env_steps: int) -> dict[str, float]:
         """Return nothing."""
         return {}
 
-    def holds(self, name: str, env_steps: int) -> bool:
-        """Say no."""
-        return False
+    def flush(self) -> None:
+        """Do nothing."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -48,6 +48,7 @@ class NoReport:
     """An evaluation that the first process makes."""
 
     on_episode: Callable[[int, int], None] | None = None
+    attempt: Callable[[str], AbstractContextManager] = nullcontext
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Refuse: whoever asks has not looked which process this is."""

@@ -103,6 +103,10 @@ class TensorboardRunLogger(TensorboardLogger):
         purge_step = None if self._resume_env_steps is None else self._resume_env_steps + 1
         return SummaryWriter(log_dir=str(Path(self.log_dir) / self.exp_name), purge_step=purge_step)
 
+    def renew(self) -> None:
+        """Go on in another file, after a write that failed: what comes behind it in this one is not read."""
+        self.experiment: Any = SummaryWriter(log_dir=self.log_dir)
+
     def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
         """Show the configuration as text, and the settings in the table of hyperparameters."""
         self.experiment.add_text("configuration", f"```yaml\n{text}\n```", self._resume_env_steps or 0)

@@ -1,7 +1,4 @@
-"""Metrics of a run: a CSV file over ``env_steps``, loggers beside it, and the episodes in a collector's rollouts.
-
-Shapes: N environments, T steps a rollout, E finished episodes.
-"""
+"""Metrics of a run: a CSV file over ``env_steps``, and loggers beside it."""
 
 from __future__ import annotations
 
@@ -13,29 +10,35 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
+from dreamer_racing.settings import quoted
 from dreamer_racing.training.directory import RunDirectory
 
 logger = logging.getLogger(__name__)
 X_AXIS = "env_steps"
+MOST_DIGITS = 19
+"""Of env_steps: more are damage, and Python reads no more than some thousands."""
 
 
 class MetricsLog:
     """Averages the metrics pushed since the last write and writes them to ``metrics.csv`` and to loggers.
 
     The file has one row a write and a column ``env_steps`` first; a metric that appears later gets a new column at the
-    end, empty in earlier rows. Whatever the moment the process is killed, at most the row being written is lost.
+    end, empty in earlier rows. Whatever the moment the process is killed, at most the row being written is lost. Rows
+    that a full disk refuses wait for the next write.
 
     Args:
         run_dir: folder of the run.
         loggers: TorchRL loggers that receive every row too (`dreamer_racing.training.loggers` makes some).
-        resume_env_steps: of the checkpoint this run continues: rows beyond it are removed. If None, the run is new,
-            and a ``metrics.csv`` already there is kept under another name.
+        resume_env_steps: of the latest row of the checkpoint this run continues: rows beyond it are removed. If None,
+            the run is new, and a ``metrics.csv`` already there is kept under another name.
+        pending: what is in no row yet, to be saved with the run; None for a new one.
 
     Example:
         >>> with MetricsLog("runs/example") as metrics:  # doctest: +SKIP
@@ -48,16 +51,17 @@ class MetricsLog:
         run_dir: str | Path,
         loggers: Sequence[Logger] = (),
         resume_env_steps: int | None = None,
+        pending: PendingMetrics | None = None,
     ) -> None:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.path = RunDirectory(run_dir).metrics
         self.loggers = list(loggers)
-        self._mean = RunningMean()
+        self._pending = pending or PendingMetrics()
         self._columns = [X_AXIS]
         if resume_env_steps is None:
             _keep_aside(self.path)
-            self._rewrite([])
+            self._rewrite([], [])
         else:
             self._truncate(resume_env_steps)
 
@@ -67,44 +71,64 @@ class MetricsLog:
         Args:
             metrics: values by name; of a tensor of several elements the mean counts.
         """
-        self._mean.push(metrics)
+        self._pending.averages.push(metrics)
 
     def write(self, env_steps: int) -> dict[str, float]:
-        """Writes the averages as one row and starts new ones. Waits for the device once.
+        """Makes a row of the averages and writes it: `close_row` and `flush`."""
+        values = self.close_row(env_steps)
+        self.flush()
+        return values
+
+    def close_row(self, env_steps: int) -> dict[str, float]:
+        """Makes a row of the averages, to be written by `flush`, and starts new ones. Waits for the device once.
 
         Args:
             env_steps: control steps summed over environments.
 
         Returns:
-            The averages by name; empty, and no row written, if nothing was pushed.
+            The averages by name; empty, and no row made, if nothing was pushed.
         """
-        values = self._mean.pop()
-        if not values:
-            return values
-        new = [name for name in values if name not in self._columns]
-        if new:
-            rows = _read_rows(self.path)
-            self._columns += new
-            self._rewrite(rows)
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            row = {name: f"{value:.8g}" for name, value in values.items()}
-            csv.DictWriter(file, self._columns).writerow({X_AXIS: env_steps, **row})
-        for sink in self.loggers:
-            sink.log_metrics(values, step=env_steps)
-            if flush := getattr(sink.experiment, "flush", None):
-                flush()
+        values = self._pending.averages.pop()
+        if values:
+            self._pending.rows.append((env_steps, values))
         return values
 
-    def holds(self, name: str, env_steps: int) -> bool:
-        """Whether a row at these env_steps has a value of this metric."""
-        return any(int(row[X_AXIS]) == env_steps and row.get(name) for row in _read_rows(self.path))
+    def flush(self) -> None:
+        """Writes the rows that wait.
+
+        Raises:
+            OSError: the file cannot be written; then it is as it was, and the rows go on waiting. Or a logger cannot
+                write, which they do not wait for.
+        """
+        rows = self._pending.rows
+        if not rows:
+            return
+        new = [name for name in dict.fromkeys(name for _, row in rows for name in row) if name not in self._columns]
+        if new:
+            self._rewrite(_read_rows(self.path), new)
+        self._append(rows)
+        written, self._pending.rows = rows, []
+        self._pending.written = written[-1][0]
+        for sink in self.loggers:
+            try:
+                for env_steps, values in written:
+                    sink.log_metrics(values, step=env_steps)
+                if flush := getattr(sink.experiment, "flush", None):
+                    flush()
+            except OSError:
+                if renew := getattr(sink, "renew", None):
+                    renew()
+                raise
 
     def close(self) -> None:
         """Closes the loggers that can be closed."""
         for sink in self.loggers:
             for name in ("close", "finish"):  # TensorBoard's word for it, and W&B's
                 if end := getattr(sink.experiment, name, None):
-                    end()
+                    try:
+                        end()
+                    except OSError as error:
+                        logger.warning("What %s has last been told may be lost: %s.", type(sink).__name__, error)
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -119,24 +143,78 @@ class MetricsLog:
         kept = [row for row in rows if int(row[X_AXIS]) <= env_steps]
         if len(kept) < len(rows):
             logger.info("Removing %d rows beyond env_steps=%d from %s.", len(rows) - len(kept), env_steps, self.path)
-        self._columns = list(rows[0]) if rows else [X_AXIS]
-        self._rewrite(kept)
+        named = {name for row in kept for name, cell in row.items() if cell}  # a column appears with its first value
+        columns = [name for name in (rows[0] if rows else ()) if name in named and name != X_AXIS]
+        self._rewrite([{name: row[name] for name in (X_AXIS, *columns)} for row in kept], columns)
 
-    def _rewrite(self, rows: Iterable[Mapping[str, str]]) -> None:
+    def _append(self, rows: Iterable[tuple[int, Mapping[str, float]]]) -> None:
+        """Adds rows of known columns; the file is as it was if it cannot be done."""
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, self._columns)
+                for env_steps, values in rows:
+                    writer.writerow({X_AXIS: env_steps, **{name: f"{value:.8g}" for name, value in values.items()}})
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            os.truncate(self.path, size)
+            raise
+
+    def _rewrite(self, rows: Iterable[Mapping[str, str]], new_columns: Sequence[str]) -> None:
+        """Replaces the file by one with these rows and further columns."""
+        columns = [*self._columns, *new_columns]
         partial = self.path.with_name(f".{self.path.name}.partial")
         with partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self._columns, restval="")
+            writer = csv.DictWriter(file, columns, restval="")
             writer.writeheader()
             writer.writerows(rows)
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, self.path)
+        self._columns = columns
+
+
+class PendingMetrics:
+    """What of a run's metrics is in no file yet, and how far the file goes.
+
+    Attributes:
+        averages: of what was pushed since the latest row.
+        rows: env_steps and values of rows that could not be written yet.
+        written: env_steps of the latest row in the file; 0 before the first.
+    """
+
+    def __init__(self) -> None:
+        self.averages = RunningMean()
+        self.rows: list[tuple[int, dict[str, float]]] = []
+        self.written = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
+        return {"averages": self.averages.state_dict(), "rows": list(self.rows), "written": self.written}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.averages.load_state_dict(state_dict["averages"])
+        self.rows, self.written = list(state_dict["rows"]), state_dict["written"]
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the complete rows."""
-    header, rows, _ = read_rows(path)
-    return [dict(zip(header, row, strict=True)) for row in rows]
+    """Read the complete rows; those without a number of env_steps are left out, and this is logged."""
+    header, cells, _ = read_rows(path)
+    rows = [dict(zip(header, row, strict=True)) for row in cells]
+    damaged = [row[X_AXIS] for row in rows if not _is_count(row[X_AXIS])]
+    if damaged:
+        logger.warning(
+            "%s is damaged: %s is no number of env_steps. %d of %d rows are left out for that.",
+            path, quoted(damaged[0]), len(damaged), len(rows),
+        )  # fmt: skip
+    return [row for row in rows if _is_count(row[X_AXIS])]
+
+
+def _is_count(cell: str) -> bool:
+    """Whether a cell is a whole number as this file's are written."""
+    return cell.isascii() and cell.isdigit() and len(cell) < MOST_DIGITS
 
 
 def _keep_aside(path: Path) -> None:
@@ -173,6 +251,20 @@ class RunningMean:
             stacked = torch.stack(list(values.values()))
             sums, pushes = self._tensors.get(key, (torch.zeros_like(stacked), 0))
             self._tensors[key] = (sums + stacked, pushes + 1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
+        return {
+            "tensors": [(list(names), total.clone(), count) for (_, names), (total, count) in self._tensors.items()],
+            "floats": dict(self._floats),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned, on the device that it was loaded to."""
+        self._tensors = {
+            (total.device, tuple(names)): (total.clone(), count) for names, total, count in state_dict["tensors"]
+        }
+        self._floats = dict(state_dict["floats"])
 
     def pop(self) -> dict[str, float]:
         """Returns the means by name, in order of first appearance, and starts anew. Copies once from each device."""

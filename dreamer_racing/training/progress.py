@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Mapping
@@ -45,11 +46,12 @@ class Progress:
         if self._bar is not None:
             self._bar.update(env_steps - self._bar.n)
 
-    def show(self, metrics: Mapping[str, float], unsaved: str = "") -> None:
-        """Show the latest numbers, and since when nothing could be saved."""
+    def show(self, metrics: Mapping[str, float], unsaved: Mapping[str, int] | None = None) -> None:
+        """Show the latest numbers, and what cannot be written since which env_steps."""
         self._kept |= {word: f"{metrics[name]:.0%}" for word, name in KEPT.items() if name in metrics}
         numbers = {word: f"{metrics[name]:.2f}" for word, name in SHOWN.items() if name in metrics}
-        numbers = ({"NOT SAVED": unsaved} if unsaved else {}) | numbers | self._kept
+        failing = "; ".join(f"{what} since {env_steps:,}" for what, env_steps in (unsaved or {}).items())
+        numbers = ({"NOT SAVED": failing} if failing else {}) | numbers | self._kept
         if self._bar is not None:
             self._bar.set_postfix(numbers)
         elif time.monotonic() - self._since >= self._seconds:
@@ -88,6 +90,10 @@ class Progress:
 
 
 def _write(text: str, stream: TextIO) -> None:
-    """Write a line with the time of day, at once: what follows a log sees it as it comes."""
-    stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
-    stream.flush()
+    """Write a line with the time of day, at once: what follows a log sees it as it comes.
+
+    A log that takes no more, on a full disk or where nobody reads it, is no reason to end a run.
+    """
+    with contextlib.suppress(OSError):
+        stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
+        stream.flush()

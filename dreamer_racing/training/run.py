@@ -7,9 +7,10 @@ Several processes may train together (`training.parallel`): they go through the 
 replay of its own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
 """
 
+import logging
 import signal
-import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -28,6 +29,7 @@ from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
+from dreamer_racing.training.journal import Interval, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
@@ -35,12 +37,16 @@ from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.signals import GracefulExit
 
+logger = logging.getLogger(__name__)
+
 
 class Report(Protocol):
     """Evaluates a learner's policy."""
 
     on_episode: Callable[[int, int], None] | None
     """Is told how many episodes have ended, and of how many."""
+    attempt: Callable[[str], AbstractContextManager]
+    """Stands around writes without which an evaluation counts all the same, by what they are of."""
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate, write what there is to look at, return metrics."""
@@ -65,19 +71,21 @@ class Run:
     learner: Any  # the recipe's Learner
     report: Report
     metrics: MetricsLog | UnwrittenMetrics
+    schedule: Schedule  # log, evaluate, save
     checkpoints: RunCheckpoints
     best: BestCheckpoint
     counters: dict[str, int]  # env_steps, updates, episodes
     clock: RunClock
     lock: RunLock | LockHeldByFirst
-    evaluated: int = field(default=-1, init=False)  # updates at the last evaluation
-    unsaved: str = field(default="", init=False)  # since when checkpoints could not be written, for the progress
+    unsaved: dict[str, int] = field(default_factory=dict, init=False)  # since which env_steps what cannot be written
+    say: Callable[[str], None] = field(default=logger.info, init=False)  # says a line of its own
 
     remedy: ClassVar[str] = "learning rate"  # what to lower once a loss is not finite, e.g. "ppo.learning_rate"
 
-    def __post_init__(self) -> None:
-        if self.metrics.holds("evaluation/return_mean", self.counters["env_steps"]):
-            self.evaluated = self.counters["updates"]  # a run killed behind its evaluation
+    @property
+    def at_end(self) -> bool:
+        """Whether all env_steps are made."""
+        return self.counters["env_steps"] >= self.config.total_env_steps
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Make the updates that are due after a rollout; after none, those that an interrupted run still owes."""
@@ -106,17 +114,47 @@ class Run:
         """Save everything, unless the networks have just been spoilt."""
         with self.clock.timed("save"):
             self.learner.check_finite()
+            self.settle()
             return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
 
-    def try_to_save(self) -> str:
-        """Save on the way, where a full disk is no reason to stop: return a line on what went wrong, or nothing."""
+    @contextmanager
+    def attempt(self, what: str) -> Iterator[None]:
+        """Stand around a write that may fail, as on a full disk, without ending the run: it is said, at once and on.
+
+        Args:
+            what: is written.
+        """
         try:
-            self.save()
-        except RunCheckpointError as error:
-            self.unsaved = self.unsaved or f"since {self.counters['env_steps']:,}"
-            return f"NOT SAVED: {error} The run goes on, and tries again at the next checkpoint."
-        self.unsaved = ""
-        return ""
+            yield
+        except (OSError, RunCheckpointError) as error:
+            self.unsaved.setdefault(what, self.counters["env_steps"])
+            said = str(error).rstrip(".")
+            self.say(f"NOT SAVED: {what}: {said}. The run goes on, and tries again when the next is due.")
+        else:
+            self.unsaved.pop(what, None)
+
+    def settle(self) -> None:
+        """Take in what is collected already; nothing, unless collection is ahead of learning."""
+
+    def keep_up(self, progress: Progress) -> None:
+        """Evaluate and log if it is due by now; of several processes the first does, and all take note."""
+        env_steps = self.counters["env_steps"]
+        due = self.schedule.due("log", env_steps, self.at_end)
+        evaluates = self.schedule.due("evaluate", env_steps, self.at_end)
+        if not parallel.is_first():
+            return
+        if evaluates:
+            self.say(self.evaluate())
+        if due or evaluates:  # so that an evaluation's numbers stand where they were measured
+            self.measure()
+            progress.show(self.write_row(), self.unsaved)
+
+    def write_row(self) -> dict[str, float]:
+        """Write what was measured since the latest row; return its averages."""
+        values = self.metrics.close_row(self.counters["env_steps"])
+        with self.attempt("metrics"):
+            self.metrics.flush()
+        return values
 
     def evaluate(self) -> str:
         """Evaluate, without a trace in the random numbers of training; return a line on what came of it."""
@@ -126,15 +164,14 @@ class Run:
             torch.manual_seed(self.config.seed)
             metrics = self.report.make(self.counters["env_steps"], self.config.evaluation.stochastic)
             if self.config.logger.media:
-                log_evaluation(self.metrics.loggers, self.directory, self.counters["env_steps"])
+                with self.attempt("pictures for loggers"):
+                    log_evaluation(self.metrics.loggers, self.directory, self.counters["env_steps"])
         self.metrics.push(metrics)
-        self.evaluated = self.counters["updates"]
         # Gates first, return where the gates are the same: a return lies far below a million.
         score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
-        try:
+        best = ""
+        with self.attempt("the best checkpoint"):
             best = " (the best so far)" if self.best.offer(score, self.counters["env_steps"]) else ""
-        except RunCheckpointError as error:
-            best = f" (the best so far, but NOT SAVED: {error})"
         names = {"gates": "gates_per_episode", "success": "success_rate", "return": "return_mean"}
         shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
         numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
@@ -196,48 +233,41 @@ def train(run: Run) -> None:
         SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
         KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
         RunCheckpointError: at its end the run could not be saved.
+        OSError: at its end metrics could not be written.
     """
     config, counters, leads = run.config, run.counters, parallel.is_first()
-    schedule = Schedule(
-        counters["env_steps"], log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every
-    )
     minutes = Interval(config.checkpoint.minutes)
     with (
         graceful_exit() as stop,
         Progress(config.total_env_steps, counters["env_steps"], shown=leads) as progress,
     ):
-        run.report.on_episode = progress.evaluating
-        if run.directory.finished_env_steps() >= config.total_env_steps:
-            progress.say(
-                f"complete already, at {counters['env_steps']:,} env_steps: give a larger total_env_steps to go on"
-            )
+        run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
+        if leads and run.directory.finished_env_steps() > counters["env_steps"]:
+            run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
         run.learn(None, stop)  # what an interrupted run still owes
-        while counters["env_steps"] < config.total_env_steps and not stop.requested:
+        while not stop.requested:
+            run.keep_up(progress)
+            by_steps = run.schedule.due("save", counters["env_steps"])
+            by_minutes = parallel.agreed(minutes.due())  # both take note
+            if by_steps or by_minutes:
+                with run.attempt("checkpoint"):
+                    run.save()
+            if run.at_end or stop.requested:
+                break
             with run.clock.timed("collect"):
                 rollout = next(run.rollouts)
                 run.take_in(rollout)
             progress.advance(counters["env_steps"])
             run.learn(rollout, stop)
-            if stop.signal_name:
-                break
-            due = schedule.due("log", counters["env_steps"])
-            if schedule.due("evaluate", counters["env_steps"]) and leads:
-                progress.say(run.evaluate())
-                due = True  # so that its numbers stand where they were measured
-            if due and leads:
-                run.measure()
-                progress.show(run.metrics.write(counters["env_steps"]), run.unsaved)
-            by_steps, by_minutes = schedule.due("save", counters["env_steps"]), parallel.agreed(minutes.due())
-            if (by_steps or by_minutes) and (problem := run.try_to_save()):
-                progress.say(problem)
+        if not stop.requested:
+            run.settle()
+            run.write_row()  # of what settled
         saved = run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
             progress.say(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
-        if not stop.requested and leads and config.evaluation.every and run.evaluated != counters["updates"]:
-            progress.say(run.evaluate())
-        run.metrics.write(counters["env_steps"])
-        if not stop.requested and leads:
+        elif leads:
+            run.metrics.flush()
             run.directory.mark_finished(counters["env_steps"])
         progress.say(f"checkpoint: {saved}")
     if stop.signal_name:
@@ -248,34 +278,3 @@ def graceful_exit() -> GracefulExit:
     """Make the flag that a signal raises, in all processes together; one of them answers."""
     answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
     return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)
-
-
-class Schedule:
-    """Says when something that happens every so many env_steps is due."""
-
-    def __init__(self, env_steps: int, **every: int) -> None:
-        self._every = every
-        self._done = {name: env_steps // period if period else 0 for name, period in every.items()}
-
-    def due(self, name: str, env_steps: int) -> bool:
-        """Whether another period has passed; asking takes note of it."""
-        period = self._every[name]
-        if not period or env_steps // period <= self._done[name]:
-            return False
-        self._done[name] = env_steps // period
-        return True
-
-
-class Interval:
-    """Says when something that happens every so many minutes of wall clock is due; never if they are 0."""
-
-    def __init__(self, minutes: float) -> None:
-        self._seconds = 60.0 * minutes
-        self._last = time.monotonic()
-
-    def due(self) -> bool:
-        """Whether the interval has passed; if so it begins anew."""
-        if not self._seconds or time.monotonic() - self._last < self._seconds:
-            return False
-        self._last = time.monotonic()
-        return True

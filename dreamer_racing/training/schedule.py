@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 
-class Clock(Enum):
+class RampClock(Enum):
     """What a ramp goes by, a number from 0 to 1."""
 
     run = "run"  # share of the run's env_steps
@@ -25,14 +25,14 @@ class Ramp:
         by: The clock: the share of the run's env_steps that are made, or that of flights that pass the hardest gate.
 
     Example:
-        >>> Ramp(to=0.99, begin=0.5, end=1.0).at(0.98, {Clock.run: 0.75})
+        >>> Ramp(to=0.99, begin=0.5, end=1.0).at(0.98, {RampClock.run: 0.75})
         0.985
     """
 
     to: float | None = None
     begin: float = 0.0
     end: float = 1.0
-    by: Clock = Clock.run
+    by: RampClock = RampClock.run
 
     def check(self, name: str) -> None:
         """Refuse a ramp that ends before it begins, or lies outside the run.
@@ -48,7 +48,7 @@ class Ramp:
                 f"{name}: begin={self.begin} and end={self.end} are shares, so it takes 0 <= begin <= end <= 1."
             )
 
-    def at(self, value: float, times: Mapping[Clock, float]) -> float:
+    def at(self, value: float, times: Mapping[RampClock, float]) -> float:
         """Return the setting at a time.
 
         Args:

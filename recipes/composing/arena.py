@@ -10,7 +10,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
-from dreamer_racing.learners.learner import Flyer
+from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.training.run import Report
 
@@ -37,6 +37,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "renderer": env.renderer,
         "camera": camera_of(config),
         "control_rate": env.control_rate,
+        "from_pixels": env.from_pixels,
     }
 
 
@@ -49,7 +50,6 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
         return DroneRacingEnv(
             num_envs=num_envs,
             episode_steps=env.episode_steps,
-            from_pixels=env.from_pixels,
             privileged=bool(readers),
             start_beyond_gate=env.start_beyond_gate,
             start_on_line=env.start_on_line,
@@ -85,7 +85,7 @@ def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
 def make_report(
     config: RunConfig,
     directory: Path,
-    learner: Flyer,
+    learner: Evaluable,
     episodes: int,
     video_steps: int,
     start_noise: float = 0.0,
@@ -93,13 +93,14 @@ def make_report(
 ) -> Report:
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
-        worlds = {**worlds_of(config), "from_pixels": config.env.from_pixels, "start_noise": start_noise}
+        worlds = {**worlds_of(config), "start_noise": start_noise}
         if start_noise:  # a world's second start would depend on how its first went
             options["num_envs"] = episodes
             print(f"evaluation: {episodes} worlds, one for each episode, so that every agent meets the same starts")
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
-    env = make_suite(config, min(8, episodes), config.seed + 1)
-    return ReturnReport(directory, learner, env, episodes, video_steps)
+    seed = config.seed + 1
+    env = make_suite(config, min(8, episodes), seed)
+    return ReturnReport(directory, learner, env, episodes, video_steps, seed)
 
 
 def crash_causes(config: RunConfig) -> type[CrashCause] | None:

@@ -1,5 +1,6 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
+import math
 import random
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,12 +38,13 @@ from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
+from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import RunLogger, make_loggers
-from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
@@ -58,6 +60,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     config.device = str(device)
     if OmegaConf.is_missing(config.env, "num_envs"):
         config.env.num_envs = num_envs
+    if not math.isfinite(config.env.control_rate):
+        raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
     if config.env.episode_steps is None:
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
@@ -227,9 +231,9 @@ def claim(config: RunConfig) -> RunLock | LockHeldByFirst:
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
     """Keep what a run is started with, beside it and beside its best checkpoint."""
     for place in (directory, directory.best):
-        OmegaConf.save(OmegaConf.structured(config), place.config)
+        replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
     kept = [override for override in overrides if not override.startswith("resume=")]
-    OmegaConf.save(OmegaConf.create(kept), directory.overrides)
+    replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
 
 
@@ -242,7 +246,7 @@ def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Rep
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
-    """Make the loggers of a run, resumed at so many env_steps if it is, and give them its configuration."""
+    """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
     asked = config.logger
     loggers = make_loggers(directory.path, asked.tensorboard, asked.wandb.value, asked.project, resumed)
     plain = OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
@@ -251,12 +255,12 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
     return loggers
 
 
-def make_metrics(config: RunConfig, directory: RunDirectory, env_steps: int) -> MetricsLog | UnwrittenMetrics:
-    """Make the metrics of a run, resumed at so many env_steps if it is, if this is the process that writes them."""
+def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMetrics) -> MetricsLog | UnwrittenMetrics:
+    """Make the metrics of a run, which go on from what is pending, if this is the process that writes them."""
     if not parallel.is_first():
         return UnwrittenMetrics()
-    resumed = env_steps if config.resume else None
-    return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed)
+    resumed = pending.written if config.resume else None
+    return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
 def assemble(
@@ -293,18 +297,25 @@ def assemble(
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
+    periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
+    parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters)
     if config.resume:
-        clock.total = checkpoints.load(config.resume, may_lack=("lag", "passes")).get("wall_clock", 0.0)
+        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
+        clock.total = saved.get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         if curriculum:
             env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
+        if not journal.restored:
+            journal.begin_at(counters["env_steps"])
+            print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
     parallel.together(lambda: None)  # all have read what is written anew now
     if parallel.is_first():
         write_configuration(directory, config, overrides, counters["env_steps"])
+    metrics = make_metrics(config, directory, journal.pending)
     print(f"run directory: {directory.path}")
     return kind(
         config=config,
@@ -316,7 +327,8 @@ def assemble(
         curriculum=curriculum,
         learner=learner,
         report=make_run_report(config, directory.path, learner),
-        metrics=make_metrics(config, directory, counters["env_steps"]),
+        metrics=metrics,
+        schedule=journal.schedule,
         checkpoints=checkpoints,
         best=best,
         counters=counters,

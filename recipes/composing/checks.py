@@ -16,8 +16,10 @@ from composing.schema import (
     Collection,
     DreamerConfig,
     ExperimentConfig,
+    PPORunConfig,
     ReplayRunConfig,
     RunConfig,
+    SACRunConfig,
     is_race,
 )
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
@@ -32,16 +34,16 @@ from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.loggers import check_loggers
-from dreamer_racing.training.schedule import Clock
+from dreamer_racing.training.schedule import RampClock
 
-RACE_ONLY = {
-    "env.control_rate": 50.0,
-    "env.start_beyond_gate": 0.0,
-    "env.start_on_line": 0.0,
-    "env.miss_radius": 0.0,
-    "evaluation.start_noise": 0.0,
-}
-"""Settings that other suites have no use for, with the defaults at which they must be left."""
+RACE_ONLY = (
+    "env.control_rate",
+    "env.start_beyond_gate",
+    "env.start_on_line",
+    "env.miss_radius",
+    "evaluation.start_noise",
+)
+"""Settings that other suites have no use for, and that must be left at their defaults."""
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -103,8 +105,9 @@ def check(config: RunConfig) -> None:
     if is_race(config):
         check_race(config)
         return
-    for name, default in RACE_ONLY.items():
-        if (value := OmegaConf.select(values, name)) != default:
+    defaults = OmegaConf.structured(RunConfig)
+    for name in RACE_ONLY:
+        if (value := OmegaConf.select(values, name)) != (default := OmegaConf.select(defaults, name)):
             raise ValueError(f"{name}={value} is for races, and env.suite={config.env.suite}: leave it at {default}.")
 
 
@@ -145,6 +148,31 @@ def check_replay(config: ReplayRunConfig) -> None:
             f"prefill={config.prefill:,} asks for no whole update of {replay.records} records. "
             "Raise total_env_steps or the ratio, or lower the prefill."
         )
+
+
+def check_ppo(config: PPORunConfig) -> None:
+    """Refuse more minibatches than a rollout has records.
+
+    Raises:
+        ValueError: the message gives the numbers and the settings to change.
+    """
+    check(config)
+    records, minibatches = config.env.num_envs * config.rollout_steps, config.ppo.minibatches
+    if minibatches > records:
+        raise ValueError(
+            f"ppo.minibatches={minibatches} are more than the {records} records of a rollout, env.num_envs="
+            f"{config.env.num_envs} times rollout_steps={config.rollout_steps}: lower the one, or raise the others."
+        )
+
+
+def check_sac(config: SACRunConfig) -> None:
+    """Refuse settings with which there would be no update.
+
+    Raises:
+        ValueError: the message gives the numbers and the setting to change.
+    """
+    check(config)
+    check_replay(config)
 
 
 def check_dreamer(config: DreamerConfig) -> None:
@@ -225,7 +253,7 @@ def check_schedule(config: DreamerConfig) -> None:
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and ramp.by is Clock.passes and not is_race(config):
+        if ramp.to is not None and ramp.by is RampClock.passes and not is_race(config):
             raise ValueError(
                 f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
             )

@@ -34,13 +34,23 @@ def plain_errors() -> Iterator[None]:
         raise SystemExit(2) from error
 
 
+@contextmanager
+def plain_disk_errors() -> Iterator[None]:
+    """Turn what a full disk does to results into a line on stderr and exit status 1."""
+    try:
+        yield
+    except OSError as error:
+        print(f"error: {error}. What was written so far is no whole result.", file=sys.stderr)
+        raise SystemExit(1) from error
+
+
 def say_error(error: object) -> None:
     """Say on stderr why nothing was begun.
 
     Of several processes that `torchrun` started, the first goes ahead: at its end the others are ended too, and so what
     is wrong for all of them is said once.
     """
-    if int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0":
+    if follows():
         time.sleep(HEAD_START)
     print(f"error: {error}", file=sys.stderr, flush=True)
 
@@ -50,6 +60,11 @@ def start_logging() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def follows() -> bool:
+    """Whether `torchrun` started this process beside a first one."""
+    return int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0"
 
 
 def follow_quietly() -> None:

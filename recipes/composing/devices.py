@@ -2,6 +2,8 @@
 
 import torch
 
+from dreamer_racing.settings import suggestion
+
 
 def choose_device(device: str) -> torch.device:
     """Resolve `auto`, and refuse a device that is not there.
@@ -15,6 +17,10 @@ def choose_device(device: str) -> torch.device:
         chosen = torch.device(device)
         torch.empty(1, device=chosen)
     except (RuntimeError, AssertionError) as error:
+        if "device type at start of device string" in str(error):  # torch names twenty more, for other machines
+            word = device.partition(":")[0]
+            meant = " (did you mean cuda?)" if word == "gpu" else suggestion(word, ("auto", "cpu", "cuda"))
+            raise ValueError(f"device={device}: there are auto, cpu, cuda and cuda:1 ...{meant}.") from error
         available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ValueError(
             f"device={device}: {str(error).splitlines()[0].rstrip('.')}. This machine has: {', '.join(available)}; "

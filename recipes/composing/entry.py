@@ -4,6 +4,7 @@ import difflib
 import functools
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,21 +14,26 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import CONFIG_DIR, override_key, plain_errors, say_error
+from composing.command_line import CONFIG_DIR, follows, override_key, plain_errors, say_error
+from composing.interruption import INTERRUPTED
 from dreamer_racing.settings import shortened, suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
-TEXTS = ("run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor")
+TEXTS = (
+    "run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
+    "run", "against",
+)  # fmt: skip
 """Settings that are no numbers, whatever they look like."""
 
 
 def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     """Make a function of a configuration the recipe of a name, whose file in `config` hydra composes it from.
 
-    An override that hydra does not take is said in one paragraph on stderr, with exit status 2.
+    An override that hydra does not take is said in one paragraph on stderr, with exit status 2. Ctrl-C, where the
+    recipe has no use for it, ends it with the shell's status.
     """
 
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
@@ -44,6 +50,10 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
             except HydraException as error:
                 say_error(in_plain_words(error, name, sys.argv[1:]))
                 raise SystemExit(2) from error
+            except KeyboardInterrupt as interrupt:
+                if not follows():
+                    print(INTERRUPTED, file=sys.stderr)
+                raise SystemExit(128 + signal.SIGINT) from interrupt
 
         return start
 

@@ -49,7 +49,7 @@ eyes.close()
 PATIENCE = 15  # s
 
 
-class State(Enum):
+class Verdict(Enum):
     """Whether something is as it should be."""
 
     fine = "ok"
@@ -57,16 +57,16 @@ class State(Enum):
     wrong = "WRONG"
 
 
-class Finding(NamedTuple):
+class Diagnosis(NamedTuple):
     """What was looked at, how it is, and what to do about it."""
 
     what: str
-    state: State
+    state: Verdict
     found: str
     remedy: str = ""
 
 
-def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Finding]:
+def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
     """Look at everything.
 
     Args:
@@ -84,15 +84,15 @@ def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Finding]:
     yield from renderers(probes)
 
 
-def python() -> Finding:
+def python() -> Diagnosis:
     """Look at the interpreter."""
     wanted = importlib.metadata.metadata(DISTRIBUTION)["Requires-Python"]
     fits = platform.python_version() in SpecifierSet(wanted)
     remedy = "" if fits else f"PYTHON=/path/to/python{wanted} ./dev ..."
-    return Finding("python", State.fine if fits else State.wrong, platform.python_version(), remedy)
+    return Diagnosis("python", Verdict.fine if fits else Verdict.wrong, platform.python_version(), remedy)
 
 
-def packages() -> Iterator[Finding]:
+def packages() -> Iterator[Diagnosis]:
     """Look at every package that the project requires, and at which extras are complete."""
     extras: dict[str, list[str]] = {}
     for text in importlib.metadata.requires(DISTRIBUTION) or ():
@@ -106,12 +106,12 @@ def packages() -> Iterator[Finding]:
             extras.setdefault(extra[1], []).extend([] if fits else [str(requirement)])
         elif not fits or requirement.name in ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "dm-control"):
             wanted = f"pip install '{requirement.name}{requirement.specifier}'"
-            state = State.fine if fits else State.wrong
-            yield Finding(requirement.name, state, found or "not installed", "" if fits else wanted)
+            state = Verdict.fine if fits else Verdict.wrong
+            yield Diagnosis(requirement.name, state, found or "not installed", "" if fits else wanted)
     complete = sorted(extra for extra, missing in extras.items() if not missing)
     absent = sorted(extra for extra, missing in extras.items() if missing)
     remedy = f"for {', '.join(absent)}: pip install 'dreamer_racing[NAME]'" if absent else ""
-    yield Finding("extras", State.fine, ", ".join(complete) or "none", remedy)
+    yield Diagnosis("extras", Verdict.fine, ", ".join(complete) or "none", remedy)
 
 
 def version_of(package: str) -> str | None:
@@ -122,18 +122,18 @@ def version_of(package: str) -> str | None:
         return None
 
 
-def accelerator() -> Iterator[Finding]:
+def accelerator() -> Iterator[Diagnosis]:
     """Look for a GPU, its driver, and a torch that can use it."""
     query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
     try:
         answer = subprocess.run(query, capture_output=True, text=True, check=True, timeout=5).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
-        yield Finding("gpu", State.fine, "no NVIDIA driver answers: trains on the CPU")
+        yield Diagnosis("gpu", Verdict.fine, "no NVIDIA driver answers: trains on the CPU")
         return
-    yield Finding("gpu", State.fine, "; ".join(answer))
+    yield Diagnosis("gpu", Verdict.fine, "; ".join(answer))
     if cuda_of_torch() is None:
         remedy = "reinstall torch from https://download.pytorch.org/whl (TORCH_INDEX_URL of ./dev)"
-        yield Finding("cuda", State.wrong, "this torch is a CPU build", remedy)
+        yield Diagnosis("cuda", Verdict.wrong, "this torch is a CPU build", remedy)
 
 
 def cuda_of_torch() -> str | None:
@@ -146,49 +146,49 @@ def cuda_of_torch() -> str | None:
     return found[1] if found else None
 
 
-def cores() -> Iterator[Finding]:
+def cores() -> Iterator[Diagnosis]:
     """Look at the cores, at who else uses them, and at how many threads torch will start."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0]
     busy = load > 0.5 * available
     remedy = "other processes take their time from a training; two trainings want OMP_NUM_THREADS=1 each"
     found = f"{available}, load {load:.1f}"
-    yield Finding("cores", State.note if busy else State.fine, found, remedy if busy else "")
+    yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
     threads = os.environ.get("OMP_NUM_THREADS")
     too_many = threads is not None and threads.isdigit() and int(threads) > available
     found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
     remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""
-    yield Finding("threads", State.wrong if too_many else State.fine, found, remedy)
+    yield Diagnosis("threads", Verdict.wrong if too_many else Verdict.fine, found, remedy)
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     bfloat16 = [name for name in ("amx_bf16", "avx512_bf16") if name in flags]
-    yield Finding("bfloat16", State.fine, ", ".join(bfloat16) or "not computed by this CPU: mixed precision is off")
+    yield Diagnosis("bfloat16", Verdict.fine, ", ".join(bfloat16) or "not computed by this CPU: mixed precision is off")
 
 
-def memory(needed: float) -> Finding:
+def memory(needed: float) -> Diagnosis:
     """Look whether a run fits."""
     information = Path("/proc/meminfo")
     if not information.exists():
-        return Finding("memory", State.note, f"a default run takes {needed / 1e9:.1f} GB")
+        return Diagnosis("memory", Verdict.note, f"a default run takes {needed / 1e9:.1f} GB")
     lines = dict(line.split(":") for line in information.read_text(encoding="utf-8").splitlines())
     free = 1024 * float(lines["MemAvailable"].split()[0])
     found = f"{free / 1e9:.1f} GB free, such a run takes {needed / 1e9:.1f}"
     remedy = "lower replay.capacity=, or replay.storage=memmap"
-    return Finding("memory", *_enough(found, free >= needed, remedy))
+    return Diagnosis("memory", *_enough(found, free >= needed, remedy))
 
 
-def disk(needed: float, run_dir: Path) -> Finding:
+def disk(needed: float, run_dir: Path) -> Diagnosis:
     """Look whether checkpoints fit."""
     place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     found = f"{free / 1e9:.1f} GB free at {run_dir}, checkpoints of such a run take about {needed / 1e9:.1f}"
-    return Finding("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
+    return Diagnosis("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
 
 
-def _enough(found: str, enough: bool, remedy: str) -> tuple[State, str, str]:
-    return (State.fine, found, "") if enough else (State.wrong, found, remedy)
+def _enough(found: str, enough: bool, remedy: str) -> tuple[Verdict, str, str]:
+    return (Verdict.fine, found, "") if enough else (Verdict.wrong, found, remedy)
 
 
-def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Finding]:
+def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
     """Look at what draws images, and how fast."""
     found, reasons = {}, {}
     for backend, probe in probes.items():
@@ -204,12 +204,12 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Finding]:
                 errors.strip().splitlines()[-1].partition(": ")[2] if errors.strip() else "its probe died"
             )
     for backend, images in found.items():
-        yield Finding(backend, State.fine, f"{images:,} images a second, 64 × 64 pixels, one core")
+        yield Diagnosis(backend, Verdict.fine, f"{images:,} images a second, 64 × 64 pixels, one core")
     for backend, reason in reasons.items():
-        yield Finding(backend, State.fine if found else State.note, f"not here: {reason}")
+        yield Diagnosis(backend, Verdict.fine if found else Verdict.note, f"not here: {reason}")
     if not found:
         remedy = "apt-get install libegl1 libopengl0 libgl1-mesa-dri: seven times as fast"
-        yield Finding("ray caster", State.note, "draws, for want of OpenGL", remedy)
+        yield Diagnosis("ray caster", Verdict.note, "draws, for want of OpenGL", remedy)
 
 
 def _start_probe(backend: str) -> subprocess.Popen[str]:

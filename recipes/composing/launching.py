@@ -4,8 +4,10 @@ import os
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import hydra
 import torch
@@ -24,8 +26,8 @@ from dreamer_racing.machine import (
     out_of_memory_advice,
 )
 from dreamer_racing.training import parallel
-from dreamer_racing.training.checkpoint import RunCheckpointError
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
+from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train
 
 TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
@@ -43,6 +45,7 @@ def launch(
         tune: says which file of the group ``tuned`` is meant by ``tuned=auto``; None where there is no such group.
     """
     start_logging()
+    threading.excepthook = tell_of_thread
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     with plain_errors():
@@ -56,6 +59,10 @@ def launch(
             overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
             config = hydra.compose(config.algorithm, overrides)
         check_overrides(config, overrides)
+        if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
+            print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
+            parallel.leave()
+            return
         config = resolve(config)
         if config.resume and (changed := changed_settings(config)):
             print(f"resumed with other settings: {', '.join(changed)}")
@@ -72,12 +79,13 @@ def launch(
         raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except NonFiniteLossError as error:
         kept = run.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
-        torch.save(error.batch.to("cpu").to_dict(), kept)
         raise SystemExit(
-            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. The batch is "
-            f"kept in {kept}; {run.last_good}. Continue from there with a lower "
+            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. "
+            f"{keep_batch(error, kept)}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
+    except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
+        raise SystemExit(f"error: {error}. The run is not finished: {run.last_good}.") from error
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
@@ -87,17 +95,36 @@ def launch(
         parallel.leave()
 
 
+def tell_of_thread(failure: threading.ExceptHookArgs) -> None:
+    """Say in a line that a thread could not write, which who waits for it is told too; all else has its traceback."""
+    if isinstance(failure.exc_value, OSError):
+        print(f"error in {failure.thread.name if failure.thread else 'a thread'}: {failure.exc_value}", file=sys.stderr)
+    else:
+        threading.__excepthook__(failure)
+
+
+def keep_batch(error: NonFiniteLossError, path: Path) -> str:
+    """Keep the batch whose loss was not finite; say where, or why it could not be."""
+    try:
+        torch.save(error.batch.to("cpu").to_dict(), path)
+    except (OSError, RuntimeError) as refused:  # torch's word for a full disk
+        return f"The batch could not be kept ({' '.join(str(refused).split())})"
+    return f"The batch is kept in {path}"
+
+
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
     """The configuration of the run to continue, as it was trained, with the overrides given now on top.
 
     Raises:
         ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
     """
-    run_dir = RunDirectory.of(latest_checkpoint(resume)).path
-    of_run = RunDirectory(run_dir.parent)
-    if run_dir == of_run.best.path and of_run.config.exists():
-        raise ValueError(f"resume={resume} are the networks of a run's best evaluation alone: resume={run_dir.parent}.")
-    for file in (RunDirectory(run_dir).config, RunDirectory(run_dir).overrides):
+    directory = RunDirectory.of(latest_checkpoint(resume))
+    run_dir = directory.path
+    if directory.run != directory:
+        raise ValueError(
+            f"resume={resume} are the networks of a run's best evaluation alone: resume={directory.run.path}."
+        )
+    for file in (directory.config, directory.overrides):
         if not file.exists():
             raise ValueError(f"{run_dir} cannot be continued: it lacks {file.name}, which every run has.")
     known = saved_config(algorithm, run_dir)
@@ -115,6 +142,23 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
     return config, merged
+
+
+def is_finished(config: DictConfig) -> bool:
+    """Whether nothing is left of a run that is resumed, which is said.
+
+    If its newest checkpoint is damaged, the run goes on from the one before.
+    """
+    directory = RunDirectory(Path(config.run_dir))
+    if directory.finished_env_steps() < config.total_env_steps:
+        return False
+    checkpoint = newest_sound(config.resume)
+    config.resume = str(checkpoint)  # so that it is not looked for, and damage not told, again
+    env_steps = env_steps_of(checkpoint)
+    if env_steps < config.total_env_steps:
+        return False
+    print(f"complete already, at {env_steps:,} env_steps: give a larger total_env_steps to go on")
+    return True
 
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:

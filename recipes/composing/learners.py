@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
+from composing.checks import steps_alone
 from composing.command_line import agent_path
+from composing.saved import read_yaml
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
@@ -20,20 +22,25 @@ from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.pass_share import PassShare
-from dreamer_racing.training.schedule import Clock
+from dreamer_racing.training.schedule import RampClock
+
+IN_CHECKPOINTS = ("min_std", "max_std")
+"""Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
 
 
-def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[Clock, float]:
+def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[RampClock, float]:
     """What the clocks of schedules say after so many env_steps of a run."""
-    return {Clock.run: env_steps / config.total_env_steps, Clock.passes: passes.best}
+    return {RampClock.run: env_steps / config.total_env_steps, RampClock.passes: passes.best}
 
 
-def scheduled(config: DreamerConfig, times: dict[Clock, float]) -> dict[str, float]:
+def scheduled_numbers(config: DreamerConfig, times: dict[RampClock, float]) -> dict[str, float]:
     """Arguments of `DreamerLearner.adjust` at what the clocks say."""
     schedule, loss = config.schedule, config.loss
-    of_losses = {name: getattr(schedule, name).at(getattr(loss, name), times) for name in LOSS_RAMPS}
+    ramps = {name: getattr(schedule, name) for name in LOSS_RAMPS}
+    moved = [name for name, ramp in ramps.items() if ramp.to is not None or name in IN_CHECKPOINTS]
+    of_losses = {name: ramps[name].at(getattr(loss, name), times) for name in moved}
     rates = {"rates": schedule.learning_rates, "world_model_rate": schedule.world_model_rate}
-    if (kl_target := loss.ppo.kl_target) is not None:
+    if (kl_target := loss.ppo.kl_target) is not None and steps_alone(loss.actor):
         of_losses["kl_target"] = schedule.kl_target.at(kl_target, times)
     return {**{name: ramp.at(1.0, times) for name, ramp in rates.items()}, **of_losses}
 
@@ -54,12 +61,13 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
 
     Raises:
         FileNotFoundError: there is no such run, checkpoint or agent.
-        ValueError: its networks are of another size, or were trained with another camera, control rate or loss.
+        ValueError: its networks are of another size, or were trained with another camera, control rate or loss; or its
+            configuration is damaged.
     """
     source = str(config.init_from)
     folder = agent_path(source)
     if not is_agent(folder):
-        saved = OmegaConf.load(RunDirectory.of(latest_checkpoint(folder)).config)
+        saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
         for name in ("env.control_rate", "env.camera_tilt"):
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:

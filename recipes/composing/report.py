@@ -7,7 +7,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 FAILURES = "failures"  # folder of an experiment: a file for every run that failed
-QUANTITIES = ("return", "success_rate", "gates", "lap_time")
+DRAWN = ("return", "success_rate", "gates", "lap_time")
 
 
 class DrawFigures(Callback):
@@ -16,14 +16,13 @@ class DrawFigures(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Draw everything for which there is something to draw; end with status 1 if a run has failed."""
         # Here, because hydra makes this object at the start of every job, and drawing is for the end.
-        from plot import draw
-
+        from composing.drawing import draw
         from composing.schema import PlotConfig
 
         place = Path(config.hydra.sweep.dir)
         print(f"figures: {place}/figures")
         try:
-            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(QUANTITIES)))
+            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(DRAWN)))
         except ValueError as error:
             print(f"figures: none, {error}")
         notes = sorted((place / FAILURES).glob("*.txt"))

@@ -10,7 +10,7 @@ import torch
 from composing.arena import Environment, make_env
 from composing.command_line import AGENTS
 from composing.devices import choose_device
-from composing.learners import clock_times, make_learner, scheduled
+from composing.learners import clock_times, make_learner, scheduled_numbers
 from composing.saved import trained_config
 from composing.schema import (
     DreamerConfig,
@@ -32,7 +32,7 @@ from dreamer_racing.export.shipped_agent import (
     kept_weights,
 )
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.learner import Flyer, Learner
+from dreamer_racing.learners.learner import Evaluable, Learner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
@@ -47,7 +47,7 @@ class Restored:
     checkpoint: Path  # or the folder of an agent
     trained: RunConfig  # configuration of its run, with the race asked for in place of the one trained on
     trained_on: str  # track
-    flyer: Flyer
+    flyer: Evaluable
     weights: str  # which of them fly: averaged | trained
     env_steps: int
     machine: dict[str, Any]  # versions and commit too, as they were at the start
@@ -107,7 +107,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer
-    flyer: Flyer
+    flyer: Evaluable
     if is_agent(checkpoint):
         flyer = shipped = restore_shipped(trained, checkpoint, device)
         weights = choose_weights(config.weights, shipped.about["weights"], checkpoint)
@@ -156,18 +156,21 @@ def results_of(checkpoint: Path) -> Path:
 
 
 def fresh_directory(path: str | Path, result: str) -> Path:
-    """Return a folder to write to: the one asked for, or if it holds a result already, the first free `<name>_2`, ...
+    """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
+
+    So nothing is mixed with what an earlier evaluation left, or one that was killed.
 
     Args:
         path: the folder asked for.
         result: name of the file that is written last.
     """
     directory, number = Path(path), 1
-    while (directory / result).exists():
+    while directory.is_dir() and any(directory.iterdir()):
         number += 1
         directory = Path(f"{path}_{number}")
     if number > 1:
-        print(f"{path} holds an earlier {result}, which is kept: writing to {directory}")
+        held = f"an earlier {result}" if (Path(path) / result).exists() else f"files, but no {result}"
+        print(f"{path} holds {held}, which is kept: writing to {directory}")
     return ensure_writable(directory)
 
 
@@ -201,7 +204,7 @@ def restore_learner(
     load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
     if isinstance(learner, DreamerLearner):
         config = cast(DreamerConfig, config)
-        learner.adjust(**scheduled(config, clock_times(config, counters["env_steps"], passes)))
+        learner.adjust(**scheduled_numbers(config, clock_times(config, counters["env_steps"], passes)))
     return learner, counters
 
 

@@ -54,7 +54,7 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
         content = OmegaConf.load(path)
     except (YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
         raise ValueError(f"{path} is damaged: {shortened(' '.join(str(error).split()), 200)}") from error
-    if not isinstance(content, kind):
+    if not isinstance(content, kind) or (kind is DictConfig and not content):
         raise ValueError(f"{path} is damaged: it holds no {'list' if kind is ListConfig else 'settings'}.")
     return content
 

@@ -8,6 +8,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
+from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.dreamer import LearnerConfig
 from dreamer_racing.losses import LossConfig
@@ -59,14 +60,9 @@ class ModelConfig(LearnerConfig):
 
 
 @dataclass
-class CurriculumConfig:
+class CurriculumConfig(BodyRateSchedule):
     """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1."""
 
-    threshold: float = 50.0  # mean return above which b₂ grows
-    increment: float = 0.001
-    maximum: float = 0.01
-    window: int = 100  # episodes
-    cooldown: int = 100  # episodes
     relabel: bool = True  # recompute rewards of replayed steps with today's b₂
 
 

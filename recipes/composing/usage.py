@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import yaml
 
-RECIPES = Path(__file__).parents[1]
-OPTIONS = RECIPES.parent / "docs" / "options.md"
+FOLDER = Path(__file__).parents[1]
+OPTIONS = FOLDER.parent / "docs" / "options.md"
 TRAINING = ("dreamer_v3", "ppo", "sac")
 WIDTH, COLUMN = 118, 42
 
@@ -31,7 +31,7 @@ class Option(NamedTuple):
 def answer_help() -> None:
     """Print the help and leave, if the command line of a recipe asks for it."""
     program = Path(sys.argv[0])
-    if program.resolve().parent == RECIPES and {"--help", "-h"} & set(sys.argv[1:]):
+    if program.resolve().parent == FOLDER and {"--help", "-h"} & set(sys.argv[1:]):
         try:
             print("\n".join(usage(program.stem)), flush=True)
         except BrokenPipeError:  # `| head` has what it wanted: what is left goes nowhere, also at exit
@@ -41,13 +41,13 @@ def answer_help() -> None:
 
 def command(recipe: str) -> str:
     """The words that start a recipe: from a clone its file, from an installed package, which holds it, the package."""
-    installed = (RECIPES.parent / "__main__.py").is_file()
+    installed = (FOLDER.parent / "__main__.py").is_file()
     return f"python -m dreamer_racing {recipe}" if installed else f"python recipes/{recipe}.py"
 
 
 def usage(recipe: str) -> Iterator[str]:
     """Yield the lines of a recipe's help."""
-    said = ast.get_docstring(ast.parse((RECIPES / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
+    said = ast.get_docstring(ast.parse((FOLDER / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
     yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *said.splitlines(), "")
     if found := groups(recipe):
         yield "Groups: settings that go together (GROUP=CHOICE)"
@@ -70,7 +70,7 @@ def usage(recipe: str) -> Iterator[str]:
 
 def groups(recipe: str) -> dict[str, list[str]]:
     """Return the configuration groups that a recipe composes, and what there is to choose in each."""
-    config = RECIPES / "config"
+    config = FOLDER / "config"
     defaults = yaml.safe_load((config / f"{recipe}.yaml").read_text(encoding="utf-8")).get("defaults", [])
     named = [name for entry in defaults if isinstance(entry, dict) for name in entry if "/" not in name]
     named += ["decoys"] if recipe in TRAINING else []

@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import dm_control_env as task_module
 from dreamer_racing.envs import viewer
-from dreamer_racing.envs.dm_control_env import NoseCamera, load
+from dreamer_racing.envs.dm_control_env import OnboardView, load
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause
@@ -337,7 +337,7 @@ def test_missing_opengl_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(task_module.mujoco, "Camera", broken)
     with pytest.raises(RendererUnavailableError, match="No OpenGL rendering backend.*libegl1.*MUJOCO_GL=egl"):
-        NoseCamera(load("circle").physics, Camera())
+        OnboardView(load("circle").physics, Camera())
 
 
 @pytest.mark.parametrize(

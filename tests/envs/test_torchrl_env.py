@@ -309,7 +309,7 @@ def test_closing_twice_is_safe() -> None:
 def test_bad_arguments_are_explained() -> None:
     with pytest.raises(ValueError, match="num_envs=0: at least one world"):
         DroneRacingEnv(num_envs=0)
-    with pytest.raises(ValueError, match="Unknown physics preset 'hard': the presets are easy, faithful"):
+    with pytest.raises(ValueError, match="preset=hard: there is no such physics; there are easy, faithful"):
         blind(preset="hard")
     with pytest.raises(TrackError, match="kidny"):
         blind(track="kidny")
@@ -328,8 +328,9 @@ def test_a_closed_environment_has_freed_its_renderer():
     env.close()
 
 
-def test_environments_made_and_closed_leave_nothing_behind():
-    """A renderer holds 7 MiB."""
+@pytest.mark.parametrize(("cycles", "most"), [(30, 3e6), pytest.param(200, 10e6, marks=pytest.mark.slow)])
+def test_environments_made_and_closed_leave_nothing_behind(cycles: int, most: float):
+    """A renderer holds 7 MiB; the limits are 0.1 and 0.05 MB a cycle, above the 0.03 by which memory fragments."""
     if not STATM.exists():
         pytest.skip("how much memory this process has is read from /proc")
 
@@ -340,6 +341,6 @@ def test_environments_made_and_closed_leave_nothing_behind():
         gc.collect()
         return int(STATM.read_text().split()[1]) * resource.getpagesize()
 
-    before = [cycle() for _ in range(5)][-1]
-    after = [cycle() for _ in range(20)][-1]
-    assert after - before < 15e6
+    before = [cycle() for _ in range(15)][-1]
+    after = [cycle() for _ in range(cycles)][-1]
+    assert after - before < most

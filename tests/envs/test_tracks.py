@@ -243,6 +243,28 @@ def test_refusals_name_file_field_and_value(write, case):
         assert piece in message
 
 
+@pytest.mark.parametrize(
+    ("field", "gate", "start", "laps"),
+    [
+        ("gates[1].position", 600, -3, 1),
+        ("start.position", 900, -900, 1),
+        ("gates[0].position", 450, -3, 2),
+    ],
+    ids=["a gate", "the start", "the next lap"],
+)
+def test_a_way_that_no_flight_is_long_enough_for(write, field, gate, start, laps):
+    """The second gate at x=gate; where there is a next lap, a third as far to the left of it."""
+    far = [[0, 0, 1.35], [gate, 0, 1.35], [gate, gate, 1.35]] if laps > 1 else [[0, 0, 1.35], [gate, 0, 1.35]]
+    gates = "".join(f"  - {{position: {position}, yaw_degrees: 0}}\n" for position in far)
+    box = "bounds: {low: [-1000, -1000, 0], high: [1000, 1000, 6]}"
+    text = f"gates:\n{gates}start: {{position: [{start}, 0, 1.35]}}\nlaps: {laps}\n{box}\n"
+    with pytest.raises(TrackError, match=r"at most 540 m from .*, as far as a flight can be: it is \d+ m") as refusal:
+        load_track(write(text))
+    assert field in str(refusal.value)
+    near = text.replace(str(gate), "200").replace(f"[{start},", "[-3,")
+    assert load_track(write(near)).laps == laps
+
+
 @pytest.mark.parametrize(("count", "listed"), [(0, "[]"), (1, "[{position: [0, 0, 1.35], yaw_degrees: 0}]")])
 def test_a_lap_needs_two_gates(write, count, listed):
     with pytest.raises(TrackError, match=re.escape("gates is [") + ".*at least 2 race gates"):
@@ -256,7 +278,8 @@ def test_a_lap_needs_two_gates(write, count, listed):
         ("name: a\nname: b\n", "line 2.*'name' is given twice"),
         ("name: !!python/object/apply:os.getcwd []", "not valid YAML at line 1"),
         ("name: 2020-99-99", "not valid YAML"),
-        ("", "the file is None.*a mapping"),
+        ("", "the track file is empty; it must have gates"),
+        ("# nothing yet", "the track file is empty; it must have gates"),
         ("- 1", r"the file is \[1\].*a mapping"),
         ("{}", "gates is missing"),
         ("name: &a [x]\nlaps: *a", "line 2.*aliases"),

@@ -31,7 +31,8 @@ class ScriptedRace(EnvBase):
         super().__init__(batch_size=[len(script)])
         self.script = script
         parameters, track = SimpleNamespace(control_dt=DT), SimpleNamespace(num_gates=3)
-        self.worlds = SimpleNamespace(evaluation=True, parameters=parameters, track=track)
+        camera = SimpleNamespace(tilt=30.0)
+        self.worlds = SimpleNamespace(evaluation=True, parameters=parameters, track=track, camera=camera)
         n = self.batch_size
         self.action_spec = Bounded(-1.0, 1.0, (*n, 4))
         self.reward_spec = Unbounded((*n, 1))
@@ -229,6 +230,24 @@ def test_records_without_images_and_none_at_all():
     ]
     assert [flight.outcome for flight in result.trajectories] == ["ground", TIMEOUT, "gate_frame"]
     assert evaluate(ScriptedRace(SCRIPT), idle(), 3, num_trajectories=0).trajectories == []
+
+
+def test_what_a_critic_makes_of_each_state_is_recorded_beside_the_action():
+    """The judge sees what the policy has acted on, of the recorded worlds only, and no more than is recorded."""
+    asked = []
+
+    def judge(acted):
+        asked.append(len(acted["action"]))
+        return acted["pixels"][:, 0, 0, :1].float() * 10
+
+    result = evaluate(ScriptedRace(SCRIPT), idle(), 6, num_trajectories=2, max_recorded_steps=20, judge=judge)
+    crashed, stopped = result.trajectories
+    assert crashed.value.tolist() == [0.0, 10.0]
+    assert stopped.value.tolist() == [10.0 * step for step in range(20)]
+    assert asked == [2] * 20
+    assert crashed.part(1, 2).value.tolist() == [10.0]
+    assert crashed.camera_tilt == 30.0
+    assert evaluate(ScriptedRace(SCRIPT), idle(), 1).trajectories[0].value is None
 
 
 def test_part_of_a_flight():

@@ -488,7 +488,7 @@ def test_a_missing_actor_is_named(tmp_path: Path) -> None:
 
 def test_a_missing_runtime_is_named(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ImportError, match="pip install onnxruntime"):
+    with pytest.raises(ImportError, match=r"pip install 'dreamer_racing\[hil\]'"):
         onnx_actor.OnnxActor(exported)
 
 

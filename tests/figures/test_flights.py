@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from dreamer_racing.envs.tracks import Gate, load_track
 from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, STRIDE, Dream, record_dream
 from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.evaluation.trajectory import read_trajectory, write_trajectory
+from dreamer_racing.evaluation.trajectory import read_flight, read_trajectory, write_flight, write_trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, left_out_of, speed_scale
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
@@ -54,6 +54,34 @@ def test_a_flight_comes_back_exactly(tmp_path, outcome):
     for name in ("position", "attitude", "linear_velocity", "target_gate", "action"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=0, atol=0, equal_nan=True)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["flight.csv"]
+
+
+def test_value_and_images_come_back_with_the_flight(tmp_path):
+    before = random_flight(pixels=True)
+    before = replace(before, value=torch.randn(60), camera_tilt=12.5)
+    assert write_flight(tmp_path / "one", before, "circle") == ["one_trajectory.csv", "one_onboard.npz"]
+    after, track = read_flight(tmp_path / "one_trajectory.csv")
+    assert (track, after.camera_tilt, after.outcome) == ("circle", 12.5, "ground")
+    for name in ("action", "value", "pixels"):
+        assert torch.equal(getattr(after, name), getattr(before, name)), name
+    assert read_trajectory(tmp_path / "one_trajectory.csv")[0].pixels is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one_onboard.npz", "one_trajectory.csv"]
+
+
+def test_images_are_never_those_of_another_flight(tmp_path):
+    write_flight(tmp_path / "one", random_flight(pixels=True), "circle")
+    write_flight(tmp_path / "two", random_flight(steps=20), "circle")
+    (tmp_path / "one_onboard.npz").rename(tmp_path / "two_onboard.npz")
+    with pytest.raises(ValueError, match="two_onboard.npz holds .* has 21 rows: these files are of two flights"):
+        read_flight(tmp_path / "two_trajectory.csv")
+    assert write_flight(tmp_path / "two", random_flight(steps=20), "circle") == ["two_trajectory.csv"]
+    assert read_flight(tmp_path / "two_trajectory.csv")[0].pixels is None
+    write_flight(tmp_path / "two", random_flight(steps=20, pixels=True), "circle")
+    whole = (tmp_path / "two_onboard.npz").read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"", b"no images"):
+        (tmp_path / "two_onboard.npz").write_bytes(damaged)
+        with pytest.raises(ValueError, match="two_onboard.npz holds no images"):
+            read_flight(tmp_path / "two_trajectory.csv")
 
 
 @pytest.mark.parametrize("cut", [1, 30, 700, 5000])

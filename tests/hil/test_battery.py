@@ -66,6 +66,9 @@ class Wire:
         arrived, self.arrived = self.arrived, []
         return iter(arrived)
 
+    def discard(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

@@ -91,7 +91,7 @@ def test_every_line_can_be_pasted(contract, link):
     text = "\n".join(lines)
     assert text.isascii() and "?" not in text and "\t" not in text and max(map(len, lines)) <= 120
     assert lines[-1] == "save"
-    assert all(line.split()[0] in {"#", "set", "feature", "map", "aux", "save"} for line in lines)
+    assert all(line.split()[0] in {"#", "set", "feature", "map", "aux", "rxfail", "save"} for line in lines)
     assert all(above.startswith("# ") for above, line in itertools.pairwise(lines) if line.startswith("set"))
 
 
@@ -101,6 +101,7 @@ def test_every_line_can_be_pasted(contract, link):
         ("crsf", ["feature -RX_MSP", "feature RX_SERIAL", "set serialrx_provider = CRSF"]),
         ("sbus", ["feature -RX_MSP", "feature RX_SERIAL", "set serialrx_provider = SBUS"]),
         ("msp", ["feature -RX_SERIAL", "feature RX_MSP"]),
+        ("betaflight_sitl", []),
     ],
 )
 def test_the_receiver_is_that_of_the_link(contract, link, there):
@@ -109,7 +110,7 @@ def test_the_receiver_is_that_of_the_link(contract, link, there):
 
 
 def test_an_unknown_link_is_refused(contract):
-    with pytest.raises(ValueError, match="one of crsf, sbus, msp"):
+    with pytest.raises(ValueError, match="one of crsf, sbus, msp, betaflight_sitl"):
         print_settings(contract, "ppm")
 
 
@@ -126,6 +127,7 @@ def test_each_setting_is_reported_where_it_differs_and_where_it_is_missing(contr
             continue
         flipped = {f"feature {name}": f"feature -{name}" for name in ("RX_SERIAL", "RX_MSP", "AIRMODE")}
         flipped |= {other: line for line, other in flipped.items()}
+        flipped |= {f"rxfail {channel} a": f"rxfail {channel} h" for channel in range(4)}
         other = flipped.get(wanted.command, wanted.command.replace(wanted.value, "TAER1234"))
         for replacement, status in ((other, Status.DIFFERS), ("# nothing", Status.MISSING)):
             text = dump_of([replacement if line == wanted.command else line for line in lines])
@@ -195,7 +197,10 @@ def test_what_a_diff_leaves_out_is_the_default(contract, version):
     own += ["set throttle_boost = 0", "rateprofile 0", "set roll_rc_rate = 58"]
     found = statuses("\n".join([VERSION.format(version), "defaults nosave", *own]), contract)
     wrong = {name for name, status in found.items() if status is not Status.OK}
-    assert wrong == {"roll_srate", "pitch_rc_rate", "pitch_srate", "yaw_rc_rate", "yaw_srate"}
+    assert wrong == {
+        *("roll_srate", "pitch_rc_rate", "pitch_srate", "yaw_rc_rate", "yaw_srate"),
+        *("f_roll", "f_pitch", "f_yaw", "rc_smoothing", "yaw_spin_recovery"),
+    }
     assert found["yaw_srate"] is Status.DIFFERS  # from the default, 67
 
 
@@ -213,6 +218,14 @@ def test_the_older_name_of_the_idle_is_read_too(contract):
     for value, status in ((550, Status.OK), (450, Status.DIFFERS)):
         older = [line.replace("set motor_idle = 550", f"set dshot_idle_value = {value}") for line in lines]
         assert statuses(dump_of(older), contract)["motor_idle"] is status
+
+
+@pytest.mark.parametrize(("line", "status"), [("rxfail 3 a", Status.OK), ("rxfail 3 h", Status.DIFFERS),
+                                              ("rxfail 3 s 1500", Status.DIFFERS)])  # fmt: skip
+def test_what_a_silent_radio_leaves_in_the_channels(contract, line, status):
+    """A throttle that is held, or set, flies on for the whole of the failsafe's first stage."""
+    text = dump_of([line if each == "rxfail 3 a" else each for each in print_settings(contract, "crsf")])
+    assert statuses(text, contract)["rxfail 3"] is status
 
 
 def test_comments_and_unknown_lines_are_passed_over(contract):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import socket
 import time
 import zlib
@@ -109,6 +111,47 @@ def test_packets_carry_the_time_of_their_arrival(poses, sender):
     assert poses.poll() == []
 
 
+@pytest.mark.parametrize("step", [-3600.0, -0.02, 0.02, 0.5, 3600.0])
+def test_a_wall_clock_that_is_set_does_not_move_arrivals(poses, sender, monkeypatch, step):
+    """What waits was stamped by the clock of before, what comes later by the one of after."""
+    assert poses.poll() == []
+    real = time.time
+    before = time.monotonic()
+    sender.sendto(encode_pose(packet(1)), poses.address)
+    after = time.monotonic()
+    time.sleep(0.01)
+    monkeypatch.setattr(time, "time", lambda: real() + step)  # for the inlet; the kernel's own stays as it is
+    (waited,) = poses.poll()
+    monkeypatch.undo()
+    sender.sendto(encode_pose(packet(2)), poses.address)
+    time.sleep(0.01)
+    (late,) = poses.poll()
+    assert before - 2e-3 < waited.time < after + 2e-3
+    assert after < late.time < time.monotonic() - 0.005
+
+
 def test_a_port_in_use_is_said(poses):
     with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{poses.address[1]}: .*in use"):
         UdpPose(poses.address[1])
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "Ports below 1024 are the system's"),
+        (errno.EADDRINUSE, "Another program uses it"),
+        (errno.EADDRNOTAVAIL, "This machine has no such address"),
+        (errno.ENOBUFS, os.strerror(errno.ENOBUFS) + "."),
+    ],
+)
+def test_each_reason_not_to_listen_has_its_own_remedy(monkeypatch, number, remedy):
+    """Root may listen anywhere, so the kernel's answer is made up."""
+
+    class Refusing(socket.socket):
+        def bind(self, address):
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("dreamer_racing.hil.inlet.socket.socket", Refusing)
+    with pytest.raises(OSError, match=r"cannot listen on 127.0.0.1:80: ") as refused:
+        UdpPose(80)
+    assert remedy in str(refused.value) and ("Another program" in str(refused.value)) == (number == errno.EADDRINUSE)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import numpy as np
 import pytest
 
-from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
+from dreamer_racing.hil.recording import FILE, WAITING_MOST, Flight, FlightRecorder
 
 
 @pytest.fixture
@@ -27,9 +30,71 @@ def test_a_flight_whose_loop_is_killed_is_there_up_to_its_last_tick(tmp_path):
     recorder = FlightRecorder(tmp_path / FILE, {})
     recorder.tick(0.0, {"index": 0})
     recorder.tick(0.1, {"index": 1})
-    flight = Flight(tmp_path)  # nothing was closed
+    deadline = time.monotonic() + 10
+    while len((flight := Flight(tmp_path)).ticks) < 2 and time.monotonic() < deadline:  # nothing was closed
+        time.sleep(0.01)
     assert not flight.whole and [tick["index"] for tick in flight.ticks] == [0, 1]
     recorder.close()
+    recorder.close()
+
+
+def stall(recorder, monkeypatch):
+    """Let the disk take nothing until the event is set; 20 s at most."""
+    released, add = threading.Event(), recorder._writer.add_message
+
+    def wait(*values):
+        released.wait(20)
+        add(*values)
+
+    monkeypatch.setattr(recorder._writer, "add_message", wait)
+    return released
+
+
+def test_a_disk_that_stalls_for_a_while_holds_nobody_up_and_loses_nothing(tmp_path, monkeypatch):
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        released, began = stall(recorder, monkeypatch), time.monotonic()
+        message = {"index": 0}
+        for message["index"] in range(WAITING_MOST):
+            recorder.tick(0.02 * message["index"], message)
+        assert time.monotonic() - began < 5
+        released.set()
+    flight = Flight(tmp_path)
+    assert flight.whole and [tick["index"] for tick in flight.ticks] == list(range(WAITING_MOST))
+
+
+def test_a_disk_that_takes_nothing_for_too_long_ends_the_recording_without_a_gap(tmp_path, monkeypatch):
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        released, taken = stall(recorder, monkeypatch), []
+
+        def fly() -> None:
+            for index in range(WAITING_MOST + 2):  # one is being written when the queue is full
+                recorder.tick(0.02 * index, {"index": index})
+                taken.append(index)
+
+        with pytest.raises(OSError, match=r"flight\.mcap: the disk does not take what is to be written"):
+            fly()
+        released.set()
+    flight = Flight(tmp_path)
+    assert not flight.whole and [tick["index"] for tick in flight.ticks] == taken and len(taken) >= WAITING_MOST
+
+
+@pytest.mark.parametrize("noticed", [True, False])
+def test_a_full_disk_is_said_by_the_next_tick_or_else_at_the_end(tmp_path, monkeypatch, noticed):
+    def full(*values):
+        raise OSError(28, "No space left on device")
+
+    recorder = FlightRecorder(tmp_path / FILE, {})
+    monkeypatch.setattr(recorder._writer, "add_message", full)
+    recorder.tick(0.0, {})
+    if noticed:
+        deadline = time.monotonic() + 10
+        while recorder._aside.error is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with pytest.raises(OSError, match="No space left"):
+            recorder.tick(0.1, {})
+    else:
+        with pytest.raises(OSError, match="No space left"):
+            recorder.close()
     recorder.close()
 
 

@@ -20,6 +20,7 @@ LIMITS = SafetyLimits(
     fence_high=(4, 4, 4),
     start_position=(1, 0, 0),
     velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities
+    turn_tolerance_degrees=180,  # and as they like, but for those of turns
 )
 OFF, ON, KILL = Operator(False, False), Operator(True, False), Operator(True, True)
 SETPOINT = Setpoint(12.0, np.array([1.0, -2.0, 0.5]))
@@ -240,6 +241,29 @@ def test_a_source_that_says_nothing_of_velocities_but_zeros_is_cut_within_its_wi
     assert Reason.POSE_CONTRADICTION in verdicts[1].reasons
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("degrees", "state"), [(46.8, State.FLYING), (46.9, State.CUT), (180.0, State.CUT),
+                                                (-46.8, State.FLYING), (-90.0, State.CUT)])  # fmt: skip
+def test_both_sides_of_what_an_attitude_may_turn_between_two_poses(axis, degrees, state):
+    """15 rad/s for 1/32 s are 26.86°, and 20° of tolerance."""
+    flight = Flight(turn_rate_max=15.0, turn_tolerance_degrees=20.0).flying()
+    verdict = flight.tick(pose={"attitude": turned(axis, degrees)})
+    assert verdict.state is state and verdict.reasons == (() if state is State.FLYING else (Reason.ATTITUDE_JUMP,))
+    jumped = f"the attitude jumped by {abs(degrees):.0f}° (allowed since the last: 47)"
+    assert state is State.FLYING or verdict.words == (jumped,)
+
+
+def test_an_attitude_and_its_negative_are_the_same_one():
+    flight = Flight(turn_tolerance_degrees=1.0).flying()
+    assert flight.tick(pose={"attitude": -turned(2, 10.0)}).state is State.FLYING
+
+
+def test_a_steady_turn_is_no_jump_however_far_it_goes():
+    flight = Flight(turn_tolerance_degrees=1.0, turn_rate_max=15.0).flying()
+    for step in range(1, 30):
+        assert flight.tick(pose={"attitude": turned(2, 26.0 * step)}).state is State.FLYING
+
+
 def test_what_contradicts_itself_does_not_arm():
     flight = Flight(velocity_tolerance=4.0, jump_tolerance=1.0, start_box=3.0).ready()
     verdict = flight.tick(pose={"position": (1.5, 0.0, 0.0)})
@@ -273,9 +297,36 @@ def test_what_has_flown_and_lies_still_is_cut():
     flight = Flight(still_time=0.5).flying()
     assert flight.ticks(40).state is State.FLYING  # it has not left the start yet, and has 3 s for that
     flight.tick(pose={"velocity": (0.0, 0.3, 0.0)})
-    assert flight.ticks(16).state is State.FLYING  # as long as allowed
-    verdict = flight.tick()
+    measured = [{"position": (1.0, 0.0, 1e-9 * digit)} for digit in range(17)]  # no two measurements are the same
+    assert [flight.tick(pose=pose).state for pose in measured[:16]] == [State.FLYING] * 16  # as long as allowed
+    verdict = flight.tick(pose=measured[16])
     assert verdict.state is State.CUT and verdict.reasons == (Reason.STRANDED,)
+
+
+@pytest.mark.parametrize("claimed", [3.0, 0.0])
+def test_a_pose_that_is_repeated_as_if_new_while_it_flies_is_cut(claimed):
+    """At 3 m/s the odometer tolerates it and nothing seems to lie still; without velocities, it seems to lie still."""
+    flight = Flight(velocity_tolerance=4.0, jump_tolerance=1.0, cut_after=0.125).flying()
+    flight.tick(pose={"position": (1.1, 0.0, 0.0), "velocity": (3.0, 0.0, 0.0)})
+    frozen = {"pose": {"position": (1.2, 0.0, 0.0), "velocity": (claimed, 0.0, 0.0)}}
+    assert flight.ticks(5, **frozen).state is State.FLYING  # 4/32 s from the first to the last: as long as allowed
+    verdict = flight.tick(**frozen)
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.POSE_FROZEN,)
+    assert verdict.words == ("poses have been the same for 0.156 s (allowed: 0.125)",)
+
+
+@pytest.mark.parametrize("moved", [{"position": (1.2, 1e-9, 0.0)}, {"attitude": turned(2, 1e-3)}])
+def test_a_pose_of_which_anything_changes_is_not_frozen(moved):
+    flight = Flight(cut_after=0.125, jump_tolerance=1.0).flying()
+    flight.tick(pose={"velocity": (3.0, 0.0, 0.0)})
+    still = {"position": (1.2, 0.0, 0.0), "velocity": (3.0, 0.0, 0.0)}
+    for _ in range(10):
+        assert flight.ticks(4, pose=still).state is State.FLYING
+        assert flight.tick(pose=still | moved).state is State.FLYING
+
+
+def test_what_stands_on_the_ground_may_be_measured_the_same_again_and_again():
+    assert Flight(lift_off_time=3.0).flying().ticks(80).state is State.FLYING
 
 
 def test_tilt_counts_anew_after_being_upright():
@@ -361,6 +412,30 @@ def test_overruns_cut_when_there_are_too_many_within_the_window():
     flight = Flight(overruns_max=2, overrun_window=0.25).flying()
     states = [flight.tick(loop_overrun=overrun).state for overrun in 5 * [True, False, False, False, False]]
     assert set(states) == {State.FLYING}
+
+
+@pytest.mark.parametrize(("missed", "state"), [(3, State.FLYING), (4, State.CUT), (1000, State.CUT)])
+def test_a_tick_that_misses_several_deadlines_counts_as_often(missed, state):
+    verdict = Flight(overruns_max=3).flying().tick(loop_overrun=missed)
+    assert verdict.state is state and verdict.reasons == (() if state is State.FLYING else (Reason.OVERRUNS,))
+
+
+def test_a_link_that_takes_no_command_is_cut_when_that_lasts():
+    flight = Flight(cut_after=0.125).flying()
+    for _ in range(3):
+        assert flight.ticks(3, command_dropped=True).state is State.FLYING
+        assert flight.tick().state is State.FLYING  # one got through
+    assert flight.ticks(4, command_dropped=True).state is State.FLYING  # 4/32 s, as long as allowed
+    verdict = flight.tick(command_dropped=True)
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.LINK_LOST,)
+    assert verdict.words == ("the link has taken no command for 0.156 s",)
+
+
+def test_a_link_that_takes_no_command_does_not_arm():
+    flight = Flight()
+    flight.ticks(10, operator=OFF, command_dropped=True)
+    verdict = flight.tick(command_dropped=True)
+    assert verdict.state is State.DISARMED and verdict.reasons == (Reason.LINK_LOST,)
 
 
 def test_overruns_before_a_flight_delay_it():
@@ -455,6 +530,8 @@ def test_each_flight_begins_with_the_least_thrust():
         ("thrust_max", 9.81),
         ("speed_max", math.inf),
         ("tilt_max_degrees", -1),
+        ("turn_rate_max", 9.9),
+        ("turn_tolerance_degrees", 0.0),
     ],
 )
 def test_limits_that_protect_nothing_are_refused(name, value):
@@ -491,11 +568,12 @@ odd_ticks = st.builds(
     operator=operators,
     arm_requested=st.booleans(),
     contract_mismatch=st.sampled_from([None, "other"]),
-    loop_overrun=st.booleans(),
+    loop_overrun=st.integers(0, 9),
     finish=st.booleans(),
+    command_dropped=st.booleans(),
 )
 small = st.builds(
-    dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.booleans()
+    dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.integers(0, 1)
 )  # what a flight survives, mostly
 
 

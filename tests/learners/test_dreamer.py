@@ -374,6 +374,30 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
         learner.adjust(discont=0.5)
 
 
+def test_every_number_that_a_loss_has_moves_under_the_name_in_the_configuration():
+    learner = learner_of(seed=0, **CONFIG)
+    homes = {
+        "world_model": ("dynamics_scale", "representation_scale", "free_nats"),
+        "actor": ("discount", "lambda_", "entropy_scale"),
+        "critic": ("discount", "lambda_", "slow_critic_scale", "replay_value_scale", "replay_value_gradient"),
+    }
+    moved = {name: 0.25 for names in homes.values() for name in names}
+    learner.adjust(**moved)
+    for home, names in homes.items():
+        found = {name: float(getattr(learner.losses[home], name)) for name in names}
+        assert found == dict.fromkeys(names, 0.25), home
+
+
+@pytest.mark.parametrize("name", ["return_decay", "barlow_scale", "kl_target", "world_model", "ppo"])
+def test_a_number_that_no_loss_has_is_refused(name):
+    """What only a constructor reads, what another loss would have, and what is no number."""
+    learner = learner_of(seed=0, **CONFIG)
+    with pytest.raises(
+        ValueError, match=rf"adjust\({name}=...\): none of ReconstructionLoss, ReinforceLoss, CriticLoss"
+    ):
+        learner.adjust(**{name: 0.5})
+
+
 def test_a_discount_of_zero_leaves_only_the_next_reward():
     learner = learner_of(seed=0, **CONFIG)
     torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
@@ -402,6 +426,21 @@ def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     for name, value in resumed.averaged.named_parameters():
         assert torch.equal(value, dict(learner.averaged.named_parameters())[name]), name
+
+
+def test_evaluations_ask_the_critic_that_belongs_to_what_flies():
+    """Of latents that have seen the image, by the averaged weights."""
+    learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
+    torch.nn.init.normal_(learner.averaged.critic.head.mlp.output.weight)
+    size = learner.size
+    belief, state = (
+        torch.randn(3, size.features - size.latents * size.classes),
+        torch.randn(3, size.latents * size.classes),
+    )
+    acted = TensorDict({"belief": 0 * belief, "next": {"belief": belief, "state": state}}, [3])
+    expected = learner.averaged.critic.value(torch.cat((belief, state), -1))
+    value = learner.judge()(acted)
+    assert value.shape == (3, 1) and not value.requires_grad and torch.equal(value, expected)
 
 
 def test_without_averages_the_trained_weights_fly():
@@ -454,3 +493,14 @@ def test_composing_by_names_draws_the_weights_that_composing_by_hand_does(actor)
     drawn = losses["world_model"].privileged_decoder.state_dict()
     for name, value in named.losses["world_model"].privileged_decoder.state_dict().items():
         assert torch.equal(value, drawn[name]), name
+
+
+def test_a_seed_means_the_weights_that_it_has_always_meant():
+    """Sums of all weights' magnitudes, so that runs begun with one seed at different versions compare."""
+    learner = make_dreamer("debug", Interface(privileged_dim=7), LossConfig(world_model="informed"), seed=3)
+    drawn = {**dict(learner.agent.named_children()), "decoder": learner.losses["world_model"].privileged_decoder}
+    sums = {
+        name: sum(p.detach().double().abs().sum().item() for p in home.parameters()) for name, home in drawn.items()
+    }
+    expected = {"world_model": 2380.58803, "actor": 103.634042, "critic": 223.145986, "decoder": 126.838377}
+    assert sums == pytest.approx(expected, rel=1e-6)

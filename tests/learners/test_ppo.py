@@ -90,6 +90,14 @@ def test_advantages_equal_torchrls() -> None:
         torch.testing.assert_close(records[key], oracle[key].flatten(0, 1), atol=1e-5, rtol=1e-5)
 
 
+def test_evaluations_are_told_values_in_units_of_the_reward() -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(reward_scale=0.25, minibatches=2), seed=0)
+    learner.critic = TensorDictModule(Echo(), ["vector"], ["state_value"])
+    seen = torch.tensor([[1.0], [2.0], [-3.0]])
+    acted = TensorDict({"vector": seen, "action": torch.zeros(3, 1)}, [3])
+    assert torch.equal(learner.judge()(acted), 4 * seen)
+
+
 def bandit(learner: PPOLearner, rounds: int) -> float:
     """Reward −(a − 0.5)², episodes of one step; return the mean action that was learnt."""
     for _ in range(rounds):
@@ -135,6 +143,18 @@ def test_networks_for_other_images_are_refused() -> None:
     learner = PPOLearner(SMALL, Interface(image_size=64), seed=0)
     with pytest.raises(ValueError, match=r"env.image_size=96, this learner's with 64"):
         learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
+
+
+@pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])
+def test_there_are_as_many_minibatches_as_were_asked_for(minibatches: int, steps: int) -> None:
+    learner = PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=minibatches, epochs=1), seed=0)
+    learner.update(random_rollout(num_envs=4, steps=12))  # 48 records, which 7 does not divide
+    assert {int(state["step"]) for state in learner.optimizer.state.values()} == {steps}
+
+
+def test_more_minibatches_than_records_are_refused() -> None:
+    with pytest.raises(ValueError, match="minibatches=49 of 48 records"):
+        PPOLearner(SMALL, NUMBERS, PPOConfig(minibatches=49), seed=0).update(random_rollout(num_envs=4, steps=12))
 
 
 def test_a_reward_that_is_not_finite_spoils_no_network() -> None:

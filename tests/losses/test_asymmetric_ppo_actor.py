@@ -55,6 +55,15 @@ def test_values_are_those_of_the_state_at_which_the_action_was_chosen():
     assert torch.equal(loss._value(), before), "neither latents nor their critic have a say"
 
 
+def test_evaluations_ask_the_critic_of_the_state():
+    learner = make_learner()
+    torch.nn.init.normal_(actor_loss(learner).state_critic.mlp.output.weight)
+    acted = TensorDict({"privileged": {"vector": torch.randn(3, P)}}, [3])
+    expected = actor_loss(learner).state_critic.mean(symlog(acted["privileged", "vector"]))
+    value = learner.judge()(acted)
+    assert value.shape == (3, 1) and not value.requires_grad and torch.equal(value, expected)
+
+
 def test_an_improvement_moves_actor_and_state_critic_and_nothing_else():
     learner = make_learner()
     loss = actor_loss(learner)

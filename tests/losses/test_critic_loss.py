@@ -126,7 +126,7 @@ def test_critic_learns_the_mean_of_a_random_return():
     torch.manual_seed(0)
     critic = Critic(4, layers=1, units=32, norm="layer")
     optimizer = torch.optim.Adam(critic.head.parameters(), lr=3e-2)
-    loss = CriticLoss(critic, replay_scale=0.0, slow_scale=0.0)
+    loss = CriticLoss(critic, replay_value_scale=0.0, slow_critic_scale=0.0)
     inputs = make_input(starts=64)
     features = inputs["imagination", "features"].fill_(1.0)
     for _ in range(150):

@@ -389,7 +389,7 @@ def test_critic_loss(slow_scale):
     agent = make_agent()
     stock = copy.deepcopy(agent.critic)
     inputs = make_critic_input(make_batch())
-    losses = CriticLoss(agent.critic, discount=DISCOUNT, slow_scale=slow_scale)(inputs)
+    losses = CriticLoss(agent.critic, discount=DISCOUNT, slow_critic_scale=slow_scale)(inputs)
     imagination = inputs["imagination"]
     belief, state = imagination["features"].split([SIZE.belief, SIZE.state], -1)
     stock_imagination = {"lambda_target": imagination["lambda_return"], "discount_weight": imagination["weight"]}
@@ -407,7 +407,7 @@ def test_replay_critic_loss_without_crashes():
     """TorchRL and the reference average over the T − 1 records that have a next one, we over all T."""
     agent, batch = make_agent(), make_batch()
     inputs = make_critic_input(batch)
-    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_scale=1.0)(inputs)["loss_replay_critic"]
+    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_value_scale=1.0)(inputs)["loss_replay_critic"]
     oracle = stock_value_loss(copy.deepcopy(agent.critic))
     expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
     torch.testing.assert_close(7 * ours, 6 * expected, **TOLERANCE)
@@ -417,7 +417,7 @@ def test_replay_critic_loss_with_crashes():
     """TorchRL leaves out records that end an episode; we teach the critic that a crash is worth zero from there on."""
     agent, batch = make_agent(), make_batch(crashes=True)
     inputs = make_critic_input(batch)
-    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_scale=1.0)(inputs)["loss_replay_critic"]
+    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_value_scale=1.0)(inputs)["loss_replay_critic"]
     oracle = stock_value_loss(copy.deepcopy(agent.critic))
     expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
     crashed = batch["terminated"].squeeze(-1)

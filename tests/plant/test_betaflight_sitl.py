@@ -16,46 +16,9 @@ from dreamer_racing.plant.betaflight_sitl import DIALECTS, BetaflightSitl, decod
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
+from tests.firmware import Firmware
 
 FIRMWARES = ("2026.6", "before")
-IDLE = 0.055  # of the motors, armed
-
-
-class Firmware:
-    """A stand-in for Betaflight: a rate controller that reads and writes the same packets.
-
-    Written from the firmware's side: it turns the rates around as sitl.c does, holds a rate with a mixer for motors in
-    Betaflight's order, and idles when armed.
-    """
-
-    GAIN = np.array((0.045, 0.045, 0.12))  # motor command per rad/s
-
-    def __init__(self, version: str) -> None:
-        self.version = version
-        self.armed, self.throttle, self.rates = False, 0.0, np.zeros(3)  # rates: right, forward and LEFT positive
-        self.stamps: set[float] = set()
-        self.gyro = np.zeros(3)
-        self.accelerometer = np.zeros(3)
-
-    def answer(self, data: bytes) -> bytes:
-        numbers = struct.unpack("<18d", data)
-        self.stamps.add(numbers[0])
-        x, y, z = numbers[1:4]
-        self.gyro = np.array((x, -y, z if self.version == "2026.6" else -z))  # sitl.c, updateState
-        self.accelerometer = -np.array(numbers[4:7])
-        return self.pack(self.motors())
-
-    def motors(self) -> np.ndarray:
-        """M1 … M4: rear right, front right, rear left, front left."""
-        if not self.armed:
-            return np.zeros(4)
-        roll, pitch, yaw = self.GAIN * (self.rates - self.gyro)
-        mix = np.array((-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw))
-        return np.clip(self.throttle + mix, IDLE, 1.0) if self.throttle > 0.0 else np.full(4, IDLE)
-
-    def pack(self, motors: np.ndarray) -> bytes:
-        m1, m2, m3, m4 = motors
-        return struct.pack("<4f", *((m1, m2, m3, m4) if self.version == "2026.6" else (m2, m3, m4, m1)))
 
 
 def closed(version: str, preset: str = "faithful") -> tuple[Plant, Firmware]:

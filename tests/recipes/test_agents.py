@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dreamer_racing.export.shipped_agent import FILES, agents_in, is_agent
-from dreamer_racing.training.checkpoint import CHECKSUMS
+from dreamer_racing.training.checkpoint import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
 
@@ -79,7 +79,7 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     assert flown.returncode == 0, flown.stderr
     assert all(words in flown.stdout for words in ("gates per episode", "laps  ", "finished  ", "mine on circle"))
     assert {path.name for path in (tmp_path / "fly").iterdir()} == {
-        "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif",
+        "evaluation.json", "top_down.png", "onboard.mp4", "onboard.gif", "flight_trajectory.csv", "flight_onboard.npz",
     }  # fmt: skip
     done = recipe("evaluate", f"checkpoint={agent}", *EVALUATION, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -167,7 +167,7 @@ def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path
     state = torch.load(path, weights_only=True)
     assert state.pop("averaged")
     torch.save(state, path)
-    (checkpoint / CHECKSUMS).unlink()  # else it is a damaged one
+    write_checksums(checkpoint)  # else it is a damaged one
     config, cpu = restoring.trained_config(tmp_path / "run"), torch.device("cpu")
     with pytest.raises(ValueError, match=f"weights=averaged: {checkpoint} holds the trained weights only"):
         restoring.restore_learner(config, checkpoint, cpu, "averaged")

@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Transform
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.pass_share import PassShare
-from dreamer_racing.training.schedule import Clock
+from dreamer_racing.training.schedule import RampClock
 from tests.running_recipes import CONFIG, build, compose, recipe_module
 
 
@@ -92,7 +92,7 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
     assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("asymmetric_ppo", False, True)
-    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, Clock.passes)
+    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.passes)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
@@ -152,9 +152,13 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     recipe_module("composing.checks").check_dreamer(config)
     learners, passes = recipe_module("composing.learners"), PassShare(1)
-    assert learners.scheduled(config, learners.clock_times(config, 100_000, passes))["min_std"] == pytest.approx(0.1)
+    assert learners.scheduled_numbers(config, learners.clock_times(config, 100_000, passes))[
+        "min_std"
+    ] == pytest.approx(0.1)
     passes.best = 0.6
-    assert learners.scheduled(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(0.075)
+    assert learners.scheduled_numbers(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(
+        0.075
+    )
 
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
@@ -163,7 +167,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    begin, end = (learners.scheduled(config, {Clock.run: share}) for share in (0.0, 1.0))
+    begin, end = (learners.scheduled_numbers(config, {RampClock.run: share}) for share in (0.0, 1.0))
     assert begin == {"rates": 1.0, "world_model_rate": 1.0} | {name: getattr(config.loss, name) for name in names}
     assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5)
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
@@ -172,8 +176,40 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
 
 
+def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
+    """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
+    overrides = ["tuned=race", "schedule.wait_for_model=null", "device=cpu", "total_env_steps=100000"]
+    found = []
+    for actor in ("asymmetric_ppo", "reinforce"):
+        resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
+        moved = recipe_module("composing.learners").scheduled_numbers(
+            OmegaConf.to_object(resolved), {RampClock.run: 0.0, RampClock.passes: 0.0}
+        )
+        found.append(set(moved) - {"rates", "world_model_rate"})
+    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
+
+
 def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
         recipe_module("composing.checks").check_dreamer(config)
+
+
+def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
+    """Two places compose a learner: a recipe's `build`, for all to read, and `make_learner`, for what restores one."""
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
+    overrides += ["loss.actor=asymmetric_ppo", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
+    recipe, learners = recipe_module("dreamer_v3"), recipe_module("composing.learners")
+    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides)))
+    run = recipe.build(config, overrides)
+    made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
+    begun = run.learner.state_dict()
+    run.close()
+    assert begun["losses"]["world_model"] and begun["losses"]["actor"], "the losses have weights of their own"
+    for part in ({"agent": begun["agent"]}, begun["losses"]):
+        for home, weights in part.items():
+            other = made["agent"] if home == "agent" else made["losses"][home]
+            assert weights.keys() == other.keys()
+            for name, value in weights.items():
+                assert torch.equal(value, other[name]), f"{home}: {name}"

@@ -13,7 +13,7 @@ from dreamer_racing.modules import SIZES
 from tests.running_recipes import compose, recipe, recipe_module
 
 examination = recipe_module("composing.examination")
-State = examination.State
+Verdict = examination.Verdict
 
 
 def test_it_looks_at_everything_and_says_so(tmp_path: Path) -> None:
@@ -47,9 +47,9 @@ def test_a_missing_and_an_old_package_are_named_with_what_to_install(monkeypatch
     version_of = examination.version_of
     monkeypatch.setattr(examination, "version_of", lambda name: versions.get(name, version_of(name)))
     found = {finding.what: finding for finding in examination.packages()}
-    assert found["torch"].state is State.wrong and found["torch"].remedy.startswith("pip install 'torch<2.14,>=2.11'")
-    assert found["tqdm"][1:3] == (State.wrong, "not installed")
-    assert found["torchrl"].state is State.fine
+    assert found["torch"].state is Verdict.wrong and found["torch"].remedy.startswith("pip install 'torch<2.14,>=2.11'")
+    assert found["tqdm"][1:3] == (Verdict.wrong, "not installed")
+    assert found["torchrl"].state is Verdict.fine
 
 
 def test_a_torch_without_cuda_beside_a_gpu_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +57,7 @@ def test_a_torch_without_cuda_beside_a_gpu_is_wrong(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: answer)
     monkeypatch.setattr(examination, "cuda_of_torch", lambda: None)
     gpu, cuda = examination.accelerator()
-    assert gpu.found.startswith("NVIDIA H200") and cuda.state is State.wrong and "whl" in cuda.remedy
+    assert gpu.found.startswith("NVIDIA H200") and cuda.state is Verdict.wrong and "whl" in cuda.remedy
     monkeypatch.setattr(examination, "cuda_of_torch", lambda: "12.8")
     assert len(list(examination.accelerator())) == 1
 
@@ -71,7 +71,7 @@ def test_the_cuda_of_torch_is_read_without_importing_it() -> None:
 def test_more_threads_than_cores_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "512")
     threads = next(finding for finding in examination.cores() if finding.what == "threads")
-    assert threads.state is State.wrong and "more threads than cores" in threads.remedy
+    assert threads.state is Verdict.wrong and "more threads than cores" in threads.remedy
 
 
 def test_without_opengl_the_ray_caster_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
@@ -97,3 +98,28 @@ def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None
     recipe_module("composing.schema").register()
     start()
     assert seen == [1000.0] and Path(CONFIG).is_dir() and not hydra.core.global_hydra.GlobalHydra().is_initialized()
+
+
+LOADING = """
+import os, signal
+class Interrupted:
+    def find_spec(name, path=None, target=None):
+        if name == "torchrl.collectors":
+            sys.meta_path.remove(Interrupted)
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupted)
+"""
+SETTING_UP = """
+import os, signal
+from dreamer_racing.training import lock
+lock.RunLock.__init__ = lambda *given: os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "status"), [(LOADING, -signal.SIGINT), (SETTING_UP, 130)], ids=["loading", "setting up"]
+)
+def test_ctrl_c_before_anything_is_there_is_no_traceback(before: str, status: int, tmp_path: Path) -> None:
+    done = recipe("ppo", "track=circle", "env.from_pixels=false", "run_dir=run", cwd=tmp_path, before=before)
+    assert done.returncode == status, done.stderr
+    assert done.stderr.strip().splitlines()[-1] == "interrupted" and "Traceback" not in done.stderr

@@ -53,6 +53,14 @@ def test_a_run_starts_with_what_was_given_and_what_its_variant_adds(tmp_path: Pa
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"run_dir={tmp_path / RUN}", *OVERRIDES]
 
 
+@pytest.mark.parametrize("content", [b"{", b"a: b", b"\xff\xfe\x00", b"!!python/name:os.system", b"- 'x=['"])
+def test_damaged_overrides_are_refused_in_words(tmp_path: Path, content: bytes) -> None:
+    run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
+    (run_dir / "overrides.yaml").write_bytes(content)
+    with pytest.raises(ValueError, match=r"overrides\.yaml is damaged|The override x=\[ has no value"):
+        next_command(tmp_path, *CHOSEN)
+
+
 def test_an_unfinished_run_is_resumed_and_a_finished_one_skipped(tmp_path: Path) -> None:
     run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"resume={run_dir}", "total_env_steps=1000000"]

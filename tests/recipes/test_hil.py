@@ -2,87 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
-import select
-import signal
 import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import Self
+from contextlib import ExitStack
 
 import pytest
 
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.chain import describe_inputs, describe_outputs
 from dreamer_racing.hil.links.udp import decode_command
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
-from tests.running_recipes import ROOT, recipe, recipe_module
+from tests.running_recipes import ROOT, free_port, recipe, recipe_module
 
 hil = recipe_module("hil")
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-class Process:
-    """A recipe that runs, and what it has said so far."""
-
-    def __init__(self, name: str, *overrides: str) -> None:
-        command = [sys.executable, str(ROOT / "recipes" / f"{name}.py"), *overrides]
-        self.running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0)
-        self.said = ""
-
-    def listen(self, seconds: float) -> None:
-        stdout = self.running.stdout
-        assert stdout is not None
-        if select.select([stdout], [], [], seconds)[0]:
-            self.said += os.read(stdout.fileno(), 65536).decode()
-
-    def wait_for(self, text: str, other: Process | None = None) -> None:
-        """Wait until it has said that; fail if it takes too long, or the other one ends meanwhile."""
-        deadline = time.monotonic() + 90
-        while text not in self.said:
-            assert time.monotonic() < deadline and self.running.poll() is None, self.said
-            assert other is None or other.running.poll() is None, other.end()
-            self.listen(0.2)
-
-    def end(self) -> str:
-        """Wait for its end; return all that it said."""
-        deadline = time.monotonic() + 60
-        while self.running.poll() is None and time.monotonic() < deadline:
-            self.listen(0.2)
-        while self.running.stdout is not None and (rest := self.running.stdout.read()):
-            self.said += rest.decode()
-        return self.said
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.running.kill()
-        self.running.wait()
-        self.running.stdout.close()
-
-
-@contextmanager
-def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
-    """Start a plant and a loop that flies it by the pilot, and wait until it flies; limits allow for slow machines."""
-    command_port, pose_port = free_port(), free_port()
-    slow = ("hold_after=0.4", "cut_after=0.9", "tick_max=1.0", "overruns_max=1000", "speed_max=40")
-    with Process("plant", "track=circle", f"command_port={command_port}", f"pose_port={pose_port}") as plant:
-        plant.wait_for("listens on")
-        own = ("actor=pilot", "track=circle", "arm=true", f"run_dir={folder}", *(f"limits.{limit}" for limit in slow))
-        with Process("hil", *own, f"link_port={command_port}", f"pose_port={pose_port}") as loop:
-            plant.wait_for("the stand let go", loop)
-            yield plant, loop
+flights = recipe_module("composing.flight")
 
 
 @pytest.mark.parametrize(
@@ -96,6 +29,8 @@ def flight(folder: Path) -> Iterator[tuple[Process, Process]]:
             "operator=timed enables by itself, and link=crsf may be",
         ),
         ({"actor": "pilot", "link_host": "10.0.0.5"}, "link_host=10.0.0.5 is another machine"),
+        ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
+        ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
     ],
@@ -110,13 +45,22 @@ def test_what_does_not_go_together_is_refused(changes, message):
     [
         ({"actor": "pilot"}, "track= is missing: actor=pilot has none of its own"),
         ({"actor": "pilot", "track": "moon"}, "moon"),
-        ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', and track=circle"),
+        ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', .* track=circle"),
         ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
         ({"actor": "nobody"}, "There is no file nobody"),
         ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
         ({"actor": "kidney", "link": "pigeon"}, "pigeon"),
         ({"actor": "kidney", "pose": "stars"}, "stars.*udp, mavlink, ros2"),
-        ({"actor": "kidney", "limits": hil.LimitsConfig(hold_after=0.2)}, "hold_after=0.2: must be below cut_after"),
+        ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),
+        (
+            {"actor": "kidney", "link": "crsf", "betaflight_dump": "x", "arm_channel": 5},
+            "betaflight_dump= is compared with arming by AUX1",
+        ),
+        ({"actor": "kidney", "link": "crsf", "betaflight_dump": "/nowhere"}, "/nowhere"),
+        (
+            {"actor": "kidney", "limits": flights.LimitsConfig(hold_after=0.2)},
+            "hold_after=0.2: must be below cut_after",
+        ),
     ],
 )
 def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, tmp_path):
@@ -144,6 +88,35 @@ def test_a_link_to_a_firmware_asks_for_the_rates_that_it_is_told_to_be_set_to():
     assert [round(rate * 57.29578) for rate in (link.rates.roll, link.rates.pitch, link.rates.yaw)] == [580, 580, 230]
 
 
+def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_path):
+    """Before a port is opened: the device does not exist."""
+    path = tmp_path / "dump.txt"
+    drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
+    config = hil.HilConfig(
+        actor="kidney", arm=True, link="crsf", device="/dev/none", run_dir=str(tmp_path / "run"), **drone,
+        betaflight_dump=str(path),
+    )  # fmt: skip
+    contract = hil.make_flyer(config)[1]
+    kidney = load_track("kidney")
+    lines = [line for line in print_settings(contract, "crsf") if not line.startswith("#")]
+    path.write_text("\n".join(["# Betaflight / STM32F405 (S405) 4.5.1 Jul 28 2024 / 05:09:33 (77d01ba3b)", *lines]))
+    assert [note.partition(":")[0] for note in flights.check_flight(config, contract, kidney)] == ["flight controller"]
+    wrong = path.read_text().replace("yaw_srate = 23", "yaw_srate = 67").replace("set failsafe_delay = 5\n", "")
+    path.write_text(wrong)
+    with ExitStack() as opened, pytest.raises(ValueError, match="2 of .* settings of the flight controller") as refused:
+        hil.prepare(config, opened)
+    said = [" ".join(line.split()[:2]) for line in str(refused.value).splitlines()[1:]]
+    assert sorted(said) == ["differs set", "missing set"] and "found 67" in str(refused.value)
+    config.betaflight_dump = None
+    assert "its settings were not compared" in flights.check_flight(config, contract, kidney)[0]
+
+
+def test_a_limit_that_was_set_may_clip_and_is_said():
+    config = hil.HilConfig(actor="kidney", limits=flights.LimitsConfig(thrust_max=20.0))
+    notes = flights.check_flight(config, hil.make_flyer(config)[1], load_track("kidney"))
+    assert len(notes) == 1 and notes[0].startswith("limits.thrust_max=20 clips the actor, which asks for up to 26.")
+
+
 def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
     drone = {"mass": 0.6, "full_thrust": 9.0, "reference_voltage": 15.0, "voltage": 15.0}  # 11.25 V lift 5.1 N
     config = hil.HilConfig(actor="kidney", link="crsf", device="/dev/null", **drone)
@@ -153,7 +126,7 @@ def test_what_is_believed_of_a_battery_must_be_what_can_be_reckoned_with():
     config.voltage_tolerance = 0.15
     assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0
     config.link, config.voltage_tolerance = "sbus", 0.25  # hears nothing
-    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and hil.battery_config(config) is None
+    assert hil.link_config(config, contract, 25.0).thrust.voltage == 15.0 and flights.battery_config(config) is None
 
 
 @pytest.mark.parametrize(
@@ -252,27 +225,3 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     assert "replayed: 5 ticks, every one as it was written" in said and "taken as it is now" in said
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
     assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
-
-
-def test_the_loop_cuts_when_the_plant_is_killed(tmp_path):
-    with flight(tmp_path) as (plant, loop):
-        plant.running.kill()
-        said = loop.end()
-    assert loop.running.returncode == 0, said  # laps= was not asked for
-    assert "ended: cut: the newest pose is" in said
-    flown = Flight(tmp_path)
-    assert flown.whole and flown.ticks[-1]["out"]["state"] == "cut"
-    assert json.loads((tmp_path / "statistics.json").read_text())["loop"]["ticks"] == len(flown.ticks)
-
-
-def test_the_plant_cuts_when_the_loop_is_killed_and_the_flight_is_on_disk(tmp_path):
-    with flight(tmp_path) as (plant, loop):
-        time.sleep(0.5)
-        loop.running.kill()
-        loop.running.wait()
-        plant.wait_for("nothing heard for 0.25 s: motors cut")
-        plant.running.send_signal(signal.SIGTERM)
-        plant.end()
-    assert plant.running.returncode == 0
-    flown = Flight(tmp_path)
-    assert not flown.whole and flown.ticks[-1]["out"]["command"][0] is True

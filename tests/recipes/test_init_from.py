@@ -50,6 +50,12 @@ def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.Cap
         one.close()
 
 
+def test_a_run_with_a_damaged_configuration_is_refused_by_name(trained: Path) -> None:
+    (trained / "config.yaml").write_text("env: {")
+    with pytest.raises(ValueError, match=r"first/config\.yaml is damaged"):
+        make(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model.average_rate=0.1")
+
+
 def test_a_resumed_run_goes_on_with_its_own_weights(trained: Path) -> None:
     again = make(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "model.average_rate=0.1",
                  "init_from=nowhere")  # fmt: skip

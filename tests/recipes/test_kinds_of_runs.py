@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,8 +18,9 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.directory import latest_checkpoint
-from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, compose, recipe, recipe_module, rows
+from dreamer_racing.training.checkpoint import newest_sound
+from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
+from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, build, compose, recipe, recipe_module, rows
 
 SLOW_DISK = """
 import runpy, sys, time
@@ -94,6 +96,84 @@ def test_a_run_that_cannot_be_saved_at_its_end_says_so(tmp_path: Path) -> None:
     done = recipe("dreamer_v3", *TINY, "run_dir=run", cwd=tmp_path, before=FULL_DISK.format(times=99))
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "could not be written" in done.stderr and "There is no checkpoint yet." in done.stderr
+
+
+FULL_FROM_412 = """
+import resource, signal
+from dreamer_racing.training import run
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+take_in = run.Run.take_in
+def filling(self, rollout):
+    steps = self.counters["env_steps"] + rollout.numel()
+    full = 412 <= steps < {until}
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100 if full else resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    return take_in(self, rollout)
+run.Run.take_in = filling
+"""
+"""No file can grow beyond 100 bytes from 412 env_steps on, until there is room again."""
+WITH_FILMS = [*SMALL, "prefill=200", "evaluation.video_steps=20", "logger=tensorboard"]
+
+
+@pytest.mark.parametrize("until", [700, 10_000], ids=["for a while", "to the end"])
+def test_a_run_outlives_a_disk_that_takes_nothing_at_all(until: int, tmp_path: Path) -> None:
+    """Rows, evaluations, plots, films, TensorBoard, the best and checkpoints; what can be made up for is."""
+    before = FULL_FROM_412.format(until=until)
+    overrides = ["evaluation.every=200", "checkpoint.every=300", "logger.every=100"]
+    done = recipe("dreamer_v3", *WITH_FILMS, *overrides, "run_dir=run", cwd=tmp_path, before=before)
+    run_dir = tmp_path / "run"
+    assert "Traceback" not in done.stderr, done.stderr
+    for what in ("metrics", "checkpoint", "evaluations, plots and videos"):
+        assert f"NOT SAVED: {what}: " in done.stdout, done.stdout
+    if until == 10_000:
+        assert done.returncode == 1 and "error: " in done.stderr, done.stderr
+        assert "last good checkpoint" in done.stderr and not (run_dir / "finished.json").exists()
+        assert env_steps_of(newest_sound(run_dir)) < 412
+        done = recipe("dreamer_v3", "resume=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = rows(run_dir)
+    steps = [int(row["env_steps"]) for row in table]
+    assert {step // 100 for step in steps} >= {4, 5, 6, 7, 8} and steps == sorted(set(steps)), "no row is missing"
+    assert [row["env_steps"] for row in table if row["evaluation/return_mean"]] == ["224", "416", "608", "800"]
+    assert env_steps_of(newest_sound(run_dir)) == 800 and (run_dir / "finished.json").exists()
+
+
+WITHOUT_A_JOURNAL = """
+from dreamer_racing.training.checkpoint import RunCheckpoints
+make = RunCheckpoints.__init__
+def older(self, run_dir, components, *rest, **named):
+    make(self, run_dir, {name: part for name, part in components.items() if name != "journal"}, *rest, **named)
+RunCheckpoints.__init__ = older
+"""
+
+
+def test_a_checkpoint_of_before_there_were_journals_is_resumed_and_says_so(tmp_path: Path) -> None:
+    options = ["env.from_pixels=false", "logger.every=64"]
+    done = recipe("dreamer_v3", *TINY, *options, "run_dir=run", cwd=tmp_path, before=WITHOUT_A_JOURNAL)
+    assert done.returncode == 0, done.stderr
+    before = [row["env_steps"] for row in rows(tmp_path / "run")]
+    done = recipe("dreamer_v3", "resume=run", "total_env_steps=280", cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.count("of an older version, without averages") == 1, done.stderr
+    assert [row["env_steps"] for row in rows(tmp_path / "run")] == [*before, "256", "288"]
+    done = recipe("dreamer_v3", "resume=run", "total_env_steps=300", cwd=tmp_path)
+    assert done.returncode == 0 and "older version" not in done.stdout, done.stderr
+
+
+def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three replays are there at the peak, with checkpoint.keep=2; what a run's own checkpoints take is free for it."""
+    building = recipe_module("composing.building")
+    config = compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2")
+    free = SimpleNamespace(free=3000)
+    monkeypatch.setattr(building.shutil, "disk_usage", lambda path: free)
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    free.free = 2999
+    assert "MAY NOT BE ENOUGH, lower checkpoint.keep= or replay.capacity=" in building.disk_needed(config, 1000)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "one").write_bytes(b"x")
+    assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
+    build(*TINY, f"run_dir={tmp_path / 'run'}")
+    assert "0.0 GB free: MAY NOT BE ENOUGH" in capsys.readouterr().out
 
 
 def test_checkpoints_by_the_clock(tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ def plot(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def recipe() -> ModuleType:
-    """The recipe as a module."""
-    return recipe_module("plot")
+    """What the recipe draws with."""
+    return recipe_module("composing.drawing")
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.evaluation.lesions import LESIONS
+from dreamer_racing.training.checkpoint import newest_sound
+from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from tests.running_recipes import CONFIG, SMALL, build, recipe, recipe_module, rows
 
 pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests share
@@ -24,6 +27,12 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "device: cpu (device=auto)" in done.stdout and "renderer: " in done.stdout and "GB when full" in done.stdout
     return directory
+
+
+def everything_in(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """When each file of a folder was written, and what it holds."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
 
 
 def test_a_run_leaves_what_it_promises(run_dir: Path) -> None:
@@ -60,6 +69,26 @@ def test_a_kill_behind_the_last_checkpoint_costs_nothing_and_adds_nothing(run_di
     assert done.returncode == 0, done.stderr
     assert (killed / "finished.json").exists()
     assert (killed / "metrics.csv").read_text() == before
+
+
+def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
+    before = everything_in(run_dir)
+    env_steps = env_steps_of(latest_checkpoint(run_dir))
+    done = recipe("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
+    assert done.returncode == 0, done.stderr
+    assert f"complete already, at {env_steps:,} env_steps" in done.stdout and "go on:" in done.stdout
+    assert everything_in(run_dir) == before
+
+
+def test_a_finished_run_whose_newest_checkpoint_is_damaged_goes_on(run_dir: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(run_dir, tmp_path / "run")
+    newest = latest_checkpoint(copied)
+    env_steps = env_steps_of(newest)
+    next(newest.rglob("*-learner/*.pt")).write_bytes(b"")
+    done = recipe("dreamer_v3", "resume=run", f"total_env_steps={env_steps}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "complete already" not in done.stdout and done.stdout.count("is damaged") == 1
+    assert newest_sound(copied) == newest and RunDirectory(copied).finished_env_steps() == env_steps
 
 
 def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
@@ -113,6 +142,55 @@ def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFix
         (holding / "evaluation.json").write_text("{}")
         assert fresh(tmp_path / "evaluation", "evaluation.json").name == f"evaluation_{number + 1}"
         assert f"evaluation_{number + 1}" in capsys.readouterr().out
+    (tmp_path / "evaluation_3" / "plots").mkdir()  # of one that was killed
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    (tmp_path / "evaluation" / "evaluation.json").unlink()
+    (tmp_path / "evaluation" / "plots").mkdir()
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    assert "holds files, but no evaluation.json" in capsys.readouterr().out
+
+
+KILLED_BEHIND_THE_FIRST_POLICY = """
+import os, signal
+from dreamer_racing.figures.report import EvaluationReport
+write = EvaluationReport.write
+EvaluationReport.write = lambda *given: (write(*given), os.kill(os.getpid(), signal.{signal}))
+"""
+
+
+def test_an_evaluation_that_was_killed_is_not_mixed_into_the_next(run_dir: Path, tmp_path: Path) -> None:
+    options = [f"checkpoint='{run_dir}'", "episodes=1", "num_envs=1", "video_steps=5", "run_dir=evaluation"]
+    for name, status in (("SIGINT", 130), ("SIGKILL", -9)):
+        before = KILLED_BEHIND_THE_FIRST_POLICY.format(signal=name)
+        done = recipe("evaluate", *options, cwd=tmp_path, before=before)
+        assert done.returncode == status and "Traceback" not in done.stderr, done.stderr
+        assert ("interrupted" in done.stderr) == (name == "SIGINT")
+    left = {folder.name for folder in tmp_path.iterdir()}
+    assert left == {"evaluation", "evaluation_2"} and not list(tmp_path.rglob("evaluation.json"))
+    before = everything_in(tmp_path)
+    done = recipe("evaluate", *options, cwd=tmp_path)
+    assert done.returncode == 0 and "writing to evaluation_3" in done.stdout, done.stderr
+    assert (tmp_path / "evaluation_3" / "evaluation.json").exists()
+    assert {path: file for path, file in everything_in(tmp_path).items() if "evaluation_3" not in path} == before
+
+
+FULL = """
+import resource, signal
+from dreamer_racing.figures.report import EvaluationReport
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+write = EvaluationReport.write
+def full(*given):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+    write(*given)
+EvaluationReport.write = full
+"""
+
+
+def test_an_evaluation_on_a_full_disk_ends_in_a_line(run_dir: Path, tmp_path: Path) -> None:
+    options = [f"checkpoint='{run_dir}'", "episodes=1", "num_envs=1", "video_steps=5", "run_dir=evaluation"]
+    done = recipe("evaluate", *options, cwd=tmp_path, before=FULL)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "error: [Errno 27] File too large" in done.stderr and "no whole result" in done.stderr
 
 
 @pytest.mark.slow
@@ -202,6 +280,33 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     assert composed("tuned=race").loss.actor == "asymmetric_ppo"
 
 
+def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied = RunDirectory(shutil.copytree(run_dir, tmp_path / "run"))
+    places = (copied.config, copied.best.config, copied.overrides)
+    before, left = {place: place.read_text() for place in places}, [0]
+    saved = recipe_module("composing.launching").saved_config("dreamer_v3", copied.path)
+    saved.seed = 7
+    config = OmegaConf.to_object(saved)
+    write, sync = recipe_module("composing.building").write_configuration, os.fsync
+
+    def killed(descriptor: int) -> None:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        sync(descriptor)
+
+    for written in range(len(places)):
+        left[0] = written
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", killed)
+            with pytest.raises(KeyboardInterrupt):
+                write(copied, config, ["seed=7"], 800)
+        for index, place in enumerate(places):
+            assert (place.read_text() == before[place]) == (index >= written), place
+
+
 def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
     resumed = recipe_module("composing.launching").resumed_config
     with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first run\."):
@@ -214,7 +319,7 @@ def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) ->
         assert resumed("dreamer_v3", str(best), [])[0].track == "circle"
     copied = shutil.copytree(run_dir, tmp_path / "run")
     whole = (copied / "config.yaml").read_text()
-    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3"):
+    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3", ""):
         (copied / "config.yaml").write_text(damage)
         with pytest.raises(ValueError, match=r"config\.yaml is damaged|does not fit") as refusal:
             resumed("dreamer_v3", str(copied), [])

@@ -16,7 +16,7 @@ from tests.running_recipes import build, compose, recipe, recipe_module
         (["total_env_steps=abc"], ["total_env_steps", "abc"]),
         (["track=monza"], ["monza", "kidney"]),
         (["run_dir=/dev/null/run"], ["/dev/null/run"]),
-        (["env.preset=hard"], ["hard", "easy", "faithful"]),
+        (["env.preset=esay"], ["env.preset=esay", "did you mean easy?", "faithful"]),
         (["env.renderer=directx"], ["directx", "egl"]),
         (["device=cuda:7"], ["cuda:7", "cpu"]),
         (["env.device=gpu"], ["env.device=gpu", "cpu", "cuda"]),
@@ -58,7 +58,9 @@ REFUSED = [
     (["env=dmc", "env.from_pixels=false", "loss=privileged"], ["loss.world_model=privileged", "reconstruction"]),
     (["env=dmc", "task=walker_fly"], ["walker_fly", "walker_walk"]),
     (["device=quantum"], ["device=quantum", "cpu"]),
+    (["device=gpu"], ["device=gpu: there are auto, cpu, cuda and cuda:1 ... (did you mean cuda?)."]),
     (["env.control_rate=5"], ["env.control_rate=5", "at least 10"]),
+    (["env.control_rate=inf"], ["env.control_rate=inf Hz: must be a finite number"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
@@ -106,6 +108,18 @@ def test_what_cannot_work_is_refused_before_it_starts(
     assert message.startswith("error: ") and "\n" not in message
     assert all(word in message for word in words), message
     assert not list((tmp_path / "run").glob("*.yaml")), "a run that was refused left its configuration"
+
+
+def test_more_minibatches_than_records_are_refused() -> None:
+    ppo, checks = recipe_module("ppo"), recipe_module("composing.checks")
+
+    def check(minibatches: int) -> None:
+        settings = ["env.num_envs=2", "rollout_steps=4", f"ppo.minibatches={minibatches}"]
+        checks.check_ppo(OmegaConf.to_object(ppo.resolve(compose("ppo", *settings))))
+
+    check(8)
+    with pytest.raises(ValueError, match=r"ppo.minibatches=9 are more than the 8 records of a rollout"):
+        check(9)
 
 
 @pytest.mark.parametrize(

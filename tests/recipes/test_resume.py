@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
 import shutil
-import subprocess
-import sys
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ import torch
 
 from dreamer_racing.training.checkpoint import CHECKSUMS
 from dreamer_racing.training.directory import latest_checkpoint
-from tests.running_recipes import recipe_module
+from tests.running_recipes import recipe
 
-ROOT = Path(__file__).parents[2]
 SETTINGS = [
     "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4", "env.num_envs=4",
     "env.episode_steps=40", "env.start_on_line=0.5", "env.control_rate=25", "prefill=64", "replay.capacity=700",
@@ -27,28 +25,31 @@ SETTINGS = [
     "curriculum.threshold=-100", "curriculum.cooldown=3",
 ]  # fmt: skip
 
+RACES = ("env.episode_steps", "env.start_on_line", "env.control_rate", "curriculum")
+"""Settings of those that are for races."""
 
 BASELINE = [
     "env.from_pixels=false", "network.units=16", "env.num_envs=4", "env.episode_steps=40", "evaluation.every=500",
     "evaluation.episodes=1", "checkpoint.every=1024", "total_env_steps=2048", "logger.every=400", "logger=csv",
     "device=cpu", "curriculum.threshold=-100", "curriculum.cooldown=3",
 ]  # fmt: skip
-
-
 SMALL = {
     "ppo": ["rollout_steps=16", "ppo.epochs=2"],
     "sac": ["prefill=64", "replay.capacity=1200", "sac.batch_size=16"],
 }
-"""What makes a baseline's run short, with 200 updates and more behind its first checkpoint."""
+"""What makes a baseline's run short."""
 
 
-def train(directory: Path, *overrides: str, recipe: str = "dreamer_v3") -> None:
-    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+def train(directory: Path, *overrides: str, name: str = "dreamer_v3", status: int = 0, before: str = "") -> str:
+    """Run a recipe to its end, or after some lines of Python to another exit status; return what it said."""
+    done = recipe(name, *overrides, cwd=directory, timeout=300, before=before)
+    assert done.returncode == status and "Traceback" not in done.stderr, done.stderr[-2000:]
+    return done.stdout
 
 
 def parts(run_dir: Path) -> dict[str, Any]:
@@ -67,11 +68,14 @@ def learner_updates(checkpoint: dict[str, Any]) -> int:
     return next(value["updates"] for name, value in checkpoint.items() if "learner" in name)
 
 
-def evaluations(run_dir: Path) -> list[dict[str, str]]:
-    """What the evaluations of a run came to."""
-    with (run_dir / "metrics.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["evaluation/return_mean"]]
-    return [{name: row[name] for name in row if name.startswith("evaluation")} for row in rows]
+def metrics(run_dir: Path) -> str:
+    """The text of metrics.csv without the columns that a clock writes."""
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        header, *rows = list(csv.reader(file))
+    kept = [column for column, name in enumerate(header) if not name.startswith(("time/", "rate/", "wall_clock"))]
+    text = io.StringIO()
+    csv.writer(text).writerows([[row[column] for column in kept] for row in (header, *rows)])
+    return text.getvalue()
 
 
 def assert_same(first: Any, second: Any, where: str) -> None:
@@ -106,9 +110,7 @@ RACE = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "tuned", [["tuned=none"], RACE, [*RACE, "loss.actor=ppo"]], ids=["none", "race", "race in imagination"]
-)
+@pytest.mark.parametrize("tuned", [["tuned=none"], [*RACE, "loss.actor=ppo"]], ids=["none", "race in imagination"])
 def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: Path) -> None:
     train(tmp_path, *SETTINGS, *tuned, "track=circle", "env=faithful", "run_dir=whole")
     kill(tmp_path / "whole", tmp_path / "killed")
@@ -118,19 +120,90 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     assert learner_updates(whole) - learner_updates(before) >= 200
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {
-        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes", "random_state"
+        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes", "journal",
+        "random_state",
     }  # fmt: skip
     assert_same(whole, resumed, "checkpoint")
+    assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", [name for name in recipe_module("composing.schema").RECIPES if name != "dreamer_v3"])
-def test_a_resumed_baseline_equals_an_uninterrupted_one(recipe: str, tmp_path: Path) -> None:
-    train(tmp_path, *BASELINE, *SMALL[recipe], "track=circle", "env=faithful", "run_dir=whole", recipe=recipe)
+def test_a_resumed_run_of_the_control_suite_is_evaluated_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Also its second evaluation: no world remembers how many there were before."""
+    settings = [setting for setting in SETTINGS if not setting.startswith(RACES)]
+    suite = ["tuned=none", "env=dmc", "task=cartpole_swingup", "env.from_pixels=false", "run_dir=whole"]
+    train(tmp_path, *settings, *suite)
     kill(tmp_path / "whole", tmp_path / "killed")
-    before = parts(tmp_path / "killed")
-    train(tmp_path, "resume=killed", recipe=recipe)
-    whole, resumed = parts(tmp_path / "whole"), parts(tmp_path / "killed")
-    assert learner_updates(whole) - learner_updates(before) >= 200
-    assert_same(whole, resumed, "checkpoint")
-    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "killed")
+    train(tmp_path, "resume=killed")
+    assert_same(parts(tmp_path / "whole"), parts(tmp_path / "killed"), "checkpoint")
+    assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")
+
+
+SAVED_BY_THE_CLOCK = """
+import itertools, os, signal
+from dreamer_racing.training import run
+rollouts = itertools.count()
+def due(self):
+    rollout = next(rollouts)
+    if rollout == {killed}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return rollout == {saved}
+run.Interval.due = due
+"""
+"""Saves behind a rollout as `checkpoint.minutes` does, and is killed behind a later one."""
+TERMINATED = """
+import os, signal
+from dreamer_racing.training import run
+learn = run.{kind}.learn
+def stopped(self, rollout, stop):
+    if rollout is None or self.counters["env_steps"] != {env_steps}:
+        return learn(self, rollout, stop)
+    draw, drawn = self.replay.sample, []
+    def sample():
+        drawn.append(0)
+        if len(drawn) == {updates}:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return draw()
+    self.replay.sample = sample
+    return learn(self, rollout, stop)
+run.{kind}.learn = stopped
+"""
+"""Gets SIGTERM during one of the updates that a rollout owes."""
+COLLECTED = """
+import os, signal
+from dreamer_racing.training import run
+take_in = run.Run.take_in
+def stopped(self, rollout):
+    episodes = take_in(self, rollout)
+    if self.counters["env_steps"] == {env_steps}:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return episodes
+run.Run.take_in = stopped
+"""
+"""Gets SIGTERM once a rollout is collected, before anything is learned from it."""
+STOPS = {
+    "dreamer_v3": (
+        [*SETTINGS, *RACE, "total_env_steps=900"],
+        [TERMINATED.format(kind="ReplayRun", env_steps=800, updates=3)],  # owes updates, a row and a checkpoint
+    ),
+    "sac": ([*BASELINE, *SMALL["sac"]], [TERMINATED.format(kind="ReplayRun", env_steps=1024, updates=1)]),
+    "ppo": ([*BASELINE, *SMALL["ppo"]], [COLLECTED.format(env_steps=1024), COLLECTED.format(env_steps=1088)]),
+}
+"""By recipe: settings, and at what it is terminated after it was killed."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STOPS)
+def test_a_run_writes_the_same_rows_wherever_it_is_stopped(name: str, tmp_path: Path) -> None:
+    settings, stops = STOPS[name]
+    settings = [*settings, "track=circle", "env=faithful"]
+    train(tmp_path, *settings, "run_dir=whole", name=name)
+    per_rollout = {"dreamer_v3": 32, "sac": 4, "ppo": 64}[name]
+    by_the_clock = SAVED_BY_THE_CLOCK.format(saved=448 // per_rollout, killed=704 // per_rollout)
+    train(tmp_path, *settings, "run_dir=other", name=name, status=-signal.SIGKILL, before=by_the_clock)
+    assert latest_checkpoint(tmp_path / "other").name.endswith("448") and "512" in metrics(tmp_path / "other")
+    for stop in stops:
+        train(tmp_path, "resume=other", name=name, status=128 + signal.SIGTERM, before=stop)
+    train(tmp_path, "resume=other", name=name)
+    assert metrics(tmp_path / "whole") == metrics(tmp_path / "other")
+    assert_same(parts(tmp_path / "whole"), parts(tmp_path / "other"), "checkpoint")

@@ -32,6 +32,10 @@ def test_groups_are_the_recipes_own() -> None:
     assert usage.groups("fly") == {}
 
 
+def test_the_options_of_all_training_recipes_are_in_the_help_of_each() -> None:
+    assert set(usage.TRAINING) == set(recipe_module("composing.schema").RECIPES)
+
+
 @pytest.mark.parametrize("flag", ["--help", "-h"])
 def test_help_loads_no_torch(flag: str, tmp_path: Path) -> None:
     done = recipe("export", flag, cwd=tmp_path, before="import sys; sys.modules['torch'] = None")

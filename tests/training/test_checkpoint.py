@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import os
@@ -9,6 +10,7 @@ import random
 import shutil
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -27,6 +29,7 @@ from dreamer_racing.training.checkpoint import (
     RunCheckpointError,
     RunCheckpoints,
     load_components,
+    load_state,
     newest_sound,
 )
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
@@ -194,6 +197,24 @@ def test_a_part_that_older_checkpoints_lack_is_left_as_it_is(saved):
     assert parts["lag"] == {"waits": 1}
 
 
+@pytest.mark.parametrize("function", ["replace", "rmtree"])
+def test_what_cannot_be_removed_does_not_end_a_run_that_is_saved(function, saved, monkeypatch, caplog):
+    run = Run(saved)
+    run.checkpoints.load(saved / "checkpoints" / "checkpoint-000000000020")
+    run.counters["env_steps"] = 25
+
+    def busy(path, *arguments, **options):
+        if "30" in str(path):  # which belongs to the future of this run
+            raise OSError(16, "Device or resource busy", str(path))
+        return original(path, *arguments, **options)
+
+    module = os if function == "replace" else shutil
+    original = getattr(module, function)
+    monkeypatch.setattr(module, function, busy)
+    assert run.save().name.endswith("25")
+    assert "could not be removed" in caplog.text and "resource busy" in caplog.text
+
+
 class Unreadable:
     def state_dict(self) -> dict:
         return {"path": Path("x")}  # loads only with arbitrary code execution allowed
@@ -315,7 +336,14 @@ def test_kill_at_each_step_of_publishing(saved, processes, function, call):
 def test_a_checkpoint_that_stepped_aside_comes_back(saved):
     newest = saved / "checkpoints" / "checkpoint-000000000030"
     newest.rename(newest.with_name(f".{newest.name}.replaced"))  # killed between the two renames of a replacement
-    assert latest_checkpoint(saved).name.endswith("20")
+    aside = latest_checkpoint(saved)
+    assert aside.name == f".{newest.name}.replaced" and newest_sound(saved) == aside
+    assert load_components(saved, {"counters": {}})["env_steps"] == 30
+    shutil.copytree(aside, newest)
+    assert latest_checkpoint(saved) == newest  # the other one has come
+    shutil.rmtree(newest)
+    shutil.rmtree(newest.with_name("checkpoint-000000000020"))
+    assert latest_checkpoint(saved) == aside  # as with checkpoint.keep=1
     Run(saved)
     assert latest_checkpoint(saved) == newest
 
@@ -334,6 +362,29 @@ def test_first_signal_sets_the_flag_second_raises(number):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_the_first_signal_is_answered_at_once(monkeypatch):
+    """Within 0.2 s, the best of some: what answers is the handler, not the loop that learns."""
+    reader, writer = os.pipe()
+    monkeypatch.setattr(sys, "__stderr__", os.fdopen(writer, "w"))
+    sent, answered = [], []
+
+    def send() -> None:
+        sent.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    for _ in range(5):
+        with GracefulExit("saving") as stop:
+            sender = threading.Timer(0.05, send)
+            sender.start()
+            while not stop.requested:  # as an update, which polls nothing
+                sum(range(1000))
+            assert os.read(reader, 100) == b"\nSIGINT: saving\n"
+            answered.append(time.monotonic())
+            sender.join()
+    seconds = [after - before for before, after in zip(sent, answered, strict=True)]
+    assert min(seconds) < 0.2
 
 
 def flip(file: Path) -> None:
@@ -384,15 +435,84 @@ def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
     assert load_components(newest, {"counters": {}})["env_steps"] == 30  # what is read of it is sound
 
 
-def test_checkpoints_of_before_there_were_checksums_are_read(saved):
+def forget_checksums(checkpoint: Path) -> None:
+    """Make a checkpoint as those before there were checksums."""
+    (checkpoint / CHECKSUMS).unlink()
+    manifest = json.loads((checkpoint / "manifest.json").read_text())
+    del manifest["metadata"][checkpoint_module.HAS_CHECKSUMS]
+    (checkpoint / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_checkpoints_of_before_there_were_checksums_are_read_with_a_warning(saved, caplog):
     newest = saved / "checkpoints/checkpoint-000000000030"
-    (newest / CHECKSUMS).unlink()
-    assert Run(saved).checkpoints.load()["env_steps"] == 30
+    forget_checksums(newest)
+    with caplog.at_level("WARNING"):
+        assert Run(saved).checkpoints.load()["env_steps"] == 30
+        assert newest_sound(saved) == newest
+    assert caplog.text.count(f"{newest} was saved by a version without checksums") == 1
     file = next(newest.rglob("*-learner/*.pt"))
     file.write_bytes(b"not a state" * 100)
     with pytest.raises(RunCheckpointError, match="could not be restored") as error:
         Run(saved).checkpoints.load()
     assert "weights_only" not in str(error.value)
+
+
+def test_every_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken(saved, caplog):
+    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
+    for name in files_of(newest):
+        caplog.clear()
+        whole = (newest / name).read_bytes()
+        (newest / name).unlink()
+        with caplog.at_level("WARNING"):
+            assert newest_sound(saved) == before, name
+        assert str(newest) in caplog.text and before.name in caplog.text and "is lost" in caplog.text, name
+        (newest / name).write_bytes(whole)
+    assert newest_sound(saved) == newest
+
+
+@pytest.mark.parametrize("name", ["manifest.json", CHECKSUMS])
+@pytest.mark.parametrize("content", ["[]", "null", "3", '"text"', "{}", "", "[" * 9], ids=repr)
+def test_json_of_another_kind_is_damage(saved, name, content, caplog):
+    newest, before = saved / "checkpoints/checkpoint-000000000030", saved / "checkpoints/checkpoint-000000000020"
+    whole = (newest / name).read_bytes()
+    (newest / name).write_text(content)
+    with caplog.at_level("WARNING"):
+        assert newest_sound(saved) == before
+    assert str(newest) in caplog.text and "is lost" in caplog.text
+    (newest / name).write_bytes(whole)
+    (before / name).write_text(content)  # the older one: neither reading nor saving minds
+    run = Run(saved)
+    assert run.checkpoints.load()["env_steps"] == 30
+    run.advance()
+    run.save()
+    assert newest_sound(saved).name.endswith("40")
+
+
+class Payload:
+    """What a pickle that runs code looks like."""
+
+    def __init__(self, witness: Path) -> None:
+        self._witness = witness
+
+    def __reduce__(self) -> tuple:
+        return (os.system, (f"touch {self._witness}",))
+
+
+@pytest.mark.parametrize("checksums", ["of the lie", "of no version"])
+def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved, checksums):
+    newest, witness = saved / "checkpoints/checkpoint-000000000030", saved / "witness"
+    file = next(newest.rglob("*-learner/*.pt"))
+    torch.save({"weight": Payload(witness)}, file)
+    if checksums == "of the lie":  # whoever can write a file can write its sum
+        checkpoint_module.write_checksums(newest)
+    else:
+        forget_checksums(newest)
+    for read in (Run(saved).checkpoints.load, lambda: load_state(newest, "learner")):
+        with pytest.raises(RunCheckpointError, match="could not be restored. A file of it holds what is no state"):
+            read()
+    assert not witness.exists()
+    torch.load(file, weights_only=False)  # as nothing of ours does
+    assert witness.exists(), "the state was harmless: this test has tested nothing"
 
 
 def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training import directory
+from dreamer_racing.training.directory import RunDirectory, replace_text
 
 
 def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path: Path) -> None:
@@ -14,6 +15,15 @@ def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path
     assert RunDirectory.of(run.checkpoints / "checkpoint-000000000100") == run
     assert RunDirectory.of(run.best.checkpoints / "checkpoint-000000000100") == run.best
     assert run.best.config == tmp_path / "best" / "config.yaml"
+
+
+def test_the_best_of_a_run_knows_the_run_and_a_run_that_is_called_best_is_its_own(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    run.best.path.mkdir(parents=True)
+    assert run.best.run == run.best  # no run is around it
+    run.config.touch()
+    assert run.best.run == run == run.run
+    assert run.evaluation_file == tmp_path / "run" / "evaluation" / "evaluation.json"
 
 
 def test_every_start_is_kept(tmp_path: Path) -> None:
@@ -46,3 +56,20 @@ def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytes
         file.write("{damaged}\n")
     run.note_start(8, [], None)
     assert [start["env_steps"] for start in run.read_starts()] == [0, 8] and "is damaged" in caplog.text
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_file_is_as_it_was_or_as_it_is_to_be(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "config.yaml"
+    replace_text(path, "old")
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(directory.os, call, killed)
+        with pytest.raises(KeyboardInterrupt):
+            replace_text(path, "new")
+    assert path.read_text() == "old"
+    replace_text(path, "new")
+    assert path.read_text() == "new" and [file.name for file in tmp_path.iterdir()] == ["config.yaml"]

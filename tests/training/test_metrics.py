@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import threading
 from enum import IntEnum
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from dreamer_racing.training import metrics as metrics_module
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.loggers import make_loggers
-from dreamer_racing.training.metrics import MetricsLog
+from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 
 
 class Cause(IntEnum):
@@ -43,6 +45,20 @@ def test_averages_between_writes(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("cell", ["1O", "", "nan", "-3", "2.5", "9" * 5000, "٣"])
+def test_a_damaged_number_of_env_steps_costs_its_row_alone_and_is_said(tmp_path, caplog, cell):
+    with MetricsLog(tmp_path) as log:
+        for step in (10, 20, 30):
+            log.push({"loss": float(step)})
+            log.write(step)
+    path = tmp_path / "metrics.csv"
+    path.write_text(path.read_text(encoding="utf-8").replace("20,20", f"{cell},20"), encoding="utf-8")
+    with caplog.at_level("WARNING"), MetricsLog(tmp_path, resume_env_steps=30) as log:
+        assert log.holds("loss", 30)
+    assert f"{path} is damaged: " in caplog.text and "1 of 3 rows are left out" in caplog.text
+    assert [row["env_steps"] for row in read(tmp_path)] == ["10", "30"]
+
+
 def test_pushed_tensors_may_be_overwritten(tmp_path):
     log = MetricsLog(tmp_path)
     static = torch.tensor(1.0)  # as a CUDA graph's outputs are
@@ -55,7 +71,8 @@ def test_pushed_tensors_may_be_overwritten(tmp_path):
 def test_graphs_are_not_kept(tmp_path):
     log = MetricsLog(tmp_path)
     log.push({"loss": torch.ones(3, requires_grad=True).sum()})
-    assert not any(total.requires_grad for total, _ in log._mean._tensors.values())
+    averages = log._pending.averages.state_dict()["tensors"]
+    assert averages and not any(total.requires_grad for _, total, _ in averages)
 
 
 def test_pushing_does_not_read_tensors_and_a_write_reads_once(tmp_path, monkeypatch):
@@ -91,10 +108,64 @@ def test_resuming_drops_later_rows_and_a_torn_one(tmp_path):
         file.write("1,2")  # killed while writing "1234567,2,3"
     log = MetricsLog(tmp_path, resume_env_steps=25)
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20"]
-    assert log.holds("a", 20) and not log.holds("a", 25) and not log.holds("c", 20)
     log.push({"b": 5.0, "c": 6.0})
     log.write(35)
     assert read(tmp_path)[-1] == {"env_steps": "35", "a": "", "b": "5", "c": "6"}
+
+
+def test_a_resumed_log_goes_on_in_the_middle_of_a_row(tmp_path):
+    """Averages of tensors and of floats, and the order of columns, with rows of a killed process in the file."""
+
+    def write(log: MetricsLog, env_steps: int) -> None:
+        for value in (0.1, 0.7, 0.2):
+            log.push({"loss": torch.tensor(value * env_steps), "norm": torch.tensor([1.0, value])})
+            log.push({f"late/{env_steps // 20}": value, "return": value / 3})
+            if env_steps == 20 and value == 0.7:
+                torch.save(log._pending.state_dict(), tmp_path / "pending.pt")
+        log.write(env_steps)
+
+    log = MetricsLog(tmp_path)
+    for env_steps in (10, 20, 40):
+        write(log, env_steps)
+    whole = (tmp_path / "metrics.csv").read_text()
+    pending = PendingMetrics()
+    pending.load_state_dict(torch.load(tmp_path / "pending.pt", weights_only=True))
+    assert pending.written == 10
+    log = MetricsLog(tmp_path, resume_env_steps=pending.written, pending=pending)
+    assert (tmp_path / "metrics.csv").read_text().splitlines()[0] == "env_steps,late/0,return,loss,norm"
+    log.push({"loss": torch.tensor(0.2 * 20), "norm": torch.tensor([1.0, 0.2])})
+    log.push({"late/1": 0.2, "return": 0.2 / 3})
+    log.write(20)
+    write(log, 40)
+    assert (tmp_path / "metrics.csv").read_text() == whole
+
+
+@pytest.mark.parametrize("new", [{}, {"b": 3.0}], ids=["a row", "a column"])
+def test_what_a_full_disk_refuses_waits(new, tmp_path, monkeypatch):
+    log = MetricsLog(tmp_path)
+    log.push({"a": 1.0})
+    log.write(10)
+    before = (tmp_path / "metrics.csv").read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(metrics_module.os, "fsync", full)
+    for env_steps in (20, 30):
+        log.push({"a": env_steps / 10} | new)
+        with pytest.raises(OSError, match="No space left"):
+            log.write(env_steps)
+        assert (tmp_path / "metrics.csv").read_bytes() == before
+    monkeypatch.undo()
+    pending = PendingMetrics()
+    pending.load_state_dict(log._pending.state_dict())  # a run that is stopped meanwhile takes them along
+    MetricsLog(tmp_path, resume_env_steps=pending.written, pending=pending).flush()
+    later = dict.fromkeys(new, "3")
+    assert read(tmp_path) == [
+        {"env_steps": "10", "a": "1", **dict.fromkeys(new, "")},
+        {"env_steps": "20", "a": "2", **later},
+        {"env_steps": "30", "a": "3", **later},
+    ]
 
 
 def test_resuming_without_a_file_starts_one(tmp_path):
@@ -138,6 +209,32 @@ def test_tensorboard_is_written_row_by_row(tmp_path):
     events.Reload()  # as TensorBoard does while the run goes on
     assert len(events.Scalars("loss")) == 1
     log.close()
+
+
+def test_tensorboard_goes_on_after_a_write_that_failed(tmp_path, monkeypatch):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (sink,) = loggers = make_loggers(tmp_path, tensorboard=True)
+    log = MetricsLog(tmp_path, loggers)
+    for env_steps in (10, 20, 30):
+        log.push({"loss": 1.0})
+        if env_steps != 20:
+            log.write(env_steps)
+            continue
+        file = sink.experiment.file_writer.event_writer._general_file_writer
+
+        def full(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(threading, "excepthook", lambda failure: None)  # of the thread that writes
+        monkeypatch.setattr(file, "write", full)
+        with pytest.raises(OSError, match="No space left"):
+            log.write(env_steps)
+    log.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("loss")] == [10, 30]
+    assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20", "30"]
 
 
 def test_tensorboard_and_other_loggers_get_every_row(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -42,8 +43,17 @@ def test_lines_keep_their_distance(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_what_is_not_saved_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    Progress(total=10, seconds=0.0).show(METRICS, unsaved="since 5")
-    assert "NOT SAVED since 5" in capsys.readouterr().err
+    Progress(total=10, seconds=0.0).show(METRICS, unsaved={"checkpoint": 5, "metrics": 1000})
+    assert "NOT SAVED checkpoint since 5; metrics since 1,000" in capsys.readouterr().err
+
+
+def test_a_log_that_takes_no_more_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Path("/dev/full").open("w")  # noqa: SIM115 -- its end fails, as everything does
+    monkeypatch.setattr(sys, "stdout", full)
+    with Progress(total=100) as progress:
+        progress.say("evaluation")
+    with pytest.raises(OSError, match="No space left"):
+        full.close()
 
 
 def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,8 @@ project's, because nobody published it.
 import math
 from dataclasses import dataclass, replace
 
+from dreamer_racing.settings import suggestion
+
 GRAVITY = 9.81  # m/s²
 
 
@@ -94,7 +96,8 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     if isinstance(preset, QuadrotorParameters):
         return preset
     if preset not in PRESETS:
-        raise ValueError(f"Unknown physics preset {preset!r}: the presets are {', '.join(sorted(PRESETS))}.")
+        there = ", ".join(sorted(PRESETS))
+        raise ValueError(f"preset={preset}: there is no such physics; there are {there}{suggestion(preset, PRESETS)}.")
     return PRESETS[preset]
 
 

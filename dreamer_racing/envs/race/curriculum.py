@@ -8,11 +8,23 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.transforms import Transform
+
+
+@dataclass
+class BodyRateSchedule:
+    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1: arguments of `BodyRateCurriculum`."""
+
+    threshold: float = 50.0  # mean return above which b₂ grows
+    increment: float = 0.001
+    maximum: float = 0.01
+    window: int = 100  # episodes
+    cooldown: int = 100  # episodes
 
 
 class BodyRateCurriculum:
@@ -36,11 +48,11 @@ class BodyRateCurriculum:
 
     def __init__(
         self,
-        threshold: float = 50.0,
-        increment: float = 0.001,
-        maximum: float = 0.01,
-        window: int = 100,
-        cooldown: int = 100,
+        threshold: float = BodyRateSchedule.threshold,
+        increment: float = BodyRateSchedule.increment,
+        maximum: float = BodyRateSchedule.maximum,
+        window: int = BodyRateSchedule.window,
+        cooldown: int = BodyRateSchedule.cooldown,
     ) -> None:
         if window < 1 or cooldown < 1 or increment < 0 or maximum < 0:
             raise ValueError(

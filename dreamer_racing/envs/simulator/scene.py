@@ -2,7 +2,7 @@
 
 `build_drone` is the part that moves: simulators step it alone, in a third less time than with the hall around it. The
 scene is drawn in flat colours without shadows, reflections or fine textures: at 64×64 pixels those alias, and
-MuJoCo's OpenGL renderer and `mujoco_warp`'s ray caster must agree. Contacts are off: `envs.gates` decides crashes.
+MuJoCo's OpenGL renderer and `mujoco_warp`'s ray caster must agree. Contacts are off: `envs.race.gates` decides crashes.
 Dimensions of the hall, colours and the camera's mount are this project's choice.
 """
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import math
 from collections.abc import Collection, Hashable
 from pathlib import Path
@@ -77,6 +79,19 @@ def describe_track(track: Track) -> dict[str, Any]:
         "gates": [_describe_gate(gate) for gate in track.gates],
         "decoys": [_describe_gate(gate) for gate in track.decoys],
     }
+
+
+def hash_track(track: Track) -> str:
+    """Return the SHA-256 of where gates, decoys, start and bounds are and how gates look; name and laps play no part.
+
+    It is of `describe_track` as JSON with sorted keys: the same track, by whatever file or name, gives the same.
+
+    Example:
+        >>> hash_track(load_track("kidney")) == hash_track(dataclasses.replace(load_track("kidney"), name="mine"))
+        True
+    """
+    geometry = {key: value for key, value in describe_track(track).items() if key not in ("name", "laps")}
+    return hashlib.sha256(json.dumps(geometry, sort_keys=True).encode()).hexdigest()
 
 
 def _describe_gate(gate: Gate) -> dict[str, Any]:
@@ -159,6 +174,8 @@ class _TrackReader:
 
     def read(self, content: Any) -> Track:
         """Check the form of every field and fill in the defaults."""
+        if content is None:
+            raise TrackError(f"{self._source}: the track file is empty; it must have gates, see docs/tracks.md.")
         content = self._mapping(
             content,
             "the file",

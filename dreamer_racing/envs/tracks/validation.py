@@ -12,7 +12,7 @@ it, where training episodes may begin. A frame may stand on the ground or touch 
 from __future__ import annotations
 
 import math
-from itertools import permutations
+from itertools import pairwise, permutations
 
 from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
 from dreamer_racing.settings import quoted
@@ -28,6 +28,9 @@ GATE_CLEARANCE = 1.0
 
 FARTHEST = 1000.0
 """Largest coordinate (m), at which float32 still tells 0.1 mm [choice]."""
+
+FARTHEST_LEG = 540.0
+"""Longest way (m) from one gate to the next: what 18 m/s make of an evaluation's 30 s, a whole flight [choice]."""
 
 SMALLEST = 0.01
 """Least opening, thickness and width of the bars of a gate (m) [choice]."""
@@ -57,6 +60,7 @@ def validate_track(track: Track, source: str) -> None:
             raise _error(source, f"{name}.position", gate.position, f"inside the bounding box {_box(track)}")
     _check_overlaps(track, source)
     _check_start(track, source)
+    _check_legs(track, source)
 
 
 def flyable_box(track: Track, clearance: float) -> tuple[Vector, Vector]:
@@ -187,6 +191,18 @@ def _check_start(track: Track, source: str) -> None:
         if abs(forward) < GATE_CLEARANCE - ROUNDING and max(abs(left), abs(up)) < reach:
             allowed = f"at least {GATE_CLEARANCE} m from the plane or the frame of gates[{index}] at {gate.position}"
             raise _error(source, "start.position", start, allowed)
+
+
+def _check_legs(track: Track, source: str) -> None:
+    """Refuse a race gate that no flight is long enough to reach."""
+    places = [("start.position", track.start_position)]
+    places += [(f"gates[{index}].position", gate.position) for index, gate in enumerate(track.gates)]
+    if track.laps > 1:
+        places.append(places[1])
+    for (name, position), (next_name, next_position) in pairwise(places):
+        if (leg := math.dist(position, next_position)) > FARTHEST_LEG:
+            allowed = f"at most {FARTHEST_LEG:.0f} m from {name}, as far as a flight can be: it is {leg:.0f} m"
+            raise _error(source, next_name, next_position, allowed)
 
 
 def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:

@@ -25,7 +25,6 @@ from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
-from dreamer_racing.hil.vehicle import at_rest
 from dreamer_racing.settings import given
 
 
@@ -90,7 +89,7 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
     if config.device is None or config.rate is None:
         return
     settings = _wire_settings(config)
-    size = len(link.encode(at_rest()))  # the longest there is: what disarms goes out with each
+    size = link.longest
     most = 1.0 / settings.seconds(size)
     if config.rate > most:
         raise ValueError(

@@ -29,6 +29,14 @@ class Transport(Protocol):
         """
         ...
 
+    def discard(self) -> None:
+        """Throw away what was written and has not left yet.
+
+        Raises:
+            OSError: The device is gone.
+        """
+        ...
+
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield what has come back, as `Inlet.read` does.
 
@@ -61,6 +69,7 @@ class TransportLink(ABC):
         self.dropped = 0
         self.thrust = thrust
         self._transport, self._telemetry = transport, telemetry
+        self._armed = False  # whether the last command was
 
     @property
     def rejected(self) -> int:
@@ -83,12 +92,19 @@ class TransportLink(ABC):
         if self.thrust is not None and self.thrust.voltage != voltage:
             self.thrust = replace(self.thrust, voltage=voltage)
 
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest command; for links whose commands differ in size."""
+        return len(self.encode(at_rest()))
+
     @abstractmethod
     def encode(self, command: Command) -> bytes:
         """Return the bytes that say a command: `at_rest`, or an armed one whose numbers are finite."""
 
     def send(self, command: Command) -> bytes:
         """Send a command now, without waiting; return the bytes that went out, none if it was dropped.
+
+        The first that disarms overtakes armed ones that still wait.
 
         Raises:
             ValueError: An armed command whose setpoint is not finite: no vehicle could be told that.
@@ -98,6 +114,9 @@ class TransportLink(ABC):
         if command.armed and not (np.isfinite(thrust) and np.isfinite(rates).all()):
             raise ValueError(f"collective_thrust={thrust}, body_rates={rates}: an armed command must be finite.")
         data = self.encode(command if command.armed else at_rest())
+        if self._armed and not command.armed:
+            self._transport.discard()
+        self._armed = command.armed
         if self._transport.write(data):
             return data
         self.dropped += 1

@@ -1,7 +1,8 @@
 """MAVLink 2 (PX4, ArduPilot): SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
 
 The vehicle must be in the mode in which it obeys (PX4: offboard; ArduPilot: guided, no GPS); a person puts it there, by
-radio. Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does.
+radio. Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does. Unlike that
+switch it counts in every mode, so none is sent before this link has armed the vehicle: whoever else flies it goes on.
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
 
@@ -17,11 +18,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from dreamer_racing.hil.links.link import Transport, TransportLink
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.mavlink_messages import import_messages
 from dreamer_racing.hil.sticks import ThrustMap
-from dreamer_racing.hil.vehicle import Command
+from dreamer_racing.hil.vehicle import GRAVITY, Command, Setpoint
 
 IGNORE_ATTITUDE = 128
 """ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
@@ -29,6 +32,7 @@ FORCE = 21196.0
 """Second number of COMPONENT_ARM_DISARM: disarm wherever the vehicle is."""
 UNKNOWN = 65535
 """mV, of a voltage that is not known."""
+_LONGEST = Setpoint(GRAVITY, np.ones(3))  # zeros at a message's end are left out on the wire
 ARM_TRIES = 5
 """Messages that arm, from when a command is armed first: one may be lost, but a vehicle that has disarmed itself later
 must not be armed again [choice]."""
@@ -55,12 +59,19 @@ class MavlinkLink(TransportLink):
         self._target = system, component
         self._sender = self._common.MAVLink(None, system, self._common.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._armed_for = 0  # commands in a row
+        self._has_armed = False  # whether this link ever said so: what it did not arm is not its own to disarm
+
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest command: one that arms."""
+        return len(self._switch(armed=True) + self._attitude_target(Command(True, _LONGEST)))
 
     def encode(self, command: Command) -> bytes:
         """Return the messages of a command: what arms or disarms where that is due, and the target."""
         self._armed_for = self._armed_for + 1 if command.armed else 0
-        switch = self._switch(command.armed) if self._armed_for <= ARM_TRIES else b""
-        return switch + self._attitude_target(command)
+        self._has_armed = self._has_armed or command.armed
+        due = self._has_armed and self._armed_for <= ARM_TRIES
+        return (self._switch(command.armed) if due else b"") + self._attitude_target(command)
 
     def _switch(self, armed: bool) -> bytes:
         force = 0.0 if armed else FORCE

@@ -35,6 +35,9 @@ PROTOCOLS = {
 }
 """Settings by name of the protocol."""
 
+BACKLOG = 2
+"""Commands that may wait in a port's buffer when the next one is written [choice]: one that is on the wire, and one."""
+
 _REMEDIES = {
     errno.ENOENT: "there is no such device. Is it plugged in? Look into /dev/serial/by-id",
     errno.EACCES: "you may not use it: sudo usermod -aG dialout $USER, and log in again",
@@ -61,16 +64,23 @@ class SerialPort:
     def __init__(self, device: str, settings: SerialSettings) -> None:
         self._device = device
         self._port = open_port(device, settings)
+        self._left = 0  # bytes that waited after the last write, if more than a backlog had to be thrown away before it
 
     def write(self, data: bytes) -> bool:
-        """Write bytes; return whether the buffer took them all.
+        """Write bytes; return whether the buffer took them all, and the wire takes what is in it.
 
-        If not, whatever waits there is old: it is thrown away, so that the next command is heard at once.
+        Where not, or where more than a `BACKLOG` waits, that is old: it is thrown away, so that the next command is
+        heard at once.
 
         Raises:
             OSError: The device is gone.
         """
         descriptor = self._port.fileno()
+        waiting = self._waiting()
+        stuck = waiting > BACKLOG * len(data) or 0 < self._left <= waiting
+        if stuck:
+            self._throw_away()
+        self._left = len(data) if stuck else 0
         try:
             # Not pyserial's own write, which tries a full buffer again until there is room.
             written = os.write(descriptor, data)
@@ -80,7 +90,15 @@ class SerialPort:
             raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
         if written < len(data):
             self._throw_away()
-        return written == len(data)
+        return written == len(data) and not stuck
+
+    def discard(self) -> None:
+        """Throw away what waits to be sent: what follows is heard at once.
+
+        Raises:
+            OSError: The device is gone.
+        """
+        self._throw_away()
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the bytes in the buffer, if there are any, with the time now, s (``time.monotonic``).
@@ -94,6 +112,15 @@ class SerialPort:
             raise OSError(f"device={self._device}: it is gone: {error}.") from error
         if data:
             yield time.monotonic(), data
+
+    def _waiting(self) -> int:
+        """Return how many bytes wait to be sent, as far as the driver knows; an adapter holds more."""
+        try:
+            return int(self._port.out_waiting)
+        except OSError as error:
+            if error.errno in (errno.ENOTTY, errno.EINVAL):  # a driver that does not say
+                return 0
+            raise OSError(f"device={self._device}: it is gone: {error.strerror}.") from error
 
     def _throw_away(self) -> None:
         import termios

@@ -93,12 +93,23 @@ class UdpTransport:
         """Send a datagram; return whether it went out: not so if buffers are full or the last one found nobody."""
         heard, self._heard = self._heard, True
         try:
-            self._socket.send(data)
+            return self._send(data) and heard
         except OSError as error:
             if error.errno not in _PASSING:
                 raise
             return False
-        return heard
+
+    def _send(self, data: bytes) -> bool:
+        """Send a datagram, whatever the last one met; return whether that found somebody, as far as is known."""
+        try:
+            self._socket.send(data)
+        except ConnectionRefusedError:  # of the last one, and this one did not go out
+            self._socket.send(data)
+            return False
+        return True
+
+    def discard(self) -> None:
+        """Do nothing: datagrams leave at once, or not at all."""
 
     def read(self) -> Iterator[tuple[float, bytes]]:
         """Yield the datagrams that have come back, with the time now, s (``time.monotonic``).

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.race.flown_laps import fly_laps
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot, fly_laps
+from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.race.racing_line import LineLimits, RacingLine, plan_racing_line
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track

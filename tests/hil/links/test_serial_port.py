@@ -79,6 +79,7 @@ def test_mavlink_over_a_serial_port(wire):
     common = pytest.importorskip("pymavlink.dialects.v20.common")
     far, path = wire
     link = make_link(LinkConfig("mavlink", device=path, thrust=THRUST))
+    assert len(read(far, len(link.send(at_rest()._replace(armed=True))))) > 0
     sent = link.send(at_rest())
     kinds = [message.get_type() for message in common.MAVLink(None).parse_buffer(read(far, len(sent)))]
     assert kinds == ["COMMAND_LONG", "SET_ATTITUDE_TARGET"]
@@ -146,6 +147,53 @@ def test_a_full_buffer_waits_for_nobody(wire, filled):
         waiting += os.read(far, 4096)
     assert sent and waiting.endswith(sent)
     link.close()
+
+
+class Uart:
+    """pyserial's port of a UART whose wire takes so many bytes between two writes; pseudo-terminals have no queue."""
+
+    def __init__(self, path: str, drains: int) -> None:
+        self.out_waiting, self.drains, self.flushed = 0, drains, 0
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_NOCTTY)
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def tick(self, size: int) -> None:
+        self.out_waiting = max(self.out_waiting + size - self.drains, 0)
+
+    def reset_output_buffer(self) -> None:
+        self.out_waiting, self.flushed = 0, self.flushed + 1
+
+
+def test_a_queue_of_old_commands_is_thrown_away_and_said(monkeypatch):
+    """The wire takes half of what is written: three commands wait, never more; one that takes all is left alone."""
+    for drains, lost in ((38, 0), (19, 5), (0, 27)):
+        uart = Uart("/dev/null", drains)
+        monkeypatch.setattr("dreamer_racing.hil.links.serial_port.open_port", lambda *of, uart=uart: uart)
+        port, taken, queue = SerialPort("/dev/radio", MSP), [], []
+        for _ in range(30):
+            taken.append(port.write(bytes(38)))
+            queue.append(uart.out_waiting + 38)
+            uart.tick(38)
+        assert taken.count(False) == uart.flushed == lost and max(queue) <= 3 * 38, drains
+        assert drains == 0 or all(taken[n] or taken[n + 1] for n in range(29))
+        assert drains or not any(taken[3:])  # a wire that takes nothing is said at every command
+        os.close(uart.fileno())
+
+
+def test_what_disarms_waits_behind_nothing(monkeypatch):
+    """Two armed commands wait, no backlog; the first disarmed one overtakes them, the others queue up."""
+    uart = Uart("/dev/null", 0)
+    monkeypatch.setattr("dreamer_racing.hil.links.serial_port.open_port", lambda *of: uart)
+    link = make_link(LinkConfig("msp", device="/dev/radio", rates=RATES, thrust=THRUST))
+    flushed = []
+    for armed in (False, True, True, False, False, True, False):
+        link.send(at_rest()._replace(armed=armed))
+        flushed.append(uart.flushed)
+        uart.out_waiting = 38
+    assert flushed == [0, 0, 0, 1, 1, 1, 2] and not link.dropped
+    os.close(uart.fileno())
 
 
 def test_a_device_that_is_pulled_out():

@@ -32,6 +32,9 @@ class Recorder:
         self.data += data * self.takes
         return self.takes
 
+    def discard(self):
+        pass
+
     def close(self):
         self.closed = True
 
@@ -140,15 +143,29 @@ def test_mavlink_arms_for_a_moment_and_disarms_for_good(mavlink):
             if message.get_type() == "COMMAND_LONG"
         ]
 
-    assert switches(at_rest()) == switches(at_rest()) == [(400, 0.0, 21196.0, 0)]
     assert [switches(turning()) for _ in range(7)] == [[(400, 1.0, 0.0, n)] for n in range(5)] + [[], []]
-    assert switches(at_rest()) == [(400, 0.0, 21196.0, 0)]
+    assert switches(at_rest()) == switches(at_rest()) == [(400, 0.0, 21196.0, 0)]
     assert switches(turning()) == [(400, 1.0, 0.0, 0)]
 
 
+def test_mavlink_disarms_nothing_that_it_has_not_armed(mavlink):
+    """Whoever flies the vehicle by radio while this program starts, or runs with arm=false, goes on flying."""
+    sent = b"".join(mavlink.send(at_rest()) for _ in range(50))
+    assert {message.get_type() for message in messages(sent)} == {"SET_ATTITUDE_TARGET"}
+    with pytest.raises(ValueError, match="must be finite"):  # what is never sent arms nothing either
+        mavlink.send(turning(x=math.nan))
+    assert len(messages(mavlink.send(at_rest()))) == 1
+
+
+def test_mavlink_knows_its_longest_command(mavlink):
+    longest = mavlink.longest
+    assert max(len(mavlink.send(command)) for command in (at_rest(), turning(1, 2, 3), at_rest())) <= longest < 100
+
+
 def test_mavlink_counts_its_messages(mavlink):
+    mavlink.send(turning())
     sent = b"".join(mavlink.send(at_rest()) for _ in range(150))
-    assert [message.get_seq() for message in messages(sent)] == [n % 256 for n in range(300)]
+    assert [message.get_seq() for message in messages(sent)] == [(2 + n) % 256 for n in range(300)]
     assert all(message.thrust == 0.0 for message in messages(sent)[1::2])
 
 

@@ -1,0 +1,134 @@
+"""What a pilot's laps come to: whole episodes flown and added up.
+
+Shapes: N drones, L laps, T control steps. SI units.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset, without_randomisation
+from dreamer_racing.envs.drone.rotation import rotate_inverse
+from dreamer_racing.envs.race.pilot import ScriptedPilot
+from dreamer_racing.envs.race.race import EVALUATION_TIME, RaceStep
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.envs.worlds import RaceWorlds
+
+
+@dataclass(frozen=True)
+class FlownLaps:
+    """What N episodes came to."""
+
+    gates: Tensor  # (N,) int64, passed
+    finished: Tensor  # (N,) bool: all laps, no crash
+    crash: Tensor  # (N,) int64 `CrashCause`
+    lap_times: Tensor  # (N, L) s; NaN where not flown; the first lap begins at rest
+    speed_mean: Tensor  # (N,) m/s
+    speed_max: Tensor  # (N,) m/s
+    gate_offset_max: Tensor  # (N,) m
+    gate_in_view: Tensor  # (N,) fraction of the time in which the nose camera sees the target gate's centre
+
+
+def fly_laps(
+    track: str | Track,
+    preset: str | QuadrotorParameters = "easy",
+    num_envs: int = 1,
+    *,
+    laps: int = 3,
+    pilot: ScriptedPilot | None = None,
+    randomise: bool = True,
+    random_starts: bool = False,
+    seed: int = 0,
+    episode_steps: int | None = None,
+) -> FlownLaps:
+    """Fly N episodes to their ends.
+
+    Args:
+        track: name, path or `Track`.
+        preset: physics preset or parameters.
+        num_envs: N.
+        laps: L.
+        pilot: who flies; a `ScriptedPilot` with default limits if None.
+        randomise: whether a preset's randomisation is on.
+        random_starts: start as training does, instead of at the start pose.
+        seed: of randomisation and starts.
+        episode_steps: control steps until an episode is given up; None for those of 30 s.
+    """
+    parameters = load_preset(preset)
+    worlds = RaceWorlds(
+        track,
+        num_envs,
+        parameters if randomise else without_randomisation(parameters),
+        evaluation=not random_starts,
+        from_pixels=False,
+        episode_steps=episode_steps or round(EVALUATION_TIME / parameters.control_dt),
+        seed=seed,
+    )
+    worlds.race.laps = laps
+    pilot = pilot or ScriptedPilot(worlds.track, parameters, dtype=worlds.dtype)
+    steps = _fly(worlds, pilot)
+    worlds.close()
+    return _summarise(steps, worlds.track.num_gates, laps)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One control step of a flight; tensors (N,)."""
+
+    outcome: RaceStep
+    speed: Tensor  # m/s
+    seen: Tensor  # bool: the target gate
+    flew: Tensor  # bool: the episode was not over
+
+
+def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
+    """Fly one episode in every world to its end."""
+    pilot.reset()
+    worlds.reset()
+    flying = torch.ones(worlds.num_envs, dtype=torch.bool, device=worlds.device)
+    steps = []
+    while flying.any():
+        state, gate = worlds.simulator.state, worlds.race.target_gate
+        seen = _in_view(worlds, state.position, state.attitude)
+        outcome = worlds.step(pilot.act(state.position, state.attitude, state.linear_velocity, state.body_rates, gate))
+        steps.append(_Step(outcome, worlds.simulator.state.linear_velocity.norm(dim=-1), seen, flying))
+        flying = flying & ~(outcome.terminated | outcome.truncated)
+    return steps
+
+
+def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
+    """Whether the centre of the target gate (N,) is inside the nose camera's image; gates in front are not minded."""
+    camera = worlds.camera
+    gates = worlds.track.gate_positions(position.device, position.dtype)
+    view = rotate_inverse(attitude, gates[worlds.race.target_gate] - position) - position.new_tensor(camera.position)
+    tilt = math.radians(camera.tilt)
+    depth = view[:, 0] * math.cos(tilt) + view[:, 2] * math.sin(tilt)
+    up = view[:, 2] * math.cos(tilt) - view[:, 0] * math.sin(tilt)
+    reach = depth * math.tan(math.radians(camera.field_of_view) / 2.0)
+    return (up.abs() < reach) & (view[:, 1].abs() < reach * camera.width / camera.height)
+
+
+def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
+    """Add up the control steps of a flight."""
+    flew = torch.stack([step.flew for step in steps])  # (T, N)
+    time = flew.sum(0)
+
+    def outcomes(name: str) -> Tensor:
+        return torch.stack([getattr(step.outcome, name) for step in steps]) * flew
+
+    speed = torch.stack([step.speed for step in steps]) * flew
+    gates, lap_time = outcomes("gates_passed"), outcomes("lap_time")
+    at_lap = (gates // num_gates).unsqueeze(-1)  # (T, N, 1)
+    lap_times = (lap_time.unsqueeze(-1) * (at_lap == torch.arange(1, laps + 1, device=speed.device))).amax(0)  # (N, L)
+    return FlownLaps(
+        gates=gates.amax(0),
+        finished=outcomes("finished").any(0),
+        crash=outcomes("crash").amax(0),
+        lap_times=torch.where(lap_times > 0.0, lap_times, math.nan),
+        speed_mean=speed.sum(0) / time,
+        speed_max=speed.amax(0),
+        gate_offset_max=outcomes("gate_offset").amax(0),
+        gate_in_view=(torch.stack([step.seen for step in steps]) & flew).sum(0) / time,
+    )

@@ -1,0 +1,272 @@
+"""What stands beside the race on the page of a flight: legend, on-board image, state, and curves, as HTML.
+
+Nothing in it moves by itself: who shows it sets the cursor's place and each view's image, and fills the numbers in.
+Shapes: K control steps of an episode; F flights, one or two.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import to_hex
+from PIL import Image
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.tracks import Track
+from dreamer_racing.evaluation.trajectory import Trajectory
+from dreamer_racing.figures.drawing import speed_scale
+from dreamer_racing.figures.hud import laps_completed
+from dreamer_racing.figures.scene_3d import DRONE_SCALE, Paint, paints
+
+SHEET_COLUMNS = 25  # images in a row of the sheet that holds those of a flight
+CURVE_WIDTH, CURVE_HEIGHT = 1000.0, 100.0  # of a curve's own coordinates
+HEADROOM = 0.06  # of a curve's range, above and below it
+COLOR_STOPS = 8  # of a legend's gradient
+STYLE = "dashboard.css"  # beside this module
+LARGER = f"Drones are drawn {DRONE_SCALE:g} times their size."
+
+
+class ShownFlight(NamedTuple):
+    """A recorded episode from its start on, and what it is called."""
+
+    title: str
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something that is drawn over time."""
+
+    name: str
+    unit: str
+    values: Callable[[Trajectory], np.ndarray | None]
+    """(K + 1,) at observations or (K,) at steps; None of a flight that does not have it."""
+
+
+def command(channel: int) -> Callable[[Trajectory], np.ndarray]:
+    """Return what reads a channel of the action in SI units, as flown: 0 is thrust, 1 to 3 are body rates."""
+    drone = QuadrotorParameters()  # every preset has these scales
+    scale = (drone.collective_thrust_scale, *drone.body_rate_max)[channel]
+    offset = drone.collective_thrust_scale if channel == 0 else 0.0
+    return lambda flight: offset + scale * flight.action[:, channel].clamp(-1.0, 1.0).numpy()
+
+
+QUANTITIES = (
+    Quantity("speed", "m/s", lambda flight: flight.speed.numpy()),
+    Quantity("thrust", "m/s²", command(0)),
+    Quantity("roll rate", "rad/s", command(1)),
+    Quantity("pitch rate", "rad/s", command(2)),
+    Quantity("yaw rate", "rad/s", command(3)),
+    Quantity("value", "return expected", lambda flight: None if flight.value is None else flight.value.numpy()),
+)
+"""The curves of a page: speed, the actor's four commands, and what its critic expected."""
+
+
+def panel(track: Track, flights: Sequence[ShownFlight], training: Sequence[str]) -> str:
+    """Return the panel: legend, images, state, curves, notes."""
+    colors = paints(len(flights))
+    shown = list(zip(flights, colors, strict=True))
+    lines = [*training, *(line for flight in flights for line in missing(flight)), LARGER]
+    parts = (
+        f"<header><h1>{escape(track.name)}</h1>{_legend(shown)}</header>",
+        f'<section class="views">{_views(shown)}{_state(track, shown)}</section>',
+        f'<section class="curves">{"".join(_curves(shown))}<i class="cursor"></i></section>',
+        f"<footer>{''.join(f'<p>{_with_commands(line)}</p>' for line in lines)}</footer>",
+    )
+    return f'<aside class="dashboard">{"".join(parts)}</aside>'
+
+
+def missing(flight: ShownFlight) -> Iterator[str]:
+    """Yield what a flight does not show, and why, a sentence each."""
+    if flight.trajectory.pixels is None:
+        yield f"{flight.title}: no images, because none were recorded with the flight."
+    if flight.trajectory.value is None:
+        yield f"{flight.title}: no value, because no critic judged the flight; agents that ship have none."
+
+
+def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
+    """Return what the panel says at each row of each flight; nothing but what JSON knows."""
+    return {
+        "duration": duration([flight.trajectory for flight in flights]),
+        "columns": SHEET_COLUMNS,
+        "flights": [
+            {
+                "control_dt": flight.trajectory.control_dt,
+                "words": state_words(track, flight.trajectory),
+                "values": {
+                    quantity.name: [_number(value) for value in values.tolist()]
+                    for quantity in QUANTITIES
+                    if (values := quantity.values(flight.trajectory)) is not None
+                },
+            }
+            for flight in flights
+        ],
+    }
+
+
+def state_words(track: Track, flight: Trajectory) -> list[list[str]]:
+    """Say lap, next gate and what goes on at every row of a flight, K + 1 times."""
+    laps = np.minimum(laps_completed(flight) + 1, track.laps).tolist()
+    gates = (flight.target_gate + 1).tolist()
+    words = [
+        [f"{lap}/{track.laps}", f"{gate}/{track.num_gates}", "flying"] for lap, gate in zip(laps, gates, strict=True)
+    ]
+    words[-1][2] = (flight.outcome or "recording stopped").replace("_", " ")
+    return words
+
+
+def image_sheet(pixels: np.ndarray) -> str:
+    """Return the images of a flight (K + 1, H, W, 3) as one, row by row, a data URI."""
+    count, height, width, channels = pixels.shape
+    rows = math.ceil(count / SHEET_COLUMNS)
+    sheet = np.zeros((rows * SHEET_COLUMNS, height, width, channels), np.uint8)
+    sheet[:count] = pixels
+    grid = sheet.reshape(rows, SHEET_COLUMNS, height, width, channels).transpose(0, 2, 1, 3, 4)
+    buffer = io.BytesIO()
+    Image.fromarray(grid.reshape(rows * height, SHEET_COLUMNS * width, channels)).save(buffer, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _legend(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+    """Say which colour is which flight, how it ended, and what its line's colours mean."""
+    top = speed_scale([flight.trajectory for flight, _ in shown]).vmax
+    rows = []
+    for flight, paint in shown:
+        stops = ", ".join(to_hex(paint.speeds(share)) for share in np.linspace(0.0, 1.0, COLOR_STOPS))
+        rows.append(
+            f'<div class="flight" style="--color: {paint.color}"><b>{escape(flight.title)}</b>'
+            f"<span>{escape(_result(flight.trajectory))}</span>"
+            f'<span class="scale">0<i style="background: linear-gradient(90deg, {stops})"></i>{top:g} m/s</span></div>'
+        )
+    return "".join(rows)
+
+
+def _result(flight: Trajectory) -> str:
+    """Say how a flight ended, and its lap times."""
+    ended = (flight.outcome or "recording stopped").replace("_", " ")
+    completed = laps_completed(flight)
+    ends = [0, *(np.flatnonzero(np.diff(completed)) + 1).tolist()]
+    laps = " ".join(f"{(after - before) * flight.control_dt:.2f}" for before, after in pairwise(ends))
+    return f"{ended}, {'laps ' + laps + ' s' if laps else 'no lap'}"
+
+
+def _views(shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+    """Return a place for the on-board image of every flight that has some."""
+    views = []
+    for index, (flight, paint) in enumerate(shown):
+        if (pixels := flight.trajectory.pixels) is None:
+            views.append(f'<div class="view" style="--color: {paint.color}"><span>no images recorded</span></div>')
+            continue
+        count, height, width = pixels.shape[:3]
+        rows = math.ceil(count / SHEET_COLUMNS)
+        views.append(
+            f'<div class="view view-{index}" role="img" aria-label="on-board image" style="--color: {paint.color};'
+            f" aspect-ratio: {width} / {height}; --columns: {SHEET_COLUMNS}; --rows: {rows};"
+            f' background-image: url({image_sheet(pixels.numpy())})"></div>'
+        )
+    return "".join(views)
+
+
+def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
+    """Return a table of time, lap, gate and what goes on; its cells are filled as the time goes by."""
+    head = '<tr><td class="time" colspan="3" data-time>0.00 s</td></tr><tr><th>lap</th><th>gate</th><th></th></tr>'
+    rows = [
+        f'<tr style="--color: {paint.color}" title="{escape(flight.title)}">'
+        + "".join(f'<td data-words="{index}">{escape(word)}</td>' for word in state_words(track, flight.trajectory)[0])
+        + "</tr>"
+        for index, (flight, paint) in enumerate(shown)
+    ]
+    return f'<table class="state">{head}{"".join(rows)}</table>'
+
+
+def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
+    """Yield the curves of each quantity that at least one flight has, one below the other, and their time axis."""
+    longest = duration([flight.trajectory for flight, _ in shown])
+    passes = "".join(_passes(flight.trajectory, paint, longest) for flight, paint in shown)
+    for quantity in QUANTITIES:
+        series = [quantity.values(flight.trajectory) for flight, _ in shown]
+        finite = np.concatenate([values[np.isfinite(values)] for values in series if values is not None] or [[]])
+        if not len(finite):
+            continue
+        low, high = float(finite.min()), float(finite.max())
+        room = HEADROOM * (high - low) or 0.5
+        frame = (low - room, high + room)
+        lines, now = [_zero(*frame)], []
+        for index, ((flight, paint), values) in enumerate(zip(shown, series, strict=True)):
+            if values is not None:
+                stretches = _points(values, flight.trajectory.control_dt / longest, *frame)
+                lines += [f'<polyline points="{points}" stroke="{paint.color}"/>' for points in stretches]
+                now.append(
+                    f'<output data-value="{index}" data-of="{quantity.name}" style="--color: {paint.color}"></output>'
+                )
+        yield (
+            f'<div class="curve"><div class="name">{quantity.name} <small>{quantity.unit}</small>'
+            f"{''.join(reversed(now))}</div>"
+            f'<div class="range"><span>{high:.3g}</span><span>{low:.3g}</span></div>'
+            f'<svg viewBox="0 0 {CURVE_WIDTH:g} {CURVE_HEIGHT:g}" preserveAspectRatio="none">'
+            f"{passes}{''.join(lines)}</svg></div>"
+        )
+    yield f'<div class="times"><span>0 s</span><span>{longest:.2f} s</span></div>'
+
+
+def _zero(low: float, high: float) -> str:
+    """Return a line at zero, if it lies within a curve's range."""
+    level = CURVE_HEIGHT * high / (high - low)
+    inside = low < 0.0 < high
+    return f'<line class="zero" x2="{CURVE_WIDTH:g}" y1="{level:.1f}" y2="{level:.1f}"/>' if inside else ""
+
+
+def _passes(flight: Trajectory, paint: Paint, longest: float) -> str:
+    """Return a thin line at every gate passed, a stronger one where a lap ends."""
+    lines, target = [], flight.target_gate.numpy()
+    for row in (np.flatnonzero(np.diff(target)) + 1).tolist():
+        place = CURVE_WIDTH * row * flight.control_dt / longest
+        kind = "lap" if target[row] == 0 else "gate"
+        lines.append(
+            f'<line class="{kind}" x1="{place:.1f}" x2="{place:.1f}" y2="{CURVE_HEIGHT:g}" stroke="{paint.color}"/>'
+        )
+    return "".join(lines)
+
+
+def _points(values: np.ndarray, step: float, low: float, high: float) -> Iterator[str]:
+    """Yield the stretches of a curve without gaps; a step is so much of the whole width."""
+    place = CURVE_WIDTH * step * np.arange(len(values))
+    level = CURVE_HEIGHT * (high - values) / (high - low)
+    finite = np.isfinite(values)
+    for part in np.split(np.arange(len(values)), np.flatnonzero(np.diff(finite)) + 1):
+        if finite[part[0]]:
+            yield " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(place[part], level[part], strict=True))
+
+
+def _with_commands(line: str) -> str:
+    """Set what stands between backquotes as a command."""
+    parts = escape(line).split("`")
+    return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
+
+
+def _number(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None
+
+
+def duration(flights: Sequence[Trajectory]) -> float:
+    """Return how long the longest of some flights is, s."""
+    return max((len(flight.position) - 1) * flight.control_dt for flight in flights)
+
+
+def row_at(flight: Trajectory, time: float) -> int:
+    """Return the row that a flight is at, its last one after its end."""
+    return min(int(time / flight.control_dt + 1e-6), len(flight.position) - 1)
+
+
+def beside(name: str) -> str:
+    """Read a file that lies beside this module, as text."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -1,0 +1,107 @@
+"""What poses tell `safety.Safety`: plain numbers, and whether a vehicle could have gone from one pose to the next."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from dreamer_racing.hil.odometer import Odometer
+from dreamer_racing.hil.reasons import Findings, Reason
+from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, to_number, to_numbers
+from dreamer_racing.hil.vehicle import Pose
+
+
+class Seen(NamedTuple):
+    """A pose in plain numbers: as `Pose`, with an attitude of unit length."""
+
+    time: float
+    position: Vector
+    attitude: Vector
+    velocity: Vector
+
+    @property
+    def speed(self) -> float:
+        """m/s."""
+        return math.hypot(*self.velocity)
+
+    @property
+    def tilt_degrees(self) -> float:
+        """Angle between body z and world z."""
+        _, x, y, _ = self.attitude
+        return math.degrees(2.0 * math.asin(min(1.0, math.hypot(x, y))))
+
+    @property
+    def yaw_degrees(self) -> float:
+        """Direction of body x from world x, left."""
+        w, x, y, z = self.attitude
+        return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+    def degrees_from(self, other: Seen) -> float:
+        """Angle by which one attitude is turned from another, about whatever axis, the short way round."""
+        cosine = sum(here * there for here, there in zip(self.attitude, other.attitude, strict=True))
+        return math.degrees(2.0 * math.acos(min(1.0, abs(cosine))))
+
+
+def read_pose(pose: Pose) -> Seen | None:
+    """Return a pose in plain numbers; None if one is not finite, or the attitude is none."""
+    time = to_number(pose.time)
+    position, velocity, rates = (
+        to_numbers(value, 3) for value in (pose.position, pose.linear_velocity, pose.body_rates)
+    )
+    attitude = to_numbers(pose.attitude, 4)
+    if position is None or velocity is None or rates is None or attitude is None or not math.isfinite(time):
+        return None
+    length = math.hypot(*attitude)
+    if not 0.9 < length < 1.1:
+        return None
+    return Seen(time, position, tuple(value / length for value in attitude), velocity)
+
+
+class Motion:
+    """Compares each pose with those before it.
+
+    Args:
+        limits: How far and how fast a vehicle may go and turn.
+
+    Attributes:
+        newest: None before the first pose.
+        repeats: Whether the newest one stands exactly where the one before it did; a measurement never does.
+        changed_at: s, since when poses stand where the newest one does.
+    """
+
+    def __init__(self, limits: SafetyLimits) -> None:
+        self.newest: Seen | None = None
+        self.repeats = False
+        self.changed_at = -math.inf
+        self._limits = limits
+        self._odometer = Odometer(limits.velocity_window)
+
+    def take(self, seen: Seen) -> Findings:
+        """Take in a pose that is newer than the last; find what no vehicle does from one to the other."""
+        last, self.newest = self.newest, seen
+        self.repeats = last is not None and (seen.position, seen.attitude) == (last.position, last.attitude)
+        if not self.repeats:
+            self.changed_at = seen.time
+        findings = {} if last is None else self._check_step(last, seen)
+        mismatch = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
+        if mismatch is not None and not mismatch <= self._limits.velocity_tolerance:
+            findings[Reason.POSE_CONTRADICTION] = (
+                f"velocities and positions of poses differ by {mismatch:.3g} m/s (allowed: "
+                f"{self._limits.velocity_tolerance:g})"
+            )
+        return findings
+
+    def _check_step(self, last: Seen, seen: Seen) -> Findings:
+        """Compare how far it went, and by how much it turned, with what is possible in the time between two poses."""
+        limits, elapsed = self._limits, seen.time - last.time
+        findings: Findings = {}
+        moved, turned = math.dist(seen.position, last.position), seen.degrees_from(last)
+        allowed = limits.speed_max * elapsed + limits.jump_tolerance
+        if not moved <= allowed:
+            findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"
+        allowed = math.degrees(limits.turn_rate_max * elapsed) + limits.turn_tolerance_degrees
+        if not turned <= allowed:
+            findings[Reason.ATTITUDE_JUMP] = (
+                f"the attitude jumped by {turned:.0f}° (allowed since the last: {allowed:.0f})"
+            )
+        return findings

@@ -1,0 +1,89 @@
+"""When a run logs, evaluates and saves, and what it has noted for its next row of metrics; saved with it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from dreamer_racing.training.metrics import PendingMetrics
+
+
+class Schedule:
+    """Says when something that happens every so many env_steps is due.
+
+    Args:
+        every: env_steps between two of a kind, by its name; 0: never.
+
+    Attributes:
+        latest: env_steps at the latest of each kind; saved with the run.
+
+    Example:
+        >>> schedule = Schedule(log=100)
+        >>> [env_steps for env_steps in (90, 110, 190, 210) if schedule.due("log", env_steps)]
+        [110, 210]
+    """
+
+    def __init__(self, **every: int) -> None:
+        self._every = every
+        self.latest = dict.fromkeys(every, 0)
+
+    def due(self, name: str, env_steps: int, last: bool = False) -> bool:
+        """Whether another period has passed, or anything has since the latest; asking takes note of it.
+
+        Args:
+            name: what may be due.
+            env_steps: made by now.
+            last: whether the run ends here, so that no period comes to its end.
+        """
+        period, latest = self._every[name], self.latest[name]
+        if not period or (env_steps // period <= latest // period and not (last and env_steps > latest)):
+            return False
+        self.latest[name] = env_steps
+        return True
+
+
+class Interval:
+    """Says when something that happens every so many minutes of wall clock is due; never if they are 0."""
+
+    def __init__(self, minutes: float) -> None:
+        self._seconds = 60.0 * minutes
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether the interval has passed; if so it begins anew."""
+        if not self._seconds or time.monotonic() - self._last < self._seconds:
+            return False
+        self._last = time.monotonic()
+        return True
+
+
+class Journal:
+    """A schedule and the metrics under way, as one part of a checkpoint: with it a resumed run writes the same rows.
+
+    Args:
+        schedule: of the run.
+        pending: metrics that are in no row yet.
+
+    Attributes:
+        restored: whether it came from a checkpoint; those of older versions have none.
+    """
+
+    def __init__(self, schedule: Schedule, pending: PendingMetrics) -> None:
+        self.schedule, self.pending = schedule, pending
+        self.restored = False
+
+    def begin_at(self, env_steps: int) -> None:
+        """Go on from a checkpoint without a journal: everything before it was done, and nothing is under way."""
+        self.schedule.latest = dict.fromkeys(self.schedule.latest, env_steps)
+        self.pending.written = env_steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
+        return {"latest": dict(self.schedule.latest), **self.pending.state_dict()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.schedule.latest |= state_dict["latest"]
+        self.pending.load_state_dict(state_dict)
+        self.restored = True

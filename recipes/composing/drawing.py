@@ -1,0 +1,247 @@
+"""What `recipes/plot.py` draws, and an experiment at its end: figures of what runs have stored."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from composing.schema import PlotConfig
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.evaluation.dreams import Dream
+from dreamer_racing.evaluation.trajectory import read_trajectory
+from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
+from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
+from dreamer_racing.figures.film import write_gif, write_video
+from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
+from dreamer_racing.figures.hud import dream_video
+from dreamer_racing.figures.learning import plot_comparison, plot_learning_curves
+from dreamer_racing.figures.profiles import PROFILE_AXES
+from dreamer_racing.figures.runs import (
+    RunData,
+    evaluation_files,
+    evaluation_score,
+    find_runs,
+    first_of_each_curve,
+    first_readable,
+    group_runs,
+    read_runs,
+)
+from dreamer_racing.settings import check_settings
+from dreamer_racing.training.directory import RunDirectory, ensure_writable
+
+VIDEO_SLOWER = 2  # than the flight, so that one can look
+FLIGHTS = ("last", "best")  # of the evaluations of a run
+
+
+class Drawn(NamedTuple):
+    """What became of a figure."""
+
+    files: list[str]
+    """Names, in the output folder; none if nothing is stored for it."""
+    problems: list[str]
+    """What was left out, a line each."""
+
+
+def draw(config: PlotConfig) -> None:
+    """Make one figure, or all for which there is something to draw.
+
+    Raises:
+        ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
+    """
+    check_plot(config)
+    output = ensure_writable(config.output)
+    places = config.runs if isinstance(config.runs, list) else [config.runs]
+    if [Path(str(place)).suffix for place in places] == [".csv"]:
+        draw_curves(read_curves(places[0]), output)
+        print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
+        return
+    explicit = config.figure != "all" and (config.flights or config.dreams)
+    asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
+    columns = {column for figure in asked for column in figure.columns(config)}
+    runs, problems = ([], []) if explicit else read_runs(find_runs(places), columns)
+    warn(problems)
+    if config.figure == "all":
+        draw_all(config, output, runs, problems)
+    elif not draw_one(config.figure, config, output, runs, problems):
+        raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
+
+
+def check_plot(config: PlotConfig) -> None:
+    """Refuse what no figure can be drawn with.
+
+    Raises:
+        ValueError: the value of a setting is not one of those there are.
+    """
+    check_settings(config)
+    for name, value, allowed in (
+        ("figure", config.figure, (*FIGURES, "all")),
+        ("flight", config.flight, FLIGHTS),
+        ("over", config.over, PROFILE_AXES),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")
+    wanted_columns(config.quantities)
+
+
+def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> None:
+    """Make every figure for which there is something to draw; one that fails does not cost the others.
+
+    Raises:
+        ValueError: nothing could be drawn.
+        Exception: of the first figure that failed for a reason that the runs cannot have, after the others were drawn.
+    """
+    drawn = False
+    failures: dict[str, Exception] = {}
+    for name in FIGURES:
+        try:
+            drawn |= draw_one(name, config, output, runs, problems)
+        except Exception as error:
+            failures[name] = error
+            warn([f"figure={name} failed: {error}"])
+    defects = [failure for failure in failures.values() if not isinstance(failure, (ValueError, OSError))]
+    if defects:
+        raise defects[0]
+    if not drawn:
+        reasons = "\n".join(f"figure={name}: {failure}" for name, failure in failures.items())
+        raise ValueError(f"figure=all: nothing could be drawn. {reasons or 'These runs have stored nothing for it.'}")
+
+
+def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> bool:
+    """Make a figure and say what it has left out; return whether there was anything to draw."""
+    files, found = FIGURES[name].draw(config, output, runs, problems)
+    warn([problem for problem in found if problem not in problems])
+    print(f"{name + ':':<17} {', '.join(files) or 'none of these runs has stored anything for it'}")
+    return bool(files)
+
+
+def warn(problems: list[str]) -> None:
+    """Print a line each."""
+    for problem in problems:
+        print(f"warning: {problem}")
+
+
+def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
+    """Make `learning_curves.png` and `.csv`."""
+    curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems)
+    write_curves(output / "learning_curves.csv", curves)
+    draw_curves(curves, output)
+    return Drawn(["learning_curves.png", "learning_curves.csv"], curves.problems)
+
+
+def draw_curves(curves: LearningCurves, output: Path) -> None:
+    """Make `learning_curves.png`."""
+    plot_learning_curves(curves, output / "learning_curves.png")
+
+
+def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
+    """Make a grid, a video and a small GIF of three stages of training of each curve's first seed that has dreams."""
+    if config.dreams:
+        return draw_dreams("imagined", {Path(file): Dream.load(file) for file in config.dreams}, [], output)
+    files, missing = [], []
+    for run in first_of_each_curve(runs):
+        stages, left_out = stages_of_training(run)
+        missing += left_out
+        if stages:
+            files += draw_dreams(f"imagined_{run.name}", stages, left_out, output).files
+    return Drawn(files, missing)
+
+
+def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
+    """Read the first, the middle and the last dream of a run; instead of one that cannot be read the one before it.
+
+    Returns:
+        The dreams, each once, by file, and what was left out.
+    """
+    files = list(evaluation_files(run.directory, "_dream.npz").values())
+    problems: list[str] = []
+    choices = (files, files[len(files) // 2 :: -1], files[::-1])  # before the first there is none: the one after it
+    found = [first_readable(choice, Dream.load, problems) for choice in choices]
+    return dict(sorted(filter(None, found), key=lambda pair: pair[0])), problems
+
+
+def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], output: Path) -> Drawn:
+    """Make a grid, a video and a small GIF."""
+    dreams = [(stage_name(file), dream) for file, dream in stages.items()]
+    plot_dreams(dreams, output / f"{name}.png", problems=problems)
+    fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
+    write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
+    write_gif(output / f"{name}.gif", film, fps=fps)
+    return Drawn([f"{name}.png", f"{name}.mp4", f"{name}.gif"], problems)
+
+
+def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
+    """Make `trajectories.png` of the files named, or of one evaluation of each curve's first seed."""
+    missing: list[str] = []
+    flights = [named_flight(file) for file in config.flights] or chosen_flights(runs, config.flight, missing)
+    if not flights:
+        return Drawn([], missing)
+    plot_flights(flights, output / "trajectories.png", config.over, problems=missing)
+    return Drawn(["trajectories.png"], missing)
+
+
+def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list[NamedFlight]:
+    """Read the last or the best flight of the first seed of each curve; of those that cannot be read, the next one.
+
+    Args:
+        runs: of any curves.
+        which: ``last`` or ``best``.
+        problems: gets a line for every file that cannot be read.
+    """
+    flights = []
+    for run in first_of_each_curve(runs):
+        found = first_readable(stored_flights(run, which), named_flight, problems)
+        flights += [found[1]] if found else []
+    return flights
+
+
+def stored_flights(run: RunData, which: str) -> list[Path]:
+    """List the flights of a run, the last or the best first."""
+    files = evaluation_files(run.directory, "_trajectory.csv")
+    order = sorted(files, reverse=which == "last")
+    if which == "best":
+        order.sort(key=lambda env_steps: evaluation_score(run.directory, env_steps), reverse=True)
+    return [files[env_steps] for env_steps in order]
+
+
+def named_flight(file: str | Path) -> NamedFlight:
+    """Read a flight with its track; the run's and the evaluation's names are its title."""
+    trajectory, track = read_trajectory(file)
+    run = RunDirectory.of(Path(file).absolute()).path.name
+    return NamedFlight(f"{run}, {stage_name(file)}", load_track(track), trajectory)
+
+
+def stage_name(file: str | Path) -> str:
+    """Say after how many env_steps an evaluation was made, if its file does."""
+    name = Path(file).stem.rpartition("_")[0]
+    return f"{int(name):,} env_steps" if name.isdigit() else name.replace("_", " ")
+
+
+def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
+    """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
+    if len(group_runs(runs)) < 2:
+        return Drawn([], [])
+    comparison = compare_variants(runs, problems)
+    (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")
+    plot_comparison(comparison, output / "comparison.png")
+    return Drawn(["comparison.md", "comparison.png"], comparison.problems)
+
+
+def no_columns(config: PlotConfig) -> Iterable[str]:
+    """Of a figure that is drawn from other files."""
+    return ()
+
+
+class Entry(NamedTuple):
+    """How `figure=` makes a figure, and from what of `metrics.csv`."""
+
+    draw: Callable[[PlotConfig, Path, list[RunData], list[str]], Drawn]
+    """Of the configuration, the output folder, the runs read, and what of them was left out, a line each."""
+    columns: Callable[[PlotConfig], Iterable[str]]
+    """Those that it looks for in a run's `metrics.columns`; no others are read."""
+
+
+FIGURES = {
+    "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities)),
+    "imagined": Entry(draw_imagined, no_columns),
+    "trajectories": Entry(draw_trajectories, no_columns),
+    "comparison": Entry(draw_comparison, lambda config: COLUMNS),
+}

@@ -1,0 +1,289 @@
+"""Flights from configuration: what `recipes/hil.py` can be told, what is refused, and the parts that a flight is of."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass, field, make_dataclass, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from composing.command_line import agent_path
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.hil.battery import BatteryConfig
+from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
+from dreamer_racing.hil.betaflight import rate_map, require_dump
+from dreamer_racing.hil.camera import NoseCamera
+from dreamer_racing.hil.chain import ChainConfig, FlightChain
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
+from dreamer_racing.hil.links import HEARING, LinkConfig
+from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
+from dreamer_racing.hil.pose_sources import PoseConfig
+from dreamer_racing.hil.safety import SafetyLimits
+from dreamer_racing.hil.stamping import Stamping
+from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
+from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
+
+PILOT = "pilot"
+PILOT_RATE = 50.0  # Hz
+SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
+OPERATORS = ("keyboard", "udp", "timed")
+
+
+LimitsConfig = make_dataclass(
+    "LimitsConfig",
+    [
+        (name, float | None if kind in (float, int) else list[float] | None, field(default=None))
+        for name, kind in get_type_hints(SafetyLimits).items()
+    ],
+)
+"""`SafetyLimits` by their names; null: the default, or what the track says."""
+
+
+@dataclass
+class HilConfig:
+    """`recipes/hil.py`."""
+
+    actor: str | None = None  # pilot, an agent that ships by its name, or the path of an .onnx file or an agent
+    track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
+    arm: bool = False  # whether the vehicle may be armed at all
+    laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
+    duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
+    patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
+    rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
+    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
+    run_dir: str | None = None  # null: runs/hil_<track>_<time>
+    replay: str | None = None  # a flight to play through the chain again
+    report: str | None = None  # a flight to draw and to sum up
+    against: str | None = None  # with report=: another flight, or an evaluation's trajectory (CSV), to draw beside it
+
+    pose: str = "udp"  # udp | mavlink | ros2
+    pose_host: str = "127.0.0.1"  # to listen on
+    pose_port: int = setting(9100, Range(1, 65535))
+    pose_device: str | None = None  # pose=mavlink: a serial port instead
+    pose_baud: int | None = setting(None, Range(1))  # of it; null: 57600
+    pose_topic: str | None = None  # pose=ros2
+    pose_message: str | None = None  # which kind of message; null: ODOMETRY, or PoseStamped
+    smoothing: float = setting(0.01, Range(0, 1))  # s, time constant of velocities where poses come without
+    # a pose's time: receive (arrival less latency) | sender (its stamp); null: receive over UDP, else sender
+    stamping: Stamping | None = None
+    latency: float = setting(0.0, Range(0, 1))  # s from a pose's measurement to its arrival, at the least
+
+    operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
+    operator_host: str = "127.0.0.1"  # to listen on
+    operator_port: int = setting(9102, Range(1, 65535))
+
+    link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
+    link_host: str = "127.0.0.1"  # to send to
+    link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
+    device: str | None = None  # serial port
+    baud: int | None = setting(None, Range(1))  # null: the protocol's own
+    arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
+    betaflight_dump: str | None = None  # what `dump all` gave; settings that are not the actor's: nothing is armed
+    mass: float | None = setting(None, POSITIVE)  # kg, with battery
+    full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
+    reference_voltage: float | None = setting(None, POSITIVE)  # V
+    voltage: float | None = setting(None, POSITIVE)  # V, the battery's now; until a link that hears of it says more
+    voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
+    voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
+
+    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
+    renderer: str = "auto"  # auto | egl | osmesa
+    record: bool = True  # write the flight to a file
+    view: int | None = setting(None, Range(1, 65535))  # port of a page on this machine that shows what the actor sees
+
+
+def check(config: HilConfig) -> None:
+    """Refuse what does not go together.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+    """
+    check_settings(config)
+    wanted = [name for name in ("actor", "replay", "report") if getattr(config, name) is not None]
+    if len(wanted) != 1:
+        raise ValueError(
+            f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
+            "agent that ships, actor=pilot track=kidney the scripted pilot."
+        )
+    if config.operator not in ("auto", *OPERATORS):
+        raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
+    if config.operator == "timed" and config.link not in SIMULATED:
+        raise ValueError(
+            f"operator=timed enables by itself, and link={config.link} may be a real vehicle: use keyboard."
+        )
+    by_itself = config.operator in ("auto", "timed") and config.link in SIMULATED
+    if by_itself and not is_this_machine(config.link_host):
+        raise ValueError(
+            f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
+        )
+    if config.against and not config.report:
+        raise ValueError(f"against={config.against} is for report=.")
+
+
+def is_this_machine(host: str) -> bool:
+    """Whether an address is one of the loopback; of names only localhost is: others may mean any machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
+    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
+
+    Args:
+        config: Says who.
+        track: That a pilot is to fly; None: the one of its name.
+    """
+    assert config.actor is not None, "checked"
+    if config.actor == PILOT:
+        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
+
+        if config.track is None:
+            raise ValueError("track= is missing: actor=pilot has none of its own.")
+        rate = config.rate or PILOT_RATE
+        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config.track)
+    path = agent_path(config.actor)
+    flyer = ActorFlyer(path)
+    return flyer, flyer.contract
+
+
+def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> list[str]:
+    """Refuse to fly where actor, track, limits and flight controller are not of one kind; arming comes after this.
+
+    Returns:
+        What was not compared, or is as a person wants it, in words.
+
+    Raises:
+        ValueError: The message names what differs, line by line where settings of the flight controller do.
+        OSError: There is no such dump.
+    """
+    notes = []
+    if config.actor != PILOT and (note := check_contract(contract, track, config.rate)):
+        notes.append(note)
+    notes += check_ranges(contract, limits_of(config, track), given_limits(config))
+    if config.betaflight_dump is not None:
+        if config.link not in BETAFLIGHT:
+            raise ValueError(
+                f"betaflight_dump={config.betaflight_dump} is for link={', '.join(BETAFLIGHT)}: leave it out."
+            )
+        if config.arm_channel != FIRST_SWITCH:
+            raise ValueError(
+                f"betaflight_dump= is compared with arming by AUX1, arm_channel={FIRST_SWITCH}, and arm_channel="
+                f"{config.arm_channel}: leave one out."
+            )
+        count = require_dump(Path(config.betaflight_dump), contract, config.link)
+        notes.append(f"flight controller: {count} settings as wanted (betaflight_dump={config.betaflight_dump})")
+    elif config.arm and config.link in BETAFLIGHT:
+        notes.append("flight controller: its settings were not compared; betaflight_dump= of a `dump all` does that")
+    return notes
+
+
+def given_limits(config: HilConfig) -> dict[str, Any]:
+    """Return the limits of safety that were set."""
+    return {name: value for name, value in vars(config.limits).items() if value is not None}
+
+
+def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
+    """Return the limits of safety."""
+    return SafetyLimits.of_track(track, **given_limits(config))
+
+
+def pilot_contract(track: str) -> dict[str, Any]:
+    """Return what an actor's contract would say of the pilot."""
+    drone = QuadrotorParameters()
+    channels = [
+        {"name": f"body_rate_{axis}", "unit": "rad/s", "offset": 0.0, "scale": rate}
+        for axis, rate in zip("xyz", drone.body_rate_max, strict=True)
+    ]
+    scale = drone.collective_thrust_scale
+    thrust = {"name": "collective_thrust", "unit": "m/s^2", "offset": scale, "scale": scale}
+    return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
+
+
+def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
+    """Make the chain of a flyer."""
+    limits = limits_of(config, track)
+    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config))
+    camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
+    return FlightChain(flyer, track, settings, camera)
+
+
+def stamping_of(config: HilConfig) -> Stamping:
+    """Return how poses are stamped: what is read when the loop comes to it looks younger than it is."""
+    if config.stamping is not None:
+        return config.stamping
+    kernel = config.pose == "udp" or (config.pose == "mavlink" and config.pose_device is None)
+    return Stamping.receive if kernel else Stamping.sender
+
+
+def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> LinkConfig:
+    """Return what the link needs: sticks as `dreamer_racing.hil.betaflight` has the flight controller set."""
+    numbers = {name: getattr(config, name) for name in ("mass", "full_thrust", "reference_voltage", "voltage")}
+    missing = [name for name, number in numbers.items() if number is None]
+    if missing and config.link not in ("simulated", "udp"):
+        raise ValueError(f"{missing[0]}= is missing: link={config.link} turns thrust into a throttle by it.")
+    thrust = None if missing else ThrustMap(**numbers)
+    if thrust is not None:
+        check_battery(config, thrust)
+    port = 9101 if config.link_port is None and config.link in ("simulated", "udp") else config.link_port
+    return LinkConfig(
+        config.link,
+        config.link_host,
+        port,
+        config.device,
+        config.baud,
+        rate_map(contract),
+        thrust,
+        config.arm_channel,
+        rate,
+    )
+
+
+def battery_config(config: HilConfig) -> BatteryConfig | None:
+    """Return what is known of the battery; None where nothing more comes to be known."""
+    if config.link not in HEARING or config.voltage is None:
+        return None
+    return BatteryConfig(voltage=config.voltage, tolerance=config.voltage_tolerance, smoothing=config.voltage_smoothing)
+
+
+def check_battery(config: HilConfig, thrust: ThrustMap) -> None:
+    """Refuse to believe voltages that the thrust map cannot reckon with: in flight nothing may be refused.
+
+    Raises:
+        ValueError: The message names the setting and the voltage.
+    """
+    battery = battery_config(config)
+    for voltage in () if battery is None else battery.limits:
+        try:
+            replace(thrust, voltage=voltage)
+        except ValueError as error:
+            raise ValueError(
+                f"voltage_tolerance={config.voltage_tolerance:g}: with it {voltage:.4g} V would be believed. {error}"
+            ) from error
+
+
+def pose_config(config: HilConfig) -> PoseConfig:
+    """Return where poses come from."""
+    return PoseConfig(
+        name=config.pose,
+        host=config.pose_host,
+        port=config.pose_port,
+        device=config.pose_device,
+        baud=config.pose_baud,
+        topic=config.pose_topic,
+        message=config.pose_message,
+        smoothing=config.smoothing,
+    )
+
+
+def make_operator(config: HilConfig) -> OperatorSource:
+    """Open where the operator's word comes from, and say which it is if that was left open."""
+    name = config.operator
+    if name == "auto":
+        name = "timed" if config.link in SIMULATED else "keyboard"
+        print(f"operator: {name} (operator=auto, link={config.link})")
+    if name == "udp":
+        return UdpOperator(config.operator_port, config.operator_host)
+    return TimedOperator() if name == "timed" else KeyboardOperator()

@@ -1,0 +1,208 @@
+"""A page of a flight: scrub it in 3-D, with the on-board image, the actor's action and the value beside it.
+
+    python recipes/dashboard.py agent=kidney
+    python recipes/dashboard.py run=runs/dreamer_v3_kidney_20260101-120000
+    python recipes/dashboard.py run=runs/kidney_x against=runs/kidney_y output=page.html
+    python recipes/dashboard.py run=runs/kidney_x serve=8080
+
+Writes one HTML file that holds all it shows: open it in a browser, without a server, or send it to somebody. `run=` and
+`against=` take what flights were stored in: a run directory (its last evaluation), the folder of recipes/evaluate.py or
+recipes/fly.py, or a file *_trajectory.csv; or an agent that ships, by its name, which is flown once, deterministically.
+`agent=` flies checkpoints, too. `serve=` also shows it live, to browsers on this machine. Curves of training are
+TensorBoard's: the page says how to open it.
+"""
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, cast
+
+from composing.arena import worlds_of
+from composing.command_line import AGENTS, plain_errors, start_logging
+from composing.drawing import stage_name
+from composing.entry import recipe
+from composing.restoring import restore
+from composing.schema import EvaluateConfig
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.evaluation.protocol import fly as fly_races
+from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
+from dreamer_racing.export.shipped_agent import agents_in, is_agent
+from dreamer_racing.figures.dashboard import write_page
+from dreamer_racing.figures.dashboard_live import serve
+from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
+from dreamer_racing.figures.runs import evaluation_files
+from dreamer_racing.figures.scene_3d import check_viser
+from dreamer_racing.settings import SEED, Range, check_settings, setting
+from dreamer_racing.training.directory import RunDirectory
+
+PAGE = "dashboard.html"
+STORED = ("flight", "deterministic")
+"""Flights that recipes/fly.py and recipes/evaluate.py leave, by the beginnings of their files' names."""
+
+
+@dataclass
+class DashboardConfig:
+    """`recipes/dashboard.py`."""
+
+    run: str | None = None  # run directory, folder or file of stored flights, or name of an agent that ships
+    agent: str | None = None  # instead: what to fly now, as of recipes/fly.py: an agent, a run directory, a checkpoint
+    against: str | None = None  # another flight on the same track, as run=, to be shown in the same scene
+    output: str | None = None  # file; null: dashboard.html in the run's folder, of an agent in runs/agent_<name>
+    serve: int | None = setting(None, Range(1, 65535))  # port, to show it live, too, on this machine alone
+    renderer: str = "auto"  # of flights that are flown now; as env.renderer in training, docs/options.md
+    seed: int = setting(0, SEED)  # likewise
+
+
+ConfigStore.instance().store(name="dashboard_schema", node=DashboardConfig)
+
+
+class Source(NamedTuple):
+    """A flight, and where it came from."""
+
+    flight: ShownFlight
+    track: Track
+    folder: Path
+    """Of the run, or of what else it was stored in."""
+
+
+@recipe("dashboard")
+def main(composed: DictConfig) -> None:
+    """Find or fly the flights, write the page, and show it if asked to."""
+    start_logging()
+    with plain_errors():
+        config = cast(DashboardConfig, OmegaConf.to_object(composed))
+        check(config)
+        check_viser()
+        sources = find(config)
+        training = [how_it_trained(sources)]
+        flights, track = [source.flight for source in sources], sources[0].track
+        output = Path(config.output or from_here(sources[0].folder) / PAGE)
+        size = write_page(output, track, flights, training)
+    for line in (*training, *(line for flight in flights for line in missing(flight))):
+        print(line.replace("`", ""))
+    print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
+    if config.serve is not None:
+        show(track, flights, config.serve, training)
+
+
+def check(config: DashboardConfig) -> None:
+    """Refuse what would leave open which flight is meant.
+
+    Raises:
+        ValueError: the message names the field and what is right.
+    """
+    check_settings(config)
+    if (config.run is None) == (config.agent is None):
+        given = "neither is given" if config.run is None else f"both are given, {config.run} and {config.agent}"
+        raise ValueError(f"run= names a stored flight, agent= what to fly now: give one of them; {given}.")
+    if config.output is not None and Path(config.output).suffix not in (".html", ".htm"):
+        raise ValueError(f"output={config.output}: the page is one HTML file, whose name ends in .html.")
+
+
+def find(config: DashboardConfig) -> list[Source]:
+    """Find the flight asked for, and the one that it is to be compared with.
+
+    Raises:
+        ValueError: a file cannot be read, or the two flights are of different tracks.
+        OSError: there is no such flight.
+    """
+    places = [locate("run", config.run) if config.run is not None else str(config.agent)]
+    places += [] if config.against is None else [locate("against", config.against)]
+    sources = [read(place) if isinstance(place, Path) else fly(place, config) for place in places]
+    first, *others = sources
+    for other in others:
+        if other.track != first.track:
+            again = " with other gates" if other.track.name == first.track.name else ""
+            raise ValueError(
+                f"against={config.against} was flown on {other.track.name}{again}, {first.flight.title} on "
+                f"{first.track.name}: only flights on one track can be shown in one scene."
+            )
+    return sources
+
+
+def locate(setting_name: str, place: str) -> Path | str:
+    """Find what `run=` and `against=` name: the file of a stored flight, or an agent that is to be flown.
+
+    Raises:
+        FileNotFoundError: there is nothing of that name, or no flight in it; the message says what would be right.
+    """
+    path = Path(place)
+    if path.is_file():
+        return path
+    if is_agent(path) or (path.name == place and is_agent(AGENTS / place)):
+        return place
+    if not path.exists():
+        there = ", ".join(agents_in(AGENTS)) or "none"
+        raise FileNotFoundError(
+            f"{setting_name}={place}: there is no such run directory or file. Agents that ship, by name: {there}."
+        )
+    flights = stored_flights(path)
+    if not flights:
+        raise FileNotFoundError(
+            f"{setting_name}={place} holds no flight: no *{NUMBERS} in it or in its evaluations/, which every "
+            f"evaluation leaves. agent={place} flies its newest checkpoint now."
+        )
+    return flights[-1]
+
+
+def stored_flights(folder: Path) -> list[Path]:
+    """List the flights of a run's evaluations, the last one last; or those that a recipe left in its own folder."""
+    if evaluated := list(evaluation_files(folder, NUMBERS).values()):
+        return evaluated
+    places = (folder, RunDirectory(folder).evaluations)
+    return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]
+
+
+def read(file: Path) -> Source:
+    """Read a stored flight with its track; run and evaluation are its title."""
+    trajectory, track = read_flight(file)
+    folder = file.absolute().parent
+    if folder.name == RunDirectory(folder).evaluations.name:
+        folder = folder.parent
+    if folder.name.startswith(RunDirectory(folder).evaluation.name):  # of recipes/evaluate.py, in the run
+        folder = folder.parent
+    stage = "" if file.name == f"{STORED[0]}{NUMBERS}" else f", {stage_name(file)}"
+    return Source(ShownFlight(f"{folder.name}{stage}", trajectory), load_track(track), folder)
+
+
+def fly(place: str, config: DashboardConfig) -> Source:
+    """Fly the deterministic policy of an agent once, as recipes/fly.py does."""
+    restored = restore(EvaluateConfig(checkpoint=place, renderer=config.renderer, seed=config.seed))
+    worlds = worlds_of(restored.trained) | {"seed": config.seed}
+    policy, judge = restored.flyer.evaluation_policy(), restored.flyer.judge()
+    flown = fly_races(policy, worlds, episodes=1, judge=judge)
+    print(flown.summary())
+    name = restored.checkpoint.name if is_agent(restored.checkpoint) else restored.run_dir.name
+    flight = ShownFlight(f"{name}, {restored.env_steps:,} env_steps", flown.trajectories[0])
+    return Source(flight, load_track(worlds["track"]), restored.run_dir)
+
+
+def how_it_trained(sources: list[Source]) -> str:
+    """Say how the curves of training are opened: they are TensorBoard's."""
+    logged = {from_here(source.folder): None for source in sources if (source.folder / "tensorboard").is_dir()}
+    if not logged:
+        return "Training curves: these flights lie in no run directory with TensorBoard files."
+    if len(logged) == 1:
+        return f"Training curves: `tensorboard --logdir {shlex.quote(str(*logged))}`"
+    runs = ",".join(f"{folder.name}:{folder}" for folder in logged)
+    return f"Training curves: `tensorboard --logdir_spec {shlex.quote(runs)}`"
+
+
+def from_here(folder: Path) -> Path:
+    """Return a folder as seen from the working directory, if it lies there: pages are shown to others."""
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+
+
+def show(track: Track, flights: list[ShownFlight], port: int, training: list[str]) -> None:
+    """Serve until interrupted."""
+    try:
+        serve(track, flights, port, training, lambda address: print(f"live: {address} until Ctrl+C", flush=True))
+    except KeyboardInterrupt:
+        print("ended")
+
+
+if __name__ == "__main__":
+    main()

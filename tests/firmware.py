@@ -1,0 +1,74 @@
+"""A stand-in for Betaflight's SITL firmware, from the firmware's side: it uses nothing of what it is to test."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+IDLE = 0.055  # of the motors, armed
+MIN_CHECK = 1050  # µs: arms below, and the throttle begins there
+FULL_STICK = np.radians((580.0, 580.0, 230.0))  # rad/s: ACTUAL rates of 58, 58, 23 without expo
+FAILSAFE = 0.5  # s: failsafe_delay = 5, procedure DROP
+STATE_DT = 0.001  # s from one state packet to the next, and so its clock: the stamps stand still
+
+
+class Firmware:
+    """A rate controller that reads and writes the firmware's packets.
+
+    It turns the rates around as sitl.c does, holds a rate with a mixer for motors in Betaflight's order, and idles when
+    armed. With `hear` it is flown by a radio: it arms by AUX1 at low throttle only, once it has been seen disarmed, and
+    drops when the radio falls silent; without, what it is to do is set from outside.
+    """
+
+    GAIN = np.array((0.045, 0.045, 0.12))  # motor command per rad/s
+
+    def __init__(self, version: str) -> None:
+        self.version = version
+        self.armed, self.throttle, self.rates = False, 0.0, np.zeros(3)  # rates: right, forward and LEFT positive
+        self.stamps: set[float] = set()
+        self.gyro = np.zeros(3)
+        self.accelerometer = np.zeros(3)
+        self.time, self.refused = 0.0, 0
+        self._heard: float | None = None  # when the radio last spoke; None: never, or not since it was lost
+        self._may_arm = False
+
+    def hear(self, data: bytes) -> None:
+        """Read a packet of the radio: f64 stamp, 16 u16 µs in the order AETR, then AUX1."""
+        roll, pitch, throttle, yaw, aux1 = struct.unpack("<d16H", data)[1:6]
+        self._heard = self.time
+        wants = 1700 <= aux1 <= 2100
+        if not wants:
+            self.armed, self._may_arm = False, True
+        elif not self.armed:
+            self.armed = self._may_arm and throttle < MIN_CHECK
+            self.refused += not self.armed
+        right, forward, yaw_right = (np.array((roll, pitch, yaw)) - 1500.0) / 500.0 * FULL_STICK
+        self.rates = np.array((right, forward, -yaw_right))
+        share = max(throttle - MIN_CHECK, 0) / (2000 - MIN_CHECK)
+        self.throttle = IDLE + (1.0 - IDLE) * share
+
+    def answer(self, data: bytes) -> bytes:
+        """Take a state packet; return the motors'."""
+        self.time += STATE_DT
+        if self._heard is not None and self.time - self._heard > FAILSAFE:
+            self.armed, self._may_arm, self._heard = False, False, None
+        numbers = struct.unpack("<18d", data)
+        self.stamps.add(numbers[0])
+        x, y, z = numbers[1:4]
+        self.gyro = np.array((x, -y, z if self.version == "2026.6" else -z))  # sitl.c, updateState
+        self.accelerometer = -np.array(numbers[4:7])
+        return self.pack(self.motors())
+
+    def motors(self) -> np.ndarray:
+        """M1 … M4: rear right, front right, rear left, front left."""
+        if not self.armed:
+            return np.zeros(4)
+        roll, pitch, yaw = self.GAIN * (self.rates - self.gyro)
+        mix = np.array((-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw))
+        return np.clip(self.throttle + mix, IDLE, 1.0) if self.throttle > 0.0 else np.full(4, IDLE)
+
+    def pack(self, motors: np.ndarray) -> bytes:
+        """Return the packet of four motors, in this version's order."""
+        m1, m2, m3, m4 = motors
+        return struct.pack("<4f", *((m1, m2, m3, m4) if self.version == "2026.6" else (m2, m3, m4, m1)))

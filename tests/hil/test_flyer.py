@@ -1,0 +1,76 @@
+"""Contracts against what an actor is to fly: track, rate, camera, and what safety lets through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dreamer_racing.envs import tracks
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.hil.flyer import check_contract, check_ranges
+from dreamer_racing.hil.safety_limits import SafetyLimits
+
+AGENTS = Path(__file__).parents[2] / "agents"
+CIRCLE = load_track("circle")
+
+
+def contract_of(agent: str) -> dict:
+    return read_contract(AGENTS / agent / "contract.json")
+
+
+@pytest.mark.parametrize("agent", ["kidney", "circle", "figure8"])
+def test_agents_that_ship_fit_their_tracks(agent):
+    track = load_track(agent)
+    assert check_contract(contract_of(agent), track, 25.0) is None
+    assert check_ranges(contract_of(agent), SafetyLimits.of_track(track)) == []
+
+
+def test_a_contract_that_does_not_fit_is_refused_with_what_differs():
+    contract, kidney = contract_of("kidney"), load_track("kidney")
+    assert check_contract(contract, kidney, 25.0) is None
+    with pytest.raises(
+        ValueError,
+        match=r"source.track is 'kidney', whose .*, and .* track=circle .*; control.rate_hz is 25, and rate=50",
+    ):
+        check_contract(contract, CIRCLE, 50.0)
+    with pytest.raises(ValueError, match=r"camera says images of \[1, 96, 64, 3\], and the input image_u8 is"):
+        check_contract({**contract, "camera": {**contract["camera"], "height_px": 96}}, kidney)
+
+
+def test_a_track_is_known_by_its_gates_not_by_its_name(tmp_path):
+    contract, file = contract_of("circle"), tmp_path / "mine.yaml"
+    built_in = (Path(tracks.__file__).parent / "circle.yaml").read_text(encoding="utf-8")
+    file.write_text(built_in, encoding="utf-8")
+    assert check_contract(contract, load_track(file)) is None  # the same, in a file of another name
+    file = tmp_path / "circle.yaml"
+    file.write_text(built_in.replace("4.0", "4.1"), encoding="utf-8")
+    with pytest.raises(ValueError, match="source.track is 'circle', whose gates, .* and those of track=circle have"):
+        check_contract(contract, load_track(file))
+
+
+def test_an_older_contract_is_compared_by_name_and_says_so():
+    contract = contract_of("circle")
+    del contract["source"]["track_sha256"]
+    note = check_contract(contract, CIRCLE)
+    assert note is not None and "no source.track_sha256: circle was compared by its name only" in note
+    with pytest.raises(ValueError, match="source.track is 'circle', and track=kidney"):
+        check_contract(contract, load_track("kidney"))
+
+
+def test_what_safety_would_clip_is_refused_unless_it_is_meant():
+    contract, limits = contract_of("circle"), SafetyLimits.of_track(CIRCLE)
+    assert check_ranges(contract, limits) == []
+    for channel in contract["action"]["channels"]:
+        channel["scale"], channel["offset"] = 1.6 * channel["scale"], 1.6 * channel["offset"]
+    with pytest.raises(
+        ValueError,
+        match=r"limits.rate_max=\[10,10,4\] clips the actor, .* up to \[16,16,6.4\] rad/s .* Set limits.rate_max=\[16",
+    ):
+        check_ranges(contract, limits)
+    with pytest.raises(ValueError, match=r"limits.thrust_max=30 clips the actor, which asks for up to 42.\d+ m/s²"):
+        check_ranges(contract, replace(limits, rate_max=(16.0, 16.0, 6.4)))
+    said = check_ranges(contract, limits, meant=("rate_max", "thrust_max"))
+    assert [words.partition("=")[0] for words in said] == ["limits.rate_max", "limits.thrust_max"]
