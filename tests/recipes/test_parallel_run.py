@@ -56,6 +56,8 @@ def test_two_processes_are_stopped_by_a_signal_and_one_goes_on(tmp_path: Path) -
     assert said.count("Traceback") == 1 and "SignalException" in said, "torchrun's own alone"
     manifest = json.loads((saved / "manifest.json").read_text())
     assert manifest["metadata"]["processes"] == 2 and (saved / "process-1" / "manifest.json").exists()
+    own = json.loads((saved / "process-1" / "manifest.json").read_text())["components"]
+    assert "journal" in manifest["components"] and not {"journal", "learner", "counters"} & own.keys()
     assert OmegaConf.load(run_dir / "config.yaml").env.num_envs == 4, "the configuration is of all"
 
     done = recipe("dreamer_v3", "resume=run", f"total_env_steps={env_steps + 64}", cwd=tmp_path)

@@ -21,7 +21,7 @@ from dreamer_racing.losses import ActorPPOConfig, LossConfig, make_losses
 from dreamer_racing.modules import Agent, Interface, get_size
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.training import parallel
-from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints
+from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
 from tests.learners.test_dreamer import make_batch
 
@@ -314,3 +314,14 @@ def test_a_checkpoint_of_two_processes_is_restored_by_one_two_or_four(tmp_path: 
     together(tmp_path, 2, save_shares, load_shares)
     for processes in (1, 4):
         together(tmp_path, processes, load_shares)
+    (saved,) = (tmp_path / "checkpoints").iterdir()
+    for file in [path for path in sorted((saved / "process-1").rglob("*")) if path.is_file()]:
+        content = file.read_bytes()
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        with pytest.raises(RunCheckpointError, match="process-1/.* is not what was saved"):
+            newest_sound(saved)
+        file.write_bytes(content)
+    assert newest_sound(saved, ["counters"]) == saved
+    (saved / "process-1" / "manifest.json").unlink()
+    with pytest.raises(RunCheckpointError, match=r"process-1/manifest\.json is not what was saved"):
+        newest_sound(saved, ["counters"])
