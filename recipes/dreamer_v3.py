@@ -4,11 +4,13 @@
     python recipes/dreamer_v3.py track=figure8 env=faithful model=size12m total_env_steps=2000000
     python recipes/dreamer_v3.py resume=runs/dreamer_v3_kidney_20260101-120000
     python recipes/dreamer_v3.py env=dmc task=cartpole_swingup
+    torchrun --nproc-per-node=2 recipes/dreamer_v3.py track=kidney   # processes that share worlds, replay and batch
 
 Everything of a run lands in its run directory: checkpoints/, metrics.csv, tensorboard/, videos/, plots/, config.yaml.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, cast
 
 from composing.arena import make_env
@@ -28,6 +30,7 @@ from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import Collection, DreamerConfig, register
+from composing.sharing import share_of
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -39,6 +42,7 @@ from dreamer_racing.learners.dreamer import DreamerLearner, make_optimizer
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Interface
+from dreamer_racing.training import parallel
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.run import ReplayRun
@@ -100,8 +104,9 @@ class DreamerRun(ReplayRun):
         periods = self.counters["env_steps"] // self.config.schedule.wait_every
         if self.lag.limit is None or periods == self.lag.periods:
             return
-        self.lag.periods, measured = periods, self.held_out()
-        error = lag_error(measured, "held_out/")
+        self.lag.periods = periods
+        measured = lag_error(self.held_out(), "held_out/")
+        error = parallel.agreed(None if measured is None else float(measured))  # the first holds out worlds for all
         if error is not None:
             self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
 
@@ -135,6 +140,12 @@ class DreamerRun(ReplayRun):
         """Take in the rollout that is under way, if there is one."""
         if isinstance(self.rollouts, OverlappedRollouts) and (rollout := self.rollouts.drain()) is not None:
             self.take_in(rollout)
+
+    def save(self) -> Path:
+        """Save everything, if the processes' networks are still the same."""
+        self.learner.check_finite()  # first: weights that are no numbers are never the same
+        parallel.check_same([*self.learner.agent.parameters()])
+        return super().save()
 
     def close(self) -> None:
         """End the thread that collects, if there is one."""
@@ -193,24 +204,25 @@ def resolve(config: DictConfig) -> DictConfig:
 def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check_dreamer(config)
+    own = share_of(config)
     lock = claim(config)
-    env = make_env(config)
+    env = make_env(own)
     with seeded(config.seed):
-        agent = make_agent(config, Interface.of(env))
-        losses = make_losses(agent, config.loss, config.model.imagination_horizon)
-    learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, config.model), config.model)
+        agent = make_agent(own, Interface.of(env))
+        losses = make_losses(agent, own.loss, own.model.imagination_horizon)
+    learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, own.model), own.model)
     if config.init_from and not config.resume:
         print(begin_with(learner, config, env))
-    seed_generators(config.seed)
+    seed_generators(own.seed)
     curriculum = make_curriculum(config)
     policy = learner.policy()
     overlapped = config.collection is Collection.overlapped
     acting = acting_copy(policy) if overlapped else policy
-    collector = make_collector(config, env, acting)
+    collector = make_collector(own, env, acting)
     rollouts = OverlappedRollouts(collector, acting, policy) if overlapped else None
     latents = learner.latent_format if config.replay.context else None
     parts = {
-        "replay": make_sequence_replay(config, env, curriculum, latents),
+        "replay": make_sequence_replay(own, env, curriculum, latents),
         "ratio": config.replay_ratio,
         "lag": ModelLag(config.schedule.wait_for_model),
         "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),

@@ -141,6 +141,11 @@ class StreamReplay(TensorDictReplayBuffer):
         self.reward_keys = tuple(reward_keys)
         self.latents = latents
 
+    @property
+    def num_streams(self) -> int:
+        """N."""
+        return self._writer.num_streams
+
     def extend(self, rollout: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Appends a collector's rollout ``[N, T]``; see `records_from_rollout`. Returns the slots, int64 ``(M,)``."""
         records = records_from_rollout(rollout, self.observation_keys, self.reward_keys, self.latents)
@@ -207,20 +212,75 @@ class StreamReplay(TensorDictReplayBuffer):
                 of older versions were.
         """
         path = Path(path)
-        state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
-        keys = [field["key"] if isinstance(field["key"], str) else tuple(field["key"]) for field in state["fields"]]
-        self._check_fields(keys, state["fields"])
-        self._check_frames(path, state)
+        state = self._read_state(path)
         self._writer.load_state_dict(state["streams"])
-        with ExitStack() as stack:
-            files = [stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(keys))]
-            for index, part in enumerate(self._filled()):
-                records = TensorDict({}, batch_size=[part.stop - part.start])
-                for key, field, file in zip(keys, state["fields"], files, strict=True):
-                    shape = (*records.batch_size, *field["shape"])
-                    records.set(key, _expanded(file.read(field["frames"][index]), shape, _dtype(field)))
-                self._storage.set(part, records, set_cursor=False)
+        self._read_streams(path, state, range(self._writer.num_streams), first=0)
         self._rng.set_state(torch.tensor(state["generator"], dtype=torch.uint8))
+
+    def deal(self, paths: Sequence[str | Path], skip: int) -> None:
+        """Takes as many streams as this replay has of those that several replays saved, one replay after the other.
+
+        What they held is dealt anew so, to another number of replays. The random generator stays as it is.
+
+        Args:
+            paths: of what each saved.
+            skip: streams at the beginning that others take.
+
+        Raises:
+            ValueError: as ``loads``; also if there are not as many streams.
+        """
+        here, wanted, before = self._writer, range(skip, skip + self._writer.num_streams), 0
+        streams = {"num_streams": here.num_streams, "stream_length": here.stream_length, "write_count": 0}
+        dealt: list[tuple[Path, dict[str, Any], range, int]] = []  # folder, what it holds, which of it, to where
+        cursor, filled = list[int](), list[int]()
+        for path in map(Path, paths):
+            state = self._read_state(path)
+            saved = state["streams"]
+            StreamWriter(saved["num_streams"], here.stream_length).check(saved)
+            begin, end = (min(max(stream - before, 0), saved["num_streams"]) for stream in (skip, wanted.stop))
+            chosen = range(begin, end)
+            dealt.append((path, state, chosen, len(filled)))
+            cursor += [saved["cursor"][stream] for stream in chosen]
+            filled += [saved["filled"][stream] for stream in chosen]
+            before += saved["num_streams"]
+        if len(filled) != here.num_streams:
+            raise ValueError(
+                f"The saved replays have {before} streams, too few for those from {skip} to {wanted.stop}: resume with "
+                "the same number of environments."
+            )
+        here.load_state_dict({**streams, "cursor": cursor, "filled": filled, "write_count": sum(filled)})
+        for path, state, chosen, first in dealt:
+            self._read_streams(path, state, chosen, first)
+
+    def _read_state(self, path: Path) -> dict[str, Any]:
+        """Read what a folder says that it holds; refuse what does not fit here, before anything is restored."""
+        state = json.loads((path / "replay.json").read_text(encoding="utf-8"))
+        for field in state["fields"]:
+            field["key"] = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
+        self._check_fields([field["key"] for field in state["fields"]], state["fields"])
+        self._check_frames(path, state)
+        return state
+
+    def _read_streams(self, path: Path, state: dict[str, Any], chosen: range, first: int) -> None:
+        """Read some of a folder's streams, to those of this replay that begin at ``first``."""
+        filled, length = state["streams"]["filled"], self._writer.stream_length
+        with ExitStack() as stack:
+            files = [
+                stack.enter_context((path / _FIELD.format(number)).open("rb")) for number in range(len(state["fields"]))
+            ]
+            frame = sum(count > 0 for count in filled[: chosen.start])  # an empty stream has none
+            for field, file in zip(state["fields"], files, strict=True):
+                file.seek(sum(field["frames"][:frame]))
+            for stream in chosen:
+                if not filled[stream]:
+                    continue
+                records = TensorDict({}, batch_size=[filled[stream]])
+                for field, file in zip(state["fields"], files, strict=True):
+                    shape = (*records.batch_size, *field["shape"])
+                    records.set(field["key"], _expanded(file.read(field["frames"][frame]), shape, _dtype(field)))
+                start = (first + stream - chosen.start) * length
+                self._storage.set(slice(start, start + filled[stream]), records, set_cursor=False)
+                frame += 1
 
     def _filled(self) -> list[slice]:
         """The filled slots of each stream: a ring that is not full has never wrapped."""

@@ -181,16 +181,24 @@ class StreamWriter(Writer):
         Raises:
             ValueError: if the state is of other streams than this writer's.
         """
+        self.check(state_dict)
+        self.cursor = torch.tensor(state_dict["cursor"], dtype=torch.int64)
+        self.filled = torch.tensor(state_dict["filled"], dtype=torch.int64)
+        self._write_count = state_dict["write_count"]
+        self._storage.set_length(int(self.filled.sum()))
+
+    def check(self, state_dict: dict[str, Any]) -> None:
+        """Refuse the state of other streams than this writer's.
+
+        Raises:
+            ValueError: the message gives both.
+        """
         saved = (state_dict["num_streams"], state_dict["stream_length"])
         if saved != (self.num_streams, self.stream_length):
             raise ValueError(
                 f"The saved replay has {saved[0]} streams of {saved[1]} records, this one has {self.num_streams} of "
                 f"{self.stream_length}: resume with the same number of environments and the same capacity."
             )
-        self.cursor = torch.tensor(state_dict["cursor"], dtype=torch.int64)
-        self.filled = torch.tensor(state_dict["filled"], dtype=torch.int64)
-        self._write_count = state_dict["write_count"]
-        self._storage.set_length(int(self.filled.sum()))
 
     def dumps(self, path: str | Path) -> None:
         """Save the bookkeeping as JSON."""

@@ -29,6 +29,7 @@ from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, check_settings, setting
+from dreamer_racing.training import parallel
 
 
 @dataclass
@@ -194,6 +195,8 @@ class DreamerLearner:
         if self._actor_optimizer is not None:
             cast(ActorLoss, self.losses["actor"]).prepare(self._number_of_starts(batch))
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
+        if parallel.count() > 1:
+            metrics = self._of_all_processes(metrics, timed)
         self._guard.check(metrics, batch)
         with timed("optimise"):
             self.optimizer.step()
@@ -204,6 +207,7 @@ class DreamerLearner:
         if self._actor_optimizer is not None and not self.actor_waits:
             with timed("improve"), self.autocast():
                 improved = cast(ActorLoss, self.losses["actor"]).improve(self.updates)
+            improved = parallel.averaged(improved)
             if improved:
                 self._guard.check(improved, batch)
             metrics |= improved
@@ -300,12 +304,28 @@ class DreamerLearner:
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with timed("optimise"):
             total.backward()
-            norms = {
-                f"gradient_norm/{name}": _gradient_norm(parameters)
-                for name, parameters in self._networks.items()
-                if any(parameter.grad is not None for parameter in parameters)  # none, where the actor steps alone
-            }
+            norms = self._gradient_norms()
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
+
+    def _gradient_norms(self) -> dict[str, Tensor]:
+        """Return the norm of each network's gradient by the metric's name."""
+        return {
+            f"gradient_norm/{name}": _gradient_norm(parameters)
+            for name, parameters in self._networks.items()
+            if any(parameter.grad is not None for parameter in parameters)  # none, where the actor steps alone
+        }
+
+    def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
+        """Turn gradients and metrics of this process's share of the batch into those of the joint batch.
+
+        One exchange of a flat tensor between backward and the optimiser's step, behind a captured graph, and not
+        ``DistributedDataParallel``: gradients come from one backward through several losses, and a metric that is not
+        finite reaches all processes with them, so that all stop at the same update.
+        """
+        with timed("exchange"):
+            networks = (parameter for parameters in self._networks.values() for parameter in parameters)
+            metrics = parallel.average_gradients(networks, metrics)
+            return metrics | self._gradient_norms()
 
     def compute_losses(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""

@@ -20,6 +20,25 @@ def own_state(loss: LossModule) -> dict[str, Tensor]:
     return {key: value for key, value in loss.state_dict().items() if not key.startswith(networks)}
 
 
+class LossState:
+    """A loss as a part of a checkpoint: what it has and keeps, without the networks.
+
+    Args:
+        loss: Of any of them.
+    """
+
+    def __init__(self, loss: LossModule) -> None:
+        self._loss = loss
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return it."""
+        return own_state(self._loss)
+
+    def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
+        """Restore what ``state_dict`` returned."""
+        self._loss.load_state_dict(state_dict, strict=False)
+
+
 def check_saved(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
     """Refuse what another learner saved.
 

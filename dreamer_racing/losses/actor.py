@@ -22,6 +22,7 @@ from dreamer_racing.modules.actor import Actor
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import WorldModel
+from dreamer_racing.training import parallel
 
 
 class Judgement(NamedTuple):
@@ -173,7 +174,7 @@ class ActorLoss(LossModule):
         returns = lambda_return(reward, value[1:], discount, self.lambda_)
         start = 1.0 - terminated.to(discount.dtype).unsqueeze(0)
         if self.training:
-            self.return_normalizer.update(returns.detach())
+            self.return_normalizer.update(parallel.gathered(returns.detach(), dim=1))
         return Judgement(
             reward=reward.detach(),
             continuation=continuation.detach(),

@@ -22,6 +22,7 @@ from dreamer_racing.losses.actor import ActorLoss
 from dreamer_racing.losses.config import HORIZON, ActorPPOConfig, LossConfig
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.training import parallel
 
 KL_TOLERANCE = 1.5
 """Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
@@ -164,6 +165,8 @@ class ClippedActorLoss(ActorLoss):
         """Make one gradient step of a network, unless its gradient is not finite; return the norm before clipping."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if parallel.count() > 1:
+            parallel.average_gradients(network.parameters())
         norm = nn.utils.clip_grad_norm_(network.parameters(), self.ppo.gradient_clip)
         if norm.isfinite():
             self.optimizer.step()
@@ -179,10 +182,10 @@ def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tenso
 
 
 def normalised(advantage: Tensor, weight: Tensor) -> Tensor:
-    """Return advantages ``(..., 1)`` with mean 0 and deviation 1 under their weights ``(..., 1)``."""
-    share = weight / weight.sum().clamp_min(1e-8)
-    mean = (share * advantage).sum()
-    deviation = (share * (advantage - mean).square()).sum().sqrt()
+    """Return advantages ``(..., 1)`` with mean 0 and deviation 1, over all processes, under weights ``(..., 1)``."""
+    share = weight / parallel.total(weight.sum()).clamp_min(1e-8)
+    mean = parallel.total((share * advantage).sum())
+    deviation = parallel.total((share * (advantage - mean).square()).sum()).sqrt()
     return (advantage - mean) / (deviation + 1e-8)
 
 
@@ -210,8 +213,9 @@ def clipped_objective(
     gain = torch.minimum(ratio * batch.advantage, bounded * batch.advantage)
     loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
     with torch.no_grad():
-        reached = batch.weight.sum().clamp_min(1e-8)
-        kl = (batch.weight * normal_divergence(old, policy)).sum() / reached  # of what the objective counts
+        reached = parallel.total(batch.weight.sum()).clamp_min(1e-8)
+        diverged = parallel.total((batch.weight * normal_divergence(old, policy)).sum())
+        kl = diverged / reached  # of what the objective counts, in all processes: it ends the epochs of all
         clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
     return loss, {"ppo/kl": kl, "ppo/clipped": clipped}
 

@@ -4,6 +4,11 @@ A checkpoint is a folder ``<run_dir>/checkpoints/checkpoint-<env_steps>`` in the
 written beside its final place and renamed into it, so that a folder of that name is always complete; what a killed
 process leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every
 file lies beside them and is compared before anything is read.
+
+Where several processes train together (`training.parallel`), a checkpoint is of all of them: the first one's parts lie
+where a single one's do, and what each of the others has of its own (worlds, replay, random state) lies below
+``process-<n>``, written by itself. Any number of processes can restore it: what is common they all read, and what they
+have of their own is read back if they are as many as before; else the replay is dealt anew, and the rest begins anew.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ import logging
 import os
 import shutil
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +33,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
+from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import (
     PREFIX,
     REPLACED,
@@ -42,6 +48,8 @@ CHECKSUMS = "checksums.json"
 """The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
 HAS_CHECKSUMS = "checksums"
 """In the metadata of a checkpoint that was saved with that file: if it is not there, it was lost."""
+PROCESS, PROCESSES = "process-", "processes"
+"""Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
 
 logger = logging.getLogger(__name__)
 
@@ -104,12 +112,14 @@ class RunCheckpoints:
     plain Python values (learner, optimiser, curriculum), or is a dictionary of JSON values, restored in place
     (counters). The random state of Python, NumPy and torch is always saved with them, as the part ``random_state``.
 
-    One process at a time may write below a run directory.
+    One run at a time may write below a run directory.
 
     Args:
         run_dir: folder of the run; checkpoints go to its subfolder ``checkpoints``.
         components: the parts by name.
         keep_last: checkpoints kept.
+        own: which of them each of several processes has of its own, beside the random state. Then all of them must save
+            and load together. Empty: the first one's are all there is, and it saves alone.
 
     Example:
         >>> counters = {"env_steps": 0}
@@ -118,14 +128,19 @@ class RunCheckpoints:
         >>> checkpoints.load()  # doctest: +SKIP
     """
 
-    def __init__(self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2) -> None:
+    def __init__(
+        self, run_dir: str | Path, components: Mapping[str, Any], keep_last: int = 2, own: Collection[str] = ()
+    ) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).checkpoints
         self.components = components
+        self._own_names = frozenset(own)  # also of parts that the other processes alone have
+        self._own = {name: components[name] for name in own if name in components}
         self._checkpoint = _bind({**components, "random_state": RandomState()})
         self._keep_last = keep_last
         self._last_saved: Path | None = None
-        ensure_writable(self.directory)
-        _remove_partial(self.directory)
+        if parallel.is_first():
+            ensure_writable(self.directory)
+            _remove_partial(self.directory)
 
     def save(self, env_steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
         """Saves all parts and removes the oldest checkpoints beyond ``keep_last``.
@@ -147,25 +162,40 @@ class RunCheckpoints:
         if final == self._last_saved:
             return final
         partial = self.directory / f".{final.name}.partial"
+        processes = {PROCESSES: parallel.count()} if self._own and parallel.count() > 1 else {}
+        about = {**(metadata or {}), "env_steps": env_steps, **processes, HAS_CHECKSUMS: True}
+        first = parallel.is_first()
         try:
-            self._checkpoint.save(partial, metadata={**(metadata or {}), "env_steps": env_steps, HAS_CHECKSUMS: True})
-            _check_loadable(partial)
-            write_checksums(partial)
-            _sync_tree(partial)
-            _publish(partial, final)
+            self._step(lambda: self._checkpoint.save(partial, metadata=about), of_this_process=first)
+            self._step(lambda: self._save_own(partial), of_this_process=not first)
+            self._step(lambda: _complete(partial, final), of_this_process=first)
         except Exception as error:
-            shutil.rmtree(partial, ignore_errors=True)
+            if first:
+                shutil.rmtree(partial, ignore_errors=True)
             raise RunCheckpointError(
                 f"The checkpoint {final} could not be written ({error}). Earlier checkpoints are untouched; check the "
                 "free space and the permissions of that folder, then resume."
             ) from error
         self._last_saved = final
-        try:
-            self._remove_later(final)
-            self._remove_oldest()
-        except OSError as error:  # what was asked for is done
-            logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
+        if first:
+            try:
+                self._remove_later(final)
+                self._remove_oldest()
+            except OSError as error:  # what was asked for is done
+                logger.warning("Checkpoints beside %s that are not kept could not be removed: %s.", final.name, error)
         return final
+
+    def _step(self, action: Callable[[], object], of_this_process: bool) -> None:
+        """Do one step of a save, if it is this process's; where all save together, wait for the others to do theirs."""
+        action = action if of_this_process else lambda: None
+        if self._own:
+            parallel.together(action)
+        else:
+            action()
+
+    def _save_own(self, checkpoint: Path) -> None:
+        """Save what this process has of its own into a checkpoint that the first one has begun."""
+        _bind({**self._own, "random_state": RandomState()}).save(checkpoint / f"{PROCESS}{parallel.rank()}")
 
     def load(
         self,
@@ -191,7 +221,43 @@ class RunCheckpoints:
         """
         self._last_saved = None
         parts = {**self.components, "random_state": RandomState()}
-        return load_components(self.directory if path is None else path, parts, map_location, may_lack)
+        if not self._own:
+            return load_components(self.directory if path is None else path, parts, map_location, may_lack)
+        looked_at = {*parts, *self._own_names}
+        source = Path(parallel.agreed(_path_of_sound(self.directory if path is None else path, looked_at)))
+        metadata = Checkpoint.manifest(source)["metadata"]
+        own = {name: part for name, part in parts.items() if name in self._own or name == "random_state"}
+        if (saved := metadata.get(PROCESSES, 1)) != parallel.count():
+            _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
+            self._deal(source, saved)
+        elif parallel.is_first():
+            _load_sound(source, parts, map_location, may_lack)
+        else:
+            _load_sound(source, {name: part for name, part in parts.items() if name not in own}, map_location, may_lack)
+            _load_sound(source / f"{PROCESS}{parallel.rank()}", own, map_location, ())
+        return metadata
+
+    def _deal(self, source: Path, saved: int) -> None:
+        """Deal replays that another number of processes saved; the first takes the last streams, which may be held out.
+
+        So does a single process, whose streams are all in one piece: the order of pieces is that of falling ranks.
+        """
+        for name, part in self._own.items():
+            if not hasattr(part, "deal"):
+                continue
+            folders = [source / f"{PROCESS}{rank}" if rank else source for rank in reversed(range(saved))]
+            paths = [folder / Checkpoint.manifest(folder)["components"][name]["path"] for folder in folders]
+            try:
+                part.deal(paths, skip=(parallel.count() - 1 - parallel.rank()) * part.num_streams)
+            except (OSError, ValueError) as error:
+                raise RunCheckpointError(f"The checkpoint {source} could not be restored. {error}") from error
+        logger.info(
+            "%s was saved by another number of processes (%d there, %d here): its replay is dealt anew; worlds, random "
+            "numbers and steps kept for the next improvement begin anew.",
+            source.name,
+            saved,
+            parallel.count(),
+        )
 
     def _remove_later(self, newest: Path) -> None:
         for path in self._complete():
@@ -256,10 +322,21 @@ def load_components(
         FileNotFoundError: if there is no complete checkpoint.
         RunCheckpointError: if all are damaged, or a part is missing or does not fit.
     """
-    source = newest_sound(path, components)
+    return _load_sound(newest_sound(path, components), components, map_location, may_lack)
+
+
+def _load_sound(
+    source: Path, components: Mapping[str, Any], map_location: torch.device | str, may_lack: Collection[str]
+) -> dict[str, Any]:
+    """Restores some parts of a checkpoint, or of what one process has there, whose files are known to be sound."""
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
     there = {name: part for name, part in components.items() if name not in lacking}
     return _restore(_bind(there), source, map_location)
+
+
+def _path_of_sound(path: str | Path, parts: Collection[str]) -> str:
+    """Returns where the newest sound checkpoint is; nothing where another process looks."""
+    return str(newest_sound(path, parts)) if parallel.is_first() else ""
 
 
 def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path:
@@ -342,6 +419,14 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
         raise RunCheckpointError(f"The checkpoint {source} could not be restored. {reason}") from error
 
 
+def _complete(partial: Path, final: Path) -> None:
+    """Makes a checkpoint of what was written beside its place."""
+    _check_loadable(partial)
+    write_checksums(partial)
+    _sync_tree(partial)
+    _publish(partial, final)
+
+
 def _check_loadable(path: Path) -> None:
     """Reads the state dicts back (mapped, not copied), to refuse values that only a resume would find unreadable."""
     for file in path.rglob(StateDictCheckpointAdapter.state_torch):
@@ -370,13 +455,24 @@ def _damage(path: Path, parts: Collection[str] | None) -> str | None:
         sums = None
     if not isinstance(sums, dict):
         return f"{CHECKSUMS} cannot be read"
-    read = [record for name, record in manifest["components"].items() if parts is None or name in parts]
-    for name in ("manifest.json", *(f"{record['path']}/{file}" for record in read for file in record["files"])):
+    for name in _files_of(path, parts):
         if name not in sums:
             return f"{CHECKSUMS} lacks {name}"
         if _checksum(path / name) != sums[name]:
             return f"{name} is not what was saved"
     return None
+
+
+def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
+    """Names the files of some parts, of every process; a manifest comes first, to be compared before it is read."""
+    yield "manifest.json"
+    manifest = Checkpoint.manifest(path)
+    for part, record in manifest["components"].items():
+        if parts is None or part in parts:
+            yield from (f"{record['path']}/{file}" for file in record["files"])
+    for rank in range(1, (manifest.get("metadata") or {}).get(PROCESSES, 1)):
+        folder = f"{PROCESS}{rank}"
+        yield from (f"{folder}/{name}" for name in _files_of(path / folder, parts))
 
 
 @functools.cache  # once for a checkpoint, however often it is read

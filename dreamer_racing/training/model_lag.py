@@ -52,7 +52,7 @@ class ModelLag:
         self._sum = self._sum + error.detach()
         self._count += 1
 
-    def measured(self, held_out: Tensor) -> float:
+    def measured(self, held_out: Tensor | float) -> float:
         """Take note of the error on fresh records, a scalar; return the ratio, and decide."""
         if self._count:
             self._trained = _moved(self._trained, float(self._sum) / self._count)

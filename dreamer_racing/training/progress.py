@@ -24,6 +24,7 @@ class Progress:
         total: env_steps at the end.
         env_steps: those at the beginning, of a run that is continued.
         seconds: between two lines of a log.
+        shown: whether anything is; where several processes train together, one alone speaks.
 
     Example:
         >>> progress = Progress(total=1000)
@@ -31,12 +32,12 @@ class Progress:
         >>> progress.close()
     """
 
-    def __init__(self, total: int, env_steps: int = 0, seconds: float = 30.0) -> None:
-        self._total, self._seconds = total, seconds
+    def __init__(self, total: int, env_steps: int = 0, seconds: float = 30.0, shown: bool = True) -> None:
+        self._total, self._seconds, self._shown = total, seconds, shown
         self._env_steps = env_steps
         self._kept: dict[str, str] = {}
         self._since, self._from = time.monotonic(), env_steps  # of the latest line
-        terminal = sys.stderr.isatty()
+        terminal = shown and sys.stderr.isatty()
         self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True) if terminal else None
 
     def advance(self, env_steps: int) -> None:
@@ -65,7 +66,7 @@ class Progress:
         """Say something in a line of its own."""
         if self._bar is not None:
             self._bar.write(text)
-        else:
+        elif self._shown:
             _write(text, sys.stdout)
 
     def close(self) -> None:

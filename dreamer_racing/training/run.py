@@ -2,6 +2,9 @@
 
 The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
 `logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
+
+Several processes may train together (`training.parallel`): they go through the loop in step, each with worlds and
+replay of its own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
 """
 
 import logging
@@ -20,10 +23,12 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
 from dreamer_racing.training.journal import Interval, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import log_evaluation
@@ -65,13 +70,13 @@ class Run:
     curriculum: BodyRateCurriculum | None
     learner: Any  # the recipe's Learner
     report: Report
-    metrics: MetricsLog
+    metrics: MetricsLog | UnwrittenMetrics
     schedule: Schedule  # log, evaluate, save
     checkpoints: RunCheckpoints
     best: BestCheckpoint
     counters: dict[str, int]  # env_steps, updates, episodes
     clock: RunClock
-    lock: RunLock
+    lock: RunLock | LockHeldByFirst
     unsaved: dict[str, int] = field(default_factory=dict, init=False)  # since which env_steps what cannot be written
     say: Callable[[str], None] = field(default=logger.info, init=False)  # says a line of its own
 
@@ -90,10 +95,10 @@ class Run:
         """Account for the episodes that ended in a rollout, and let the curriculum set the b₂ of what comes.
 
         Returns:
-            Those episodes, batch ``[E]`` of ``EpisodeTracker.update``.
+            Those episodes, of all processes, batch ``[E]`` of ``EpisodeTracker.update``.
         """
-        self.counters["env_steps"] += rollout.numel()
-        episodes = self.tracker.update(rollout)
+        self.counters["env_steps"] += rollout.numel() * parallel.count()
+        episodes = parallel.gathered_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
         self.metrics.push(self.tracker.summary(episodes))
         if self.curriculum:
@@ -132,13 +137,15 @@ class Run:
         """Take in what is collected already; nothing, unless collection is ahead of learning."""
 
     def keep_up(self, progress: Progress) -> None:
-        """Evaluate and log if it is due by now."""
+        """Evaluate and log if it is due by now; of several processes the first does, and all take note."""
         env_steps = self.counters["env_steps"]
         due = self.schedule.due("log", env_steps, self.at_end)
-        if self.schedule.due("evaluate", env_steps, self.at_end):
+        evaluates = self.schedule.due("evaluate", env_steps, self.at_end)
+        if not parallel.is_first():
+            return
+        if evaluates:
             self.say(self.evaluate())
-            due = True  # so that its numbers stand where they were measured
-        if due:
+        if due or evaluates:  # so that an evaluation's numbers stand where they were measured
             self.measure()
             progress.show(self.write_row(), self.unsaved)
 
@@ -228,19 +235,20 @@ def train(run: Run) -> None:
         RunCheckpointError: at its end the run could not be saved.
         OSError: at its end metrics could not be written.
     """
-    config, counters = run.config, run.counters
+    config, counters, leads = run.config, run.counters, parallel.is_first()
     minutes = Interval(config.checkpoint.minutes)
     with (
-        GracefulExit("saving; again: abandons what is since the last checkpoint") as stop,
-        Progress(config.total_env_steps, counters["env_steps"]) as progress,
+        graceful_exit() as stop,
+        Progress(config.total_env_steps, counters["env_steps"], shown=leads) as progress,
     ):
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
-        if run.directory.finished_env_steps() > counters["env_steps"]:
+        if leads and run.directory.finished_env_steps() > counters["env_steps"]:
             run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
         run.learn(None, stop)  # what an interrupted run still owes
         while not stop.requested:
             run.keep_up(progress)
-            by_steps, by_minutes = run.schedule.due("save", counters["env_steps"]), minutes.due()  # both take note
+            by_steps = run.schedule.due("save", counters["env_steps"])
+            by_minutes = parallel.agreed(minutes.due())  # both take note
             if by_steps or by_minutes:
                 with run.attempt("checkpoint"):
                     run.save()
@@ -258,9 +266,15 @@ def train(run: Run) -> None:
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
             progress.say(f"{stop.signal_name} {at}: saved; continue with resume={run.directory.path}")
-        else:
+        elif leads:
             run.metrics.flush()
             run.directory.mark_finished(counters["env_steps"])
         progress.say(f"checkpoint: {saved}")
     if stop.signal_name:
         raise SystemExit(128 + signal.Signals[stop.signal_name])
+
+
+def graceful_exit() -> GracefulExit:
+    """Make the flag that a signal raises, in all processes together; one of them answers."""
+    answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
+    return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -19,6 +20,8 @@ class GracefulExit:
 
     Args:
         answer: Said at once on stderr at the first signal, after its name; nothing if empty.
+        agree: Where several processes train together, what makes of each one's signal number (0: none yet) the one that
+            all go by. Then `requested` is an exchange, for which all must ask equally often.
 
     Example:
         >>> with GracefulExit() as stop:
@@ -26,14 +29,18 @@ class GracefulExit:
         ...         break
     """
 
-    def __init__(self, answer: str = "") -> None:
+    def __init__(self, answer: str = "", agree: Callable[[int], int] | None = None) -> None:
         self._answer = answer
+        self._agree = agree
+        self._arrived = 0  # number of the signal that came to this process
         self.signal_name: str | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
     @property
     def requested(self) -> bool:
-        """Whether a signal has arrived."""
+        """Whether a signal has arrived, at any process."""
+        if self._agree and self.signal_name is None and (number := self._agree(self._arrived)):
+            self.signal_name = signal.Signals(number).name
         return self.signal_name is not None
 
     def __enter__(self) -> GracefulExit:
@@ -51,9 +58,11 @@ class GracefulExit:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
-        if self.requested:
+        if self._arrived:
             raise KeyboardInterrupt(number)
-        self.signal_name = name
+        self._arrived = number
+        if not self._agree:
+            self.signal_name = name
         if self._answer:  # past Python's streams: the signal may have interrupted a write to one
             with contextlib.suppress(OSError, ValueError):  # nobody listens any more
                 os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"\n{name}: {self._answer}\n".encode())

@@ -25,7 +25,9 @@ from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelRewar
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
+from dreamer_racing.learners.saved_dreamer import LossState
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
@@ -33,10 +35,12 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.loggers import RunLogger, make_loggers
@@ -44,6 +48,8 @@ from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
+OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
+"""Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
@@ -62,7 +68,7 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.device = worlds_device(config)
         print(f"worlds: {config.env.device} (env.device=auto)")
     if config.run_dir is None:
-        config.run_dir = str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config))))
+        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device
 
 
@@ -155,7 +161,8 @@ def make_run_replay(
     if settings.storage is Storage.tensor:
         check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
     print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
-    print(disk_needed(config, round(size * min(1.0, config.total_env_steps / settings.capacity))))
+    of_all = parallel.count()  # processes, each with a replay like this one
+    print(disk_needed(config, round(size * min(of_all, config.total_env_steps / settings.capacity))))
     return make_replay(
         settings.capacity,
         config.env.num_envs,
@@ -207,13 +214,15 @@ def make_sequence_replay(
     )
 
 
-def claim(config: RunConfig) -> RunLock:
-    """Take a run directory before anything large is made.
+def claim(config: RunConfig) -> RunLock | LockHeldByFirst:
+    """Take a run directory before anything large is made; of several processes the first one does.
 
     Raises:
         ValueError: it holds another run, or is in use by a live one.
     """
     assert config.run_dir is not None, "resolve_common() names it"
+    if not parallel.is_first():
+        return LockHeldByFirst(Path(config.run_dir))
     lock = RunDirectory(Path(config.run_dir)).claim()
     refuse_to_replace(config)
     return lock
@@ -229,7 +238,9 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
 
 
 def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Report:
-    """Make the evaluation of a run during training."""
+    """Make the evaluation of a run during training, if this is the process that makes it."""
+    if not parallel.is_first():
+        return NoReport()
     asked = config.evaluation
     return make_report(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
 
@@ -244,11 +255,19 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
     return loggers
 
 
+def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMetrics) -> MetricsLog | UnwrittenMetrics:
+    """Make the metrics of a run, which go on from what is pending, if this is the process that writes them."""
+    if not parallel.is_first():
+        return UnwrittenMetrics()
+    resumed = pending.written if config.resume else None
+    return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
     overrides: list[str],
-    lock: RunLock,
+    lock: RunLock | LockHeldByFirst,
     env: Environment,
     learner: Learner,
     collector: Collector,
@@ -271,27 +290,32 @@ def assemble(
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
     directory = RunDirectory(lock.directory)
-    tracker = EpisodeTracker(config.env.num_envs, crash_causes(config))
+    tracker = EpisodeTracker(env.batch_size.numel(), crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
+    if not parallel.is_first() and isinstance(learner, DreamerLearner):
+        parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
     parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
-    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep)
+    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters)
     if config.resume:
         saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
         clock.total = saved.get("wall_clock", 0.0)
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
+        if curriculum:
+            env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
     best = BestCheckpoint(directory.path, flown)
-    write_configuration(directory, config, overrides, counters["env_steps"])
-    resumed = journal.pending.written if config.resume else None
-    metrics = MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, journal.pending)
+    parallel.together(lambda: None)  # all have read what is written anew now
+    if parallel.is_first():
+        write_configuration(directory, config, overrides, counters["env_steps"])
+    metrics = make_metrics(config, directory, journal.pending)
     print(f"run directory: {directory.path}")
     return kind(
         config=config,

@@ -31,6 +31,7 @@ from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
+from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.loggers import check_loggers
 from dreamer_racing.training.schedule import RampClock
@@ -88,6 +89,11 @@ def check(config: RunConfig) -> None:
     """
     check_settings(config)
     check_loggers(config.logger.wandb.value)
+    if parallel.asked_for() > 1 and not isinstance(config, DreamerConfig):
+        raise ValueError(
+            f"WORLD_SIZE={parallel.asked_for()}: algorithm={config.algorithm} trains in one process, and of those that "
+            "torchrun starts only recipes/dreamer_v3.py makes use: start it without torchrun."
+        )
     values = OmegaConf.structured(config)
     on_cuda = config.env.device.partition(":")[0] == "cuda"
     if not on_cuda and config.env.device != "cpu":

@@ -1,7 +1,9 @@
 """What every recipe does around its own work: plain errors for bad input, logging, run directories; no torch."""
 
 import logging
+import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -13,6 +15,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
 CONFIG_DIR = Path(__file__).parents[1] / "config"
 AGENTS = Path(__file__).parents[2] / "agents"
+HEAD_START = 10.0  # s that the first of several processes has to say an error; longer than it takes to end the others
 
 
 @contextmanager
@@ -24,10 +27,10 @@ def plain_errors() -> Iterator[None]:
     try:
         yield
     except MissingMandatoryValue as error:
-        print(f"error: {error.full_key}= is missing, and there is no default.", file=sys.stderr)
+        say_error(f"{error.full_key}= is missing, and there is no default.")
         raise SystemExit(2) from error
     except (ValueError, OSError, RendererUnavailableError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        say_error(error)
         raise SystemExit(2) from error
 
 
@@ -41,11 +44,34 @@ def plain_disk_errors() -> Iterator[None]:
         raise SystemExit(1) from error
 
 
+def say_error(error: object) -> None:
+    """Say on stderr why nothing was begun.
+
+    Of several processes that `torchrun` started, the first goes ahead: at its end the others are ended too, and so what
+    is wrong for all of them is said once.
+    """
+    if follows():
+        time.sleep(HEAD_START)
+    print(f"error: {error}", file=sys.stderr, flush=True)
+
+
 def start_logging() -> None:
     """Show what the package chose and why, one line each."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def follows() -> bool:
+    """Whether `torchrun` started this process beside a first one."""
+    return int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0"
+
+
+def follow_quietly() -> None:
+    """Leave it to the first of several processes to say what is the same in all; warnings and errors go to stderr."""
+    sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - until the process ends
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr, force=True)
+    logging.getLogger("dreamer_racing").setLevel(logging.WARNING)
 
 
 def new_run_dir(recipe: str, track: str) -> Path:

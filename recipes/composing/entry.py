@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import CONFIG_DIR, override_key, plain_errors
+from composing.command_line import CONFIG_DIR, follows, override_key, plain_errors, say_error
 from composing.interruption import INTERRUPTED
 from dreamer_racing.settings import shortened, suggestion
 
@@ -48,10 +48,11 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
             try:
                 main()
             except HydraException as error:
-                print(f"error: {in_plain_words(error, name, sys.argv[1:])}", file=sys.stderr)
+                say_error(in_plain_words(error, name, sys.argv[1:]))
                 raise SystemExit(2) from error
             except KeyboardInterrupt as interrupt:
-                print(INTERRUPTED, file=sys.stderr)
+                if not follows():
+                    print(INTERRUPTED, file=sys.stderr)
                 raise SystemExit(128 + signal.SIGINT) from interrupt
 
         return start

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from composing.checks import check_overrides
-from composing.command_line import merge_overrides, override_key, plain_errors, start_logging
+from composing.command_line import follow_quietly, merge_overrides, override_key, plain_errors, start_logging
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import RunConfig, is_race
 from composing.usage import command
@@ -25,6 +25,7 @@ from dreamer_racing.machine import (
     keep_freed_memory,
     out_of_memory_advice,
 )
+from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train
@@ -48,6 +49,9 @@ def launch(
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     with plain_errors():
+        parallel.join()
+        if not parallel.is_first():
+            follow_quietly()
         overrides = list(HydraConfig.get().overrides.task)
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
@@ -55,8 +59,9 @@ def launch(
             overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
             config = hydra.compose(config.algorithm, overrides)
         check_overrides(config, overrides)
-        if config.resume and is_finished(config):
+        if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
             print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
+            parallel.leave()
             return
         config = resolve(config)
         if config.resume and (changed := changed_settings(config)):
@@ -73,9 +78,10 @@ def launch(
     except RunCheckpointError as error:
         raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except NonFiniteLossError as error:
+        kept = run.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
         raise SystemExit(
             f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. "
-            f"{keep_batch(error, run.directory.nonfinite_batch)}; {run.last_good}. Continue from there with a lower "
+            f"{keep_batch(error, kept)}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
     except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
@@ -86,6 +92,7 @@ def launch(
         raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
     finally:
         run.close()
+        parallel.leave()
 
 
 def tell_of_thread(failure: threading.ExceptHookArgs) -> None:

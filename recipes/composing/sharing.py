@@ -1,0 +1,116 @@
+"""The share that each process has of a run, where `torchrun` started several to train one agent.
+
+A configuration says what all of them do together, and is kept so: env_steps, batch, replay and improvements of a run do
+not depend on how many processes there are, and a run may go on with another number of them.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from typing import Any
+
+import torch
+
+from composing.checks import steps_alone
+from composing.schema import DreamerConfig
+from dreamer_racing.losses import ACTOR_LOSSES, find_loss
+from dreamer_racing.training import parallel
+
+DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
+OF_IMPROVEMENTS = ("loss.ppo.flown", "loss.ppo.minibatch")
+"""What is divided among the processes, and must be divisible; the latter of actors that step alone."""
+ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")
+"""What is divided too, by worlds anyway."""
+SEEDS_APART = 1_000_000
+"""Between the seeds of two processes' worlds, samples and actions; initial weights have that of the run."""
+
+
+def share_of(config: DreamerConfig) -> DreamerConfig:
+    """What this process does of a run that is resolved and checked; of a single process, all of it.
+
+    Raises:
+        ValueError: what is to be shared does not divide, or the devices do not suffice.
+    """
+    processes = parallel.count()
+    if processes == 1:
+        return config
+    check_devices(config)
+    check_captured(config)
+    own = copy.deepcopy(config)
+    for name in DIVIDED + (OF_IMPROVEMENTS if steps_alone(config.loss.actor) else ()):
+        part, key = _place(own, name)
+        whole = getattr(part, key)
+        if whole is not None:
+            if whole % processes:
+                raise ValueError(
+                    f"{name}={whole} cannot be shared equally by {processes} processes: make it a multiple of "
+                    f"{processes}, e.g. {name}={-(-whole // processes) * processes}, or start another number of them "
+                    "by --nproc-per-node."
+                )
+            setattr(part, key, whole // processes)
+    for name in ROUNDED_DOWN:
+        part, key = _place(own, name)
+        setattr(part, key, getattr(part, key) // processes)
+    if config.replay.held_out >= own.env.num_envs:
+        raise ValueError(
+            f"replay.held_out={config.replay.held_out} worlds are of the first process, which has {own.env.num_envs} "
+            f"of env.num_envs={config.env.num_envs}: hold out fewer, or raise env.num_envs."
+        )
+    own.replay.held_out = config.replay.held_out if parallel.is_first() else 0
+    own.seed = (config.seed + parallel.rank() * SEEDS_APART) % 2**32
+    own.device, own.env.device = (_own_device(device) for device in (config.device, config.env.device))
+    print(f"processes: {processes}, each with {own.env.num_envs} worlds and {own.model.batch_size} windows of a batch;")
+    print(f"  process r draws from seed {config.seed} + {SEEDS_APART:,} r")
+    return own
+
+
+def check_devices(config: DreamerConfig) -> None:
+    """Refuse more processes than CUDA devices on this machine, and to have them all on one.
+
+    Raises:
+        ValueError: the message says what there is.
+    """
+    here, there = int(os.environ.get("LOCAL_WORLD_SIZE", parallel.count())), torch.cuda.device_count()
+    for name, device in (("device", config.device), ("env.device", config.env.device)):
+        if not device.startswith("cuda"):
+            continue
+        if ":" in device:
+            raise ValueError(
+                f"{name}={device} would have all {parallel.count()} processes on one device: with {name}=cuda each has "
+                "its own; CUDA_VISIBLE_DEVICES chooses which."
+            )
+        if here > there:
+            raise ValueError(
+                f"{name}={device} needs a CUDA device for each of the {here} processes on this machine, which has "
+                f"{there}: start torchrun with --nproc-per-node={max(there, 1)}, or set {name}=cpu."
+            )
+
+
+def check_captured(config: DreamerConfig) -> None:
+    """Refuse to capture or compile updates that exchange imagined returns on their way.
+
+    Raises:
+        ValueError: the message names the settings.
+    """
+    imagines = getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True)
+    for name in ("cuda_graph", "compile"):
+        if imagines and getattr(config.model, name):
+            raise ValueError(
+                f"model.{name}=true: loss.actor={config.loss.actor} exchanges imagined returns between "
+                f"{parallel.count()} processes in the midst of an update. Set model.{name}=false, or choose "
+                "loss.actor=asymmetric_ppo, which imagines nothing."
+            )
+
+
+def _own_device(device: str) -> str:
+    """The device of this process, of a kind."""
+    return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
+
+
+def _place(config: Any, name: str) -> tuple[Any, str]:
+    """The group in which a setting of a dotted name is, and its name there."""
+    *groups, key = name.split(".")
+    for group in groups:
+        config = getattr(config, group)
+    return config, key

@@ -1,0 +1,327 @@
+"""Processes that train together: the exchanges, and updates of the shares of a batch against those of the whole."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from dreamer_racing.experience.replay import StreamReplay, make_replay
+from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.finite_guard import NonFiniteLossError
+from dreamer_racing.losses import ActorPPOConfig, LossConfig, make_losses
+from dreamer_racing.modules import Agent, Interface, get_size
+from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.training import parallel
+from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
+from dreamer_racing.training.signals import GracefulExit
+from tests.learners.test_dreamer import make_batch
+
+ROOT = Path(__file__).parents[2]
+SIZE = replace(get_size("debug"), sampled=False)  # nothing is drawn: an update is a function of its batch
+SEES = Interface(privileged_dim=5)
+WINDOWS, LENGTH = 4, 6  # of the joint batch
+WORLDS, STEPS = 4, 8  # of the joint rollout
+PPO = ActorPPOConfig(flown=WORLDS * STEPS, epochs=3, minibatch=2 * WORLDS, kl_stop=1e9)
+ASYMMETRIC = LossConfig(actor="asymmetric_ppo", world_model="privileged", ppo=PPO)
+
+
+def share_of_ppo(ppo: ActorPPOConfig) -> ActorPPOConfig:
+    """The improvement's numbers of each process."""
+    return replace(ppo, flown=ppo.flown // parallel.count(), minibatch=ppo.minibatch // parallel.count())
+
+
+def share(whole: TensorDict | Tensor) -> TensorDict | Tensor:
+    """What this process has of a joint batch or rollout."""
+    return whole.chunk(parallel.count())[parallel.rank()]
+
+
+def make_learner(config: LossConfig = ASYMMETRIC) -> DreamerLearner:
+    """With an optimiser that is linear in gradients, so that differences of weights are those of gradients."""
+    torch.manual_seed(0)
+    agent = Agent(SIZE, SEES, decode=config.world_model == "reconstruction")
+    output = agent.critic.head.mlp.output
+    torch.nn.init.normal_(output.weight, std=0.3)
+    bins = len(output.bias)
+    output.bias.data -= (torch.arange(bins) - bins // 2).abs()  # values near 0, or rounding shows in symexp's far bins
+    losses = make_losses(agent, replace(config, ppo=share_of_ppo(config.ppo)), horizon=3)
+    groups = [{"params": [*agent.world_model.parameters()]}, {"params": [*agent.critic.parameters()]}]
+    own = {id(p) for p in agent.parameters()}
+    groups[0]["params"] += [p for p in losses["world_model"].parameters() if id(p) not in own]
+    if losses["actor"].optimizer is None:
+        groups[1]["params"] += [*agent.actor.parameters()]
+    return DreamerLearner(agent, losses, torch.optim.SGD(groups, lr=0.005), LearnerConfig())
+
+
+def joint_batch(seed: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+    batch = make_batch(WINDOWS, LENGTH)
+    batch["reward"] += torch.randn(batch["reward"].shape, generator=generator)
+    return batch.set(("privileged", "vector"), torch.randn(WINDOWS, LENGTH, 5, generator=generator))
+
+
+def joint_rollout(learner: DreamerLearner) -> TensorDict:
+    """As the policy flew it; it is the same in all processes."""
+    generator = torch.Generator().manual_seed(7)
+    shape = (WORLDS, STEPS)
+    belief = torch.rand(*shape, SIZE.belief, generator=generator) * 2 - 1
+    state = torch.rand(*shape, SIZE.state, generator=generator)
+    with torch.no_grad():
+        policy = learner.agent.actor(torch.cat((belief, state), -1))
+    action = (policy.mean + policy.std * torch.randn(policy.mean.shape, generator=generator)).clamp(-1.0, 1.0)
+    done = torch.rand(*shape, 1, generator=generator) < 0.1
+    came = {"reward": torch.randn(*shape, 1, generator=generator), "done": done, "terminated": done}
+    seen = {"action": action, "loc": policy.mean, "scale": policy.std}
+    privileged = {"vector": torch.randn(*shape, 5, generator=generator)}
+    after = {"belief": belief, "state": state, **came}
+    return TensorDict({**seen, "privileged": privileged, "next": after}, shape)
+
+
+def weights(learner: DreamerLearner) -> dict[str, Tensor]:
+    """Everything that an update changes, but for what was flown."""
+    flown = set(getattr(learner.losses["actor"], "kept", ()))
+    own = {f"{name}.{key}": value for name, loss in learner.losses.items() for key, value in loss.state_dict().items()}
+    return {key: value.clone() for key, value in own.items() if key.rpartition(".")[2] not in flown}
+
+
+def in_order(number: int, device: torch.device | None = None) -> Tensor:
+    """In place of `torch.randperm`: minibatches of the shares then make up those of the whole."""
+    return torch.arange(number, device=device)
+
+
+def train_a_little(config: LossConfig, updates: int = 3) -> dict[str, Tensor]:
+    """Updates and one improvement; the weights and the metrics after them."""
+    torch.randperm, ActionDistribution.sample = in_order, lambda policy: policy.mean  # of a process of its own
+    learner = make_learner(config)
+    learner.watch(share(joint_rollout(learner)))
+    metrics: dict[str, Tensor] = {}
+    for seed in range(updates):
+        metrics |= learner.update(share(joint_batch(seed)))
+    names = [name for name in metrics if name != "ppo/explained_variance"]  # no mean over records
+    return weights(learner) | {name: metrics[name] for name in names}
+
+
+# What follows runs in processes of their own, started by `together`.
+
+
+def updates_of_shares(folder: Path) -> None:
+    for name, config in CONFIGS.items():
+        torch.save(train_a_little(config), folder / f"{name}_{parallel.count()}_{parallel.rank()}.pt")
+
+
+def exchanges(folder: Path) -> None:
+    rank = parallel.rank()
+    values = [torch.full((2, 2), float(rank)), torch.tensor(1.0 + rank)]
+    parallel.average_(values)
+    assert values[0].tolist() == [[0.5, 0.5], [0.5, 0.5]] and values[1] == 1.5
+    assert parallel.total(torch.tensor([1.0, rank])).tolist() == [2.0, 1.0]
+    assert parallel.gathered(torch.full((1, 2), rank), dim=1).tolist() == [[0, 0, 1, 1]]
+    rows = TensorDict({"return": torch.arange(rank + 1)}, [rank + 1])
+    assert parallel.gathered_rows(rows)["return"].tolist() == [0, 0, 1]
+    assert parallel.gathered_rows(rows[: 1 - rank])["return"].tolist() == [0], "one process may have none"
+    assert parallel.agreed({"path": rank}) == {"path": 0}
+    assert parallel.largest(rank) == 1
+    parallel.check_same([torch.ones(3)])
+    with pytest.raises(RuntimeError, match="no longer the same"):
+        parallel.check_same([torch.ones(3) + 1e-7 * rank])
+    with pytest.raises((RuntimeError, OSError), match="full"):
+        parallel.together(lambda: fail("disk full") if rank else None)
+
+
+def fail(words: str) -> None:
+    raise OSError(words)
+
+
+def bad_number(folder: Path) -> None:
+    """A reward that is no number in one process ends all of them, at the same update."""
+    learner = make_learner()
+    batch = share(joint_batch(0))
+    if parallel.rank():
+        batch["reward"][0, 1] = torch.nan
+    before = weights(learner)
+    with pytest.raises(NonFiniteLossError):
+        learner.update(batch)
+    assert all(torch.equal(value, before[name]) for name, value in weights(learner).items())
+
+
+def stop_at_once(folder: Path) -> None:
+    """A divergence that is large in one process alone ends the epochs of all, and slows all down."""
+    config = replace(ASYMMETRIC, ppo=replace(PPO, epochs=50, learning_rate=0.01, kl_target=0.01, kl_stop=0.02))
+    learner = make_learner(config)
+    rollout = joint_rollout(learner)
+    rollout["next", "reward"][: WORLDS // 2] *= 100.0
+    learner.watch(share(rollout))
+    metrics = learner.update(share(joint_batch(0)))
+    assert 0 < metrics["ppo/epochs"] < 50 and metrics["ppo/pace"] == 1.0 and learner.losses["actor"].pace < 1.0
+    parallel.check_same([*weights(learner).values(), metrics["ppo/epochs"], metrics["ppo/kl"]])
+
+
+def signal_at_one(folder: Path) -> None:
+    with GracefulExit(agree=parallel.largest) as stop:
+        assert not stop.requested
+        if parallel.rank():
+            os.kill(os.getpid(), 15)
+        assert stop.signal_name is None, "not before all know"
+        assert stop.requested and stop.requested and stop.signal_name == "SIGTERM"
+
+
+def make_share_of_replay(total_worlds: int = 8, held_out: int = 1) -> StreamReplay:
+    worlds = total_worlds // parallel.count()
+    held_out = held_out if parallel.is_first() else 0
+    seed = parallel.rank()
+    return make_replay(20 * worlds, worlds, 2, 4, seed=seed, observation_keys=["pixels"], held_out=held_out)
+
+
+def flown_rollout(worlds: int, steps: int, value: int) -> TensorDict:
+    flag = torch.zeros(worlds, steps, 1, dtype=torch.bool)
+    pixels = torch.full((worlds, steps, 2, 2, 3), value, dtype=torch.uint8)
+    pixels += torch.arange(worlds, dtype=torch.uint8).view(-1, 1, 1, 1, 1)
+    number = torch.zeros(worlds, steps, 1)
+    after = {"reward": number, "reward_base": number, "body_rate_norm": number, "terminated": flag, "truncated": flag}
+    root = {"pixels": pixels, "action": torch.zeros(worlds, steps, 4), "is_init": flag}
+    return TensorDict({**root, "next": {"pixels": pixels, **after}}, [worlds, steps])
+
+
+def contents(replay: StreamReplay) -> list[list[int]]:
+    return [replay.records(stream)["pixels"][:, 0, 0, 0].tolist() for stream in range(replay.num_streams)]
+
+
+def save_shares(folder: Path) -> None:
+    """Streams of different lengths, one of them a ring that went round; the counters are common."""
+    replay = make_share_of_replay()
+    replay.extend(flown_rollout(replay.num_streams, 15, 10 * (parallel.rank() + 1)))
+    if parallel.rank():
+        replay.extend(flown_rollout(replay.num_streams, 15, 100))
+    counters = {"env_steps": 120}
+    checkpoints = RunCheckpoints(folder, {"counters": counters, "replay": replay}, own=["replay"])
+    checkpoints.save(120)
+    torch.save(contents(replay), folder / f"contents_{parallel.rank()}.pt")
+    torch.save(torch.rand(3), folder / f"random_{parallel.rank()}.pt")
+    checkpoints.load()
+    assert torch.equal(torch.rand(3), torch.load(folder / f"random_{parallel.rank()}.pt"))
+    assert contents(replay) == torch.load(folder / f"contents_{parallel.rank()}.pt")
+    parts = {"counters": counters, "replay": Unsavable() if parallel.rank() else replay}
+    checkpoints = RunCheckpoints(folder, parts, own=["replay"])
+    with pytest.raises(RunCheckpointError, match="full"):
+        checkpoints.save(130)
+    parallel.together(lambda: None)  # the first has cleared it away
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["checkpoint-000000000120"]
+
+
+class Unsavable:
+    """A replay on a full disk."""
+
+    def dump(self, path: Path) -> None:
+        raise OSError("disk full")
+
+    def load(self, path: Path) -> None:
+        raise NotImplementedError
+
+
+def load_shares(folder: Path) -> None:
+    """Eight worlds that two processes left, the first one's last: held out before, and held out now."""
+    left = [torch.load(folder / f"contents_{rank}.pt") for rank in (1, 0)]
+    replay, counters = make_share_of_replay(), {"env_steps": 0}
+    RunCheckpoints(folder, {"counters": counters, "replay": replay}, own=["replay"]).load()
+    joint, number = left[0] + left[1], replay.num_streams
+    skip = (parallel.count() - 1 - parallel.rank()) * number
+    assert contents(replay) == joint[skip : skip + number] and counters == {"env_steps": 120}
+    assert len(replay) == sum(map(len, joint[skip : skip + number]))
+    replay.extend(flown_rollout(number, 3, 200))
+    assert contents(replay)[0][-3:] == [200, 200, 200] and replay.sample()["index"].shape == (2, 4)
+
+
+CONFIGS = {
+    "asymmetric_ppo": ASYMMETRIC,
+    "ppo": LossConfig(actor="ppo", world_model="privileged", ppo=replace(PPO, updates=3, minibatch=10**6)),
+    # A scale that is of the last returns alone, and an entropy that moves the actor.
+    "reinforce": LossConfig(actor="reinforce", world_model="privileged", return_decay=0.0, entropy_scale=0.3),
+}
+
+
+def together(tmp_path: Path, processes: int, *works: Callable[[Path], None]) -> None:
+    """Do some things in several processes that meet as those of torchrun do; each may fail."""
+    calls = "".join(f"    test_parallel.{work.__name__}(Path(sys.argv[1]))\n" for work in works)
+    (script := tmp_path / "work.py").write_text(
+        "import sys\nfrom pathlib import Path\nfrom dreamer_racing.training import parallel\n"
+        f"from tests.training import test_parallel\nparallel.join()\ntry:\n{calls}finally:\n    parallel.leave()\n"
+    )
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    done = subprocess.run(
+        [*launcher, str(script), str(tmp_path)],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_single_process_exchanges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    parallel.join()
+    assert not torch.distributed.is_initialized()
+    value = torch.ones(2)
+    assert parallel.total(value) is value and parallel.gathered(value, 0) is value and parallel.agreed(value) is value
+    assert (parallel.count(), parallel.rank(), parallel.is_first()) == (1, 0, True)
+
+
+def test_processes_that_cannot_meet_are_told_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match=r"WORLD_SIZE=2.*torchrun --nproc-per-node=N"):
+        parallel.join()
+
+
+@pytest.mark.slow
+def test_two_processes_agree(tmp_path: Path) -> None:
+    together(tmp_path, 2, exchanges, bad_number, stop_at_once, signal_at_one)
+
+
+@pytest.mark.slow
+def test_updates_of_two_shares_are_those_of_the_whole(tmp_path: Path) -> None:
+    """Weights after three updates and an improvement: of one process, of two, and of those two one another."""
+    together(tmp_path, 1, updates_of_shares)
+    together(tmp_path, 2, updates_of_shares)
+    for name, config in CONFIGS.items():
+        whole, first, second = (torch.load(tmp_path / f"{name}_{place}.pt") for place in ("1_0", "2_0", "2_1"))
+        begun = weights(make_learner(config))
+        kept = {"features", "action", "old", "advantage", "weight"} if name == "ppo" else set()  # each has its own
+        for key, value in whole.items():
+            if key.rpartition(".")[2] in kept and value.ndim > 2:
+                continue
+            near = {"rtol": 1e-5, "atol": 1e-5} if key in begun else {"rtol": 1e-3, "atol": 1e-4}  # else a metric
+            assert torch.allclose(first[key], value, **near), f"{name}: {key} {first[key]} is not {value}"
+            assert torch.equal(first[key], second[key]), f"{name}: {key} differs between the processes"
+        for part in ("world_model.world_model.rssm", "critic.critic", "actor.actor"):
+            moved = (whole[key] - value for key, value in begun.items() if key.startswith(part))
+            assert max(float(distance.abs().max()) for distance in moved) > 1e-4, f"{name}: {part} stands still"
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_two_processes_is_restored_by_one_two_or_four(tmp_path: Path) -> None:
+    together(tmp_path, 2, save_shares, load_shares)
+    for processes in (1, 4):
+        together(tmp_path, processes, load_shares)
+    (saved,) = (tmp_path / "checkpoints").iterdir()
+    for file in [path for path in sorted((saved / "process-1").rglob("*")) if path.is_file()]:
+        content = file.read_bytes()
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        with pytest.raises(RunCheckpointError, match="process-1/.* is not what was saved"):
+            newest_sound(saved)
+        file.write_bytes(content)
+    assert newest_sound(saved, ["counters"]) == saved
+    (saved / "process-1" / "manifest.json").unlink()
+    with pytest.raises(RunCheckpointError, match=r"process-1/manifest\.json is not what was saved"):
+        newest_sound(saved, ["counters"])
