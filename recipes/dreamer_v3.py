@@ -79,7 +79,7 @@ class DreamerRun(ReplayRun):
         episodes = super().take_in(rollout)
         self.learner.watch(rollout)
         if len(episodes) and "gates_passed" in episodes:
-            share = self.passes.update(episodes)
+            share = self.passes.update(episodes, self.counters["env_steps"])
             self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})
         return episodes
 

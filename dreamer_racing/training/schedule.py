@@ -11,7 +11,8 @@ class RampClock(Enum):
     """What a ramp goes by, a number from 0 to 1."""
 
     run = "run"  # share of the run's env_steps
-    passes = "passes"  # best share of flights that pass the hardest gate, `PassShare`
+    passes = "passes"  # best share of flights that pass the hardest gate, `PassShare.best`
+    known = "known"  # the same, and on by itself once that gate is known, `PassShare.known`
 
 
 @dataclass
@@ -22,7 +23,8 @@ class Ramp:
         to: Where it ends; None: it stays at its own value.
         begin: Time at which it leaves its own value.
         end: Time from which on it stays at ``to``.
-        by: The clock: the share of the run's env_steps that are made, or that of flights that pass the hardest gate.
+        by: The clock: the share of the run's env_steps that are made, or that of flights that pass the hardest gate,
+            with time or without.
 
     Example:
         >>> Ramp(to=0.99, begin=0.5, end=1.0).at(0.98, {RampClock.run: 0.75})

@@ -253,9 +253,9 @@ def check_schedule(config: DreamerConfig) -> None:
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
-        if ramp.to is not None and ramp.by is RampClock.passes and not is_race(config):
+        if ramp.to is not None and ramp.by is not RampClock.run and not is_race(config):
             raise ValueError(
-                f"schedule.{name}.by=passes goes by gates, and env.suite={config.env.suite} has none: by=run."
+                f"schedule.{name}.by={ramp.by.value} goes by gates, and env.suite={config.env.suite} has none: by=run."
             )
         if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")

@@ -30,7 +30,11 @@ IN_CHECKPOINTS = ("min_std", "max_std")
 
 def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[RampClock, float]:
     """What the clocks of schedules say after so many env_steps of a run."""
-    return {RampClock.run: env_steps / config.total_env_steps, RampClock.passes: passes.best}
+    return {
+        RampClock.run: env_steps / config.total_env_steps,
+        RampClock.passes: passes.best,
+        RampClock.known: passes.known(env_steps, config.total_env_steps),
+    }
 
 
 def scheduled_numbers(config: DreamerConfig, times: dict[RampClock, float]) -> dict[str, float]:

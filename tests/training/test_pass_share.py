@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.training.pass_share import MEMORY, PassShare
+from dreamer_racing.training.pass_share import KNOWN, MEMORY, PACE, PassShare
 
 
 def episodes(gates: list[int], targets: list[int], crashes: list[int]) -> TensorDict:
@@ -46,6 +46,28 @@ def test_the_best_counts_once_each_gate_was_tried_and_never_goes_back():
     assert passes.best == 1.0
     passes.update(episodes([1] * 1000, [0] * 1000, [1] * 1000))
     assert passes.share < 0.1 and passes.best == 1.0
+
+
+def test_once_the_hardest_gate_is_known_its_clock_goes_on_by_itself():
+    passes = PassShare(2)
+    for _ in range(4):
+        passes.update(episodes([150, 149], [0, 1], [0, 1]), 500)  # past both, but for a crash now and then
+    assert passes.best > KNOWN and passes.known_since == 500
+    passes.best = 0.5
+    passes.update(episodes([2], [0], [0]), 700)
+    assert passes.known_since == 500
+    passes.best = 0.5
+    assert passes.known(510, 1000) == 0.5  # 0.43 by time
+    assert passes.known(600, 1000) == pytest.approx(KNOWN + 0.1 * PACE)
+    resumed = PassShare(0)
+    resumed.load_state_dict(passes.state_dict())
+    assert resumed.known(600, 1000) == passes.known(600, 1000)
+
+
+def test_before_that_the_clock_is_the_best_share():
+    passes = PassShare(2)
+    passes.best = 0.3
+    assert passes.known(900, 1000) == 0.3 and passes.known_since is None
 
 
 def test_old_attempts_are_forgotten_and_a_resumed_run_remembers_what_is_left():
