@@ -44,6 +44,7 @@ from dreamer_racing.export.shipped_agent import load_agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
+from tests.running_recipes import recipe
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -520,15 +521,6 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
 
 
 # --- the recipe -------------------------------------------------------------------------------------------------------
-
-
-def recipe(name: str, *overrides: str, cwd: Path, before: str = "") -> subprocess.CompletedProcess[str]:
-    """Run a recipe as a user does, or after some lines of Python."""
-    path = str(ROOT / "recipes" / f"{name}.py")
-    start = f"import runpy, sys\nsys.path.insert(0, {str(Path(path).parent)!r})\n{before}\nsys.argv[0] = {path!r}\n"
-    program = [path] if not before else ["-c", f"{start}runpy.run_path({path!r}, run_name='__main__')"]
-    command = [sys.executable, *program, *overrides]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
 
 
 @pytest.fixture(scope="module")

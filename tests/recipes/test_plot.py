@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -17,15 +16,11 @@ from dreamer_racing.figures.curves import read_curves
 from tests.figures.test_curves import write_run
 from tests.figures.test_flights import flat_dream, random_flight
 from tests.running_recipes import ROOT, recipe_module
+from tests.running_recipes import recipe as recipe_process
 
 pytestmark = pytest.mark.xdist_group("figures")  # one worker makes what these tests share
 
-RECIPE = ROOT / "recipes" / "plot.py"
-
-
-def plot(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(RECIPE), *overrides]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
+plot = partial(recipe_process, "plot")
 
 
 @pytest.fixture(scope="module")

@@ -198,7 +198,8 @@ class Renderer:
 
     def close(self) -> None:
         """Free every worker in its own thread, and wait for the threads' end."""
-        self._end()
+        if self._end.detach() is not None:  # once; called, it does nothing while the interpreter exits
+            _end(self._threads, self._workers)
         for thread in self._threads:
             thread.join()
 
