@@ -46,6 +46,7 @@ from dreamer_racing.training import parallel
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.run import ReplayRun
+from dreamer_racing.training.schedule import RampClock
 from dreamer_racing.training.signals import GracefulExit
 
 NUM_ENVS = 32
@@ -84,8 +85,10 @@ class DreamerRun(ReplayRun):
         return episodes
 
     def measure(self) -> None:
-        """Say the learning rates after warm-up, and measure the world model on records never trained on, too."""
+        """Say what is scheduled, and measure the world model on records never trained on, too."""
         super().measure()
+        numbers = scheduled_numbers(self.config, self.times())
+        self.metrics.push({f"schedule/{name}": number for name, number in numbers.items() if number is not None})
         names = ("learning_rate/world_model", "learning_rate/behavior")
         rates = (group["lr"] for group in self.learner.optimizer.param_groups)
         self.metrics.push(dict(zip(names, rates, strict=True)))
@@ -117,10 +120,14 @@ class DreamerRun(ReplayRun):
         if not stop.signal_name:  # else after what is owed then
             self.look_at_lag()
 
+    def times(self) -> dict[RampClock, float]:
+        """What the clocks of schedules say by now."""
+        return clock_times(self.config, self.counters["env_steps"], self.passes)
+
     def keep_to_schedule(self) -> None:
         """Set everything that is scheduled to its value at this share of the run."""
         self.learner.actor_waits = self.lag.waits
-        times = clock_times(self.config, self.counters["env_steps"], self.passes)
+        times = self.times()
         self.learner.adjust(**scheduled_numbers(self.config, times))
         ramp = self.config.schedule.start_on_line
         if ramp.to is not None:

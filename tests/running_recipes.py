@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import runpy
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -82,6 +83,7 @@ def _run(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(cwd)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
     sys.argv = [path, *overrides]
     sys.path.insert(0, str(Path(path).parent))
     try:

@@ -92,7 +92,7 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
     assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("asymmetric_ppo", False, True)
-    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.passes)
+    assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
@@ -183,7 +183,7 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     for actor in ("asymmetric_ppo", "reinforce"):
         resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
         moved = recipe_module("composing.learners").scheduled_numbers(
-            OmegaConf.to_object(resolved), {RampClock.run: 0.0, RampClock.passes: 0.0}
+            OmegaConf.to_object(resolved), dict.fromkeys(RampClock, 0.0)
         )
         found.append(set(moved) - {"rates", "world_model_rate"})
     assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]

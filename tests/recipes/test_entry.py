@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import hydra
 import pytest
 from hydra.errors import HydraException
 
-from tests.running_recipes import CONFIG, compose, recipe, recipe_module
+from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module
 
 
 @pytest.mark.parametrize(
@@ -53,7 +54,7 @@ def test_whole_numbers_may_be_written_short(argument: str, taken: str) -> None:
         ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is not a valid bool (type str)."),
         (
             "schedule.max_std.by=gates",
-            "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes].",
+            "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes, known].",
         ),
         ("kidney", "kidney: an override is written name=value"),
         ("run_dir=[a", "run_dir=[a: overrides are written name=value, and a value with brackets"),
@@ -101,13 +102,16 @@ def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 LOADING = """
-import os, signal
+import os, runpy, signal, sys
 class Interrupted:
     def find_spec(name, path=None, target=None):
         if name == "torchrl.collectors":
             sys.meta_path.remove(Interrupted)
             os.kill(os.getpid(), signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
 sys.meta_path.insert(0, Interrupted)
+sys.path.insert(0, {recipes!r})
+runpy.run_path({recipes!r} + "/ppo.py", run_name="__main__")
 """
 SETTING_UP = """
 import os, signal
@@ -116,10 +120,17 @@ lock.RunLock.__init__ = lambda *given: os.kill(os.getpid(), signal.SIGINT)
 """
 
 
-@pytest.mark.parametrize(
-    ("before", "status"), [(LOADING, -signal.SIGINT), (SETTING_UP, 130)], ids=["loading", "setting up"]
-)
-def test_ctrl_c_before_anything_is_there_is_no_traceback(before: str, status: int, tmp_path: Path) -> None:
-    done = recipe("ppo", "track=circle", "env.from_pixels=false", "run_dir=run", cwd=tmp_path, before=before)
-    assert done.returncode == status, done.stderr
+
+def test_ctrl_c_while_packages_are_loaded_is_no_traceback(tmp_path: Path) -> None:
+    program = LOADING.format(recipes=str(ROOT / "recipes"))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == -signal.SIGINT, done.stderr
+    assert done.stderr == "interrupted\n" and not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_before_anything_is_there_is_no_traceback(tmp_path: Path) -> None:
+    done = recipe("ppo", "track=circle", "env.from_pixels=false", "run_dir=run", cwd=tmp_path, before=SETTING_UP)
+    assert done.returncode == 130, done.stderr
     assert done.stderr.strip().splitlines()[-1] == "interrupted" and "Traceback" not in done.stderr

@@ -152,7 +152,6 @@ def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFix
 
 KILLED_BEHIND_THE_FIRST_POLICY = """
 import os, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
 from dreamer_racing.figures.report import EvaluationReport
 write = EvaluationReport.write
 EvaluationReport.write = lambda *given: (write(*given), os.kill(os.getpid(), signal.{signal}))
