@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import atexit
 import csv
 import importlib
-import multiprocessing
 import os
 import runpy
 import select
-import signal
 import socket
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from multiprocessing import reduction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Self
+from typing import Self
 
 import hydra
 from omegaconf import OmegaConf
+
+from tests.forked import Forked
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
@@ -41,61 +38,19 @@ TINY = [
 AT_THE_END = "evaluation.every=1000000"
 
 
-FORKED = multiprocessing.get_context("forkserver")
-"""Starts processes that have imported, once for all of them, what takes a recipe most of its first seconds."""
-FORKED.set_forkserver_preload(
-    [
-        "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
-        "torchrl.envs", "torchrl.record",
-    ]
-)  # fmt: skip
-
-
 def recipe(
     name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
 ) -> subprocess.CompletedProcess[str]:
     """Run a recipe in a process of its own, after some lines of Python if need be."""
-    path = str(ROOT / "recipes" / f"{name}.py")
-    output, errors = os.pipe(), os.pipe()
-    streams = [reduction.DupFd(write) for _, write in (output, errors)]
-    process = FORKED.Process(target=_run, args=(path, overrides, cwd, dict(os.environ), before, *streams))
-    with ThreadPoolExecutor(2) as readers:
-        process.start()
-        said = []
-        for read, write in (output, errors):
-            os.close(write)
-            said.append(readers.submit(_read, read))
-        process.join(timeout)
-        if process.exitcode is None:
-            process.kill()
-            process.join()
-            raise subprocess.TimeoutExpired([path, *overrides], timeout, *(text.result() for text in said))
-        assert process.exitcode is not None
-        return subprocess.CompletedProcess([path, *overrides], process.exitcode, *(text.result() for text in said))
+    return Forked(_run, str(ROOT / "recipes" / f"{name}.py"), overrides, before, cwd=cwd).communicate(timeout)
 
 
-def _run(
-    path: str, overrides: tuple[str, ...], cwd: Path, environment: dict[str, str], before: str, *streams: Any
-) -> None:
+def _run(path: str, overrides: tuple[str, ...], before: str) -> None:
     """Be the recipe, as `python PATH OVERRIDE...` would be."""
-    for stream, number in zip(streams, (1, 2), strict=True):
-        os.dup2(stream.detach(), number)
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(cwd)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
     sys.argv = [path, *overrides]
     sys.path.insert(0, str(Path(path).parent))
-    try:
-        exec(before, {})
-        runpy.run_path(path, run_name="__main__")
-    finally:
-        atexit._run_exitfuncs()  # which a process of multiprocessing leaves out
-
-
-def _read(pipe: int) -> str:
-    with open(pipe) as stream:
-        return stream.read()
+    exec(before, {})
+    runpy.run_path(path, run_name="__main__")
 
 
 def rows(run_dir: Path) -> list[dict[str, str]]:

@@ -120,7 +120,6 @@ lock.RunLock.__init__ = lambda *given: os.kill(os.getpid(), signal.SIGINT)
 """
 
 
-
 def test_ctrl_c_while_packages_are_loaded_is_no_traceback(tmp_path: Path) -> None:
     program = LOADING.format(recipes=str(ROOT / "recipes"))
     done = subprocess.run(

@@ -30,7 +30,8 @@ RACES = ("env.episode_steps", "env.start_on_line", "env.control_rate", "curricul
 
 BASELINE = [
     "env.from_pixels=false", "network.units=16", "env.num_envs=4", "env.episode_steps=40", "evaluation.every=500",
-    "evaluation.episodes=1", "checkpoint.every=1024", "total_env_steps=2048", "logger.every=400", "logger=csv",
+    "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=1024", "total_env_steps=1200",
+    "logger.every=400", "logger=csv",
     "device=cpu", "curriculum.threshold=-100", "curriculum.cooldown=3",
 ]  # fmt: skip
 SMALL = {

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
+import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +22,9 @@ from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
+from tests.forked import Forked
 from tests.learners.test_dreamer import make_batch
 
-ROOT = Path(__file__).parents[2]
 SIZE = replace(get_size("debug"), sampled=False)  # nothing is drawn: an update is a function of its batch
 SEES = Interface(privileged_dim=5)
 WINDOWS, LENGTH = 4, 6  # of the joint batch
@@ -249,22 +248,32 @@ CONFIGS = {
 
 def together(tmp_path: Path, processes: int, *works: Callable[[Path], None]) -> None:
     """Do some things in several processes that meet as those of torchrun do; each may fail."""
-    calls = "".join(f"    test_parallel.{work.__name__}(Path(sys.argv[1]))\n" for work in works)
-    (script := tmp_path / "work.py").write_text(
-        "import sys\nfrom pathlib import Path\nfrom dreamer_racing.training import parallel\n"
-        f"from tests.training import test_parallel\nparallel.join()\ntry:\n{calls}finally:\n    parallel.leave()\n"
-    )
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-    done = subprocess.run(
-        [*launcher, str(script), str(tmp_path)],
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = {"WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    members = [
+        Forked(
+            _meet,
+            tmp_path,
+            [work.__name__ for work in works],
+            cwd=tmp_path,
+            environment={name: str(value) for name, value in {**shared, "RANK": rank, "LOCAL_RANK": rank}.items()},
+        )
+        for rank in range(processes)
+    ]
+    for done in [member.communicate(timeout=240) for member in members]:
+        assert done.returncode == 0, done.stderr
+
+
+def _meet(tmp_path: Path, works: list[str]) -> None:
+    torch.set_num_threads(1)
+    parallel.join()
+    try:
+        for work in works:
+            globals()[work](tmp_path)
+    finally:
+        parallel.leave()
 
 
 def test_a_single_process_exchanges_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,88 @@
+"""Processes that begin with what takes a recipe most of its first seconds, imported once for all of them."""
+
+from __future__ import annotations
+
+import atexit
+import multiprocessing
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing import reduction
+from pathlib import Path
+from typing import Any
+
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(
+    [
+        "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
+        "torchrl.envs", "torchrl.record",
+    ]
+)  # fmt: skip
+
+
+class Forked:
+    """A process that calls a function, with streams of its own.
+
+    Args:
+        function: called with the arguments; both can be pickled.
+        arguments: given to it.
+        cwd: where it works.
+        environment: its variables, beside those of this process.
+    """
+
+    def __init__(
+        self, function: Callable[..., None], *arguments: Any, cwd: Path, environment: Mapping[str, str] | None = None
+    ) -> None:
+        pipes = [os.pipe() for _ in range(2)]
+        streams = [reduction.DupFd(write) for _, write in pipes]
+        variables = {**os.environ, **(environment or {})}
+        self.process = SERVER.Process(target=_begin, args=(streams, cwd, variables, function, arguments))
+        self.process.start()
+        self._readers = ThreadPoolExecutor(len(pipes))
+        self._said: list[Future[str]] = []
+        for read, write in pipes:
+            os.close(write)
+            self._said.append(self._readers.submit(_read, read))
+
+    def communicate(self, timeout: float) -> subprocess.CompletedProcess[str]:
+        """Wait for its end; return exit status and what it said.
+
+        Raises:
+            subprocess.TimeoutExpired: it took longer, and was killed.
+        """
+        self.process.join(timeout)
+        if late := self.process.exitcode is None:
+            self.process.kill()
+            self.process.join()
+        output, errors = (text.result() for text in self._said)
+        self._readers.shutdown()
+        if late:
+            raise subprocess.TimeoutExpired(self.process.name, timeout, output, errors)
+        assert self.process.exitcode is not None
+        return subprocess.CompletedProcess(self.process.name, self.process.exitcode, output, errors)
+
+
+def _begin(
+    streams: list[Any],
+    cwd: Path,
+    environment: dict[str, str],
+    function: Callable[..., None],
+    arguments: tuple[Any, ...],
+) -> None:
+    for stream, number in zip(streams, (1, 2), strict=True):
+        os.dup2(stream.detach(), number)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(cwd)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
+    try:
+        function(*arguments)
+    finally:
+        atexit._run_exitfuncs()  # which a process of multiprocessing leaves out
+
+
+def _read(pipe: int) -> str:
+    with open(pipe) as stream:
+        return stream.read()
