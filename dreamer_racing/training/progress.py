@@ -83,7 +83,8 @@ class Progress:
     def _write_line(self, numbers: str) -> None:
         now = time.monotonic()
         speed = (self._env_steps - self._from) / (now - self._since)
-        left = timedelta(seconds=round((self._total - self._env_steps) / speed)) if speed else "unknown time"
+        remaining = max(0, self._total - self._env_steps)  # the last rollout may go past the end
+        left = timedelta(seconds=round(remaining / speed)) if speed else "unknown time"
         done = f"{self._env_steps:,} of {self._total:,} env_steps, {speed:.0f}/s, {left} to go"
         _write(f"{done}: {numbers}", sys.stderr)
         self._since, self._from = now, self._env_steps

@@ -34,6 +34,13 @@ def test_a_log_gets_whole_lines_now_and_then(capsys: pytest.CaptureFixture[str])
     assert said.out.endswith("evaluation at 512,000 env_steps\n")
 
 
+def test_a_run_that_went_past_its_end_has_nothing_left(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(total=100, seconds=0.0) as progress:
+        progress.advance(112)
+        progress.show(METRICS)
+    assert "0:00:00 to go" in capsys.readouterr().err
+
+
 def test_lines_keep_their_distance(capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress(total=10, seconds=3600.0)
     for step in range(10):
