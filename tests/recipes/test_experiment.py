@@ -120,7 +120,8 @@ def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) ->
 def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     algorithms = tuple(recipe_module("composing.schema").RECIPES)
     command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), "--multirun", "budget=smoke", "name=smoke",
-               f"algorithm={','.join(algorithms)}", "track=circle", "seed=0", "device=cpu"]  # fmt: skip
+               f"algorithm={','.join(algorithms)}", "track=circle", "seed=0", "device=cpu", "env.image_size=48",
+               "evaluation.video_steps=10"]  # fmt: skip
     first, second = (
         subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
         for _ in range(2)
