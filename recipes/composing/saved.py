@@ -1,6 +1,7 @@
 """Configurations of runs, read back: typed as this version knows them, and compared."""
 
 from collections.abc import Collection
+from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -132,7 +133,7 @@ def changed_settings(config: DictConfig) -> list[str]:
     before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
 
     def word(value: Any) -> str:
-        return "null" if value is None else str(value)
+        return "null" if value is None else str(value.value if isinstance(value, Enum) else value)
 
     return [
         f"{name}={word(value)} (was {word(before.get(name))})"

@@ -336,4 +336,7 @@ def test_a_resumed_run_says_what_is_other_than_it_was(run_dir: Path) -> None:
     config.run_dir = str(run_dir)
     assert training.changed_settings(config) == []
     config.loss.discount, config.model.average_rate = 0.9, 0.5  # by an override, or by another version's defaults
-    assert training.changed_settings(config) == ["model.average_rate=0.5 (was null)", "loss.discount=0.9 (was 0.997)"]
+    config.schedule.max_std.by = "known"
+    assert training.changed_settings(config) == [
+        "model.average_rate=0.5 (was null)", "loss.discount=0.9 (was 0.997)", "schedule.max_std.by=known (was run)",
+    ]  # fmt: skip
