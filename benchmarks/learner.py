@@ -5,6 +5,7 @@
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
     python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
+    python benchmarks/learner.py --in-turns --sizes cpu_small ssm_cpu_small --json results/learner_in_turns.json
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
 Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
@@ -12,6 +13,10 @@ Columns: `s` is the median of one whole update (losses, gradients, optimiser, sl
 GFLOP / s over the speed of a large matrix product measured in the same run at the same precision; `sample_share` is the
 time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
 (resident) or of the device, GiB.
+
+With `--in-turns` all of it happens in one process, where the sizes take turns from update to update, so that what
+else a machine does meets all alike: `world_model` is the median of forward and backward of the world model's loss
+alone, and `ratio` and `world_model_ratio` are medians, over the turns, of the first size's time over this one's.
 """
 
 import argparse
@@ -41,6 +46,8 @@ PRIVILEGED_DIM = 21
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
+IN_TURNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "ratio", "world_model",
+            "world_model_ratio")  # fmt: skip
 
 
 def main() -> None:
@@ -59,13 +66,29 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
     parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
     parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
+    parser.add_argument("--in-turns", action="store_true", help="compare the sizes, eager, in one process")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     if arguments.table:
         write_size_table(Path(arguments.table))
         return
+    if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
+        parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
     shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    if arguments.in_turns:
+        keep_freed_memory()
+        records = [
+            record | {"threads": arguments.threads}
+            for loss in arguments.losses
+            for actor in arguments.actor_losses
+            for record in measure_in_turns(
+                arguments.sizes, loss, actor, arguments.mixed_precision, arguments.image_size, *shared
+            )
+        ]
+        print_table(records, IN_TURNS)
+        write_json(records, arguments.json)
+        return
     prepare = None if arguments.return_freed_memory else keep_freed_memory
     jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
         (measure, (size, loss, actor, backend, arguments.mixed_precision, arguments.image_size, *shared), prepare)
@@ -133,6 +156,60 @@ def measure(
         "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
         "sample_share": statistics.median(samples) / median, "memory": memory,
     }  # fmt: skip
+
+
+def measure_in_turns(
+    sizes: list[str],
+    loss: str,
+    actor: str,
+    mixed_precision: bool,
+    image_size: int,
+    batch: tuple[int, int],
+    horizon: int,
+    device: str,
+    threads: int,
+    updates: int,
+) -> list[dict[str, Any]]:
+    """Time updates of several sizes, one of each after the other; return a record of each."""
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision("high")
+    config, losses = LearnerConfig(mixed_precision=mixed_precision), LossConfig(world_model=loss, actor=actor)
+    interface = interface_of(image_size)
+    learners = {
+        size: make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0) for size in sizes
+    }
+    data = filled_replay(batch, device, image_size).sample()
+    whole: dict[str, list[float]] = {size: [] for size in sizes}
+    model: dict[str, list[float]] = {size: [] for size in sizes}
+    for _ in range(3 + updates):
+        for size, learner in learners.items():
+            whole[size].append(seconds(lambda learner=learner: learner.update(data), device))
+            model[size].append(seconds(lambda learner=learner: differentiate_world_model(learner, data), device))
+    first = sizes[0]
+    return [
+        {
+            "benchmark": "learner_in_turns", "size": size, "loss": loss, "actor": actor,
+            "backend": "eager" + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
+            "horizon": horizon, "image_size": image_size, "parameters": parameters(learners[size]),
+            "updates": updates, "s": statistics.median(whole[size][3:]), "ratio": ratio(whole[first], whole[size]),
+            "world_model": statistics.median(model[size][3:]),
+            "world_model_ratio": ratio(model[first], model[size]),
+        }
+        for size in sizes
+    ]  # fmt: skip
+
+
+def differentiate_world_model(learner: DreamerLearner, data: Any) -> None:
+    """Compute the gradients of the world model's loss alone, and drop them."""
+    with learner.autocast():
+        found = learner.losses["world_model"](data)
+    torch.stack([value for key, value in found.items() if key.startswith("loss_")]).sum().backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def ratio(first: list[float], other: list[float]) -> float:
+    """Return the median of one list over another, turn by turn, without the 3 of warm-up."""
+    return statistics.median(one / two for one, two in list(zip(first, other, strict=True))[3:])
 
 
 def interface_of(image_size: int) -> Interface:
