@@ -14,12 +14,14 @@ GFLOP / s over the speed of a large matrix product measured in the same run at t
 time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
 (resident) or of the device, GiB.
 
-With `--in-turns` all of it happens in one process, where the sizes take turns from update to update, so that what
-else a machine does meets all alike: `world_model` is the median of forward and backward of the world model's loss
-alone, and `ratio` and `world_model_ratio` are medians, over the turns, of the first size's time over this one's.
+With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
+all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`)
+and of its RSSM's `observe` alone (`observe`). Each `ratio` is the median over the turns of the first size's time over
+this one's.
 """
 
 import argparse
+import functools
 import resource
 import statistics
 import time
@@ -46,8 +48,8 @@ PRIVILEGED_DIM = 21
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
-IN_TURNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "ratio", "world_model",
-            "world_model_ratio")  # fmt: skip
+IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
+            "world_model_ratio", "observe", "observe_ratio")  # fmt: skip
 
 
 def main() -> None:
@@ -179,21 +181,26 @@ def measure_in_turns(
         size: make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0) for size in sizes
     }
     data = filled_replay(batch, device, image_size).sample()
-    whole: dict[str, list[float]] = {size: [] for size in sizes}
-    model: dict[str, list[float]] = {size: [] for size in sizes}
+    parts: dict[str, Callable[[DreamerLearner], Any]] = {
+        "s": lambda learner: learner.update(data),
+        "world_model": lambda learner: differentiate_world_model(learner, data),
+        "observe": lambda learner: differentiate_observe(learner, data),
+    }
+    times: dict[tuple[str, str], list[float]] = {(size, part): [] for size in sizes for part in parts}
     for _ in range(3 + updates):
-        for size, learner in learners.items():
-            whole[size].append(seconds(lambda learner=learner: learner.update(data), device))
-            model[size].append(seconds(lambda learner=learner: differentiate_world_model(learner, data), device))
-    first = sizes[0]
+        for part, run in parts.items():
+            for size, learner in learners.items():
+                times[size, part].append(seconds(functools.partial(run, learner), device))
     return [
         {
             "benchmark": "learner_in_turns", "size": size, "loss": loss, "actor": actor,
             "backend": "eager" + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
-            "horizon": horizon, "image_size": image_size, "parameters": parameters(learners[size]),
-            "updates": updates, "s": statistics.median(whole[size][3:]), "ratio": ratio(whole[first], whole[size]),
-            "world_model": statistics.median(model[size][3:]),
-            "world_model_ratio": ratio(model[first], model[size]),
+            "horizon": horizon, "image_size": image_size, "parameters": parameters(learners[size]), "updates": updates,
+            **{part: statistics.median(times[size, part][3:]) for part in parts},
+            **{
+                "ratio" if part == "s" else f"{part}_ratio": ratio(times[sizes[0], part], times[size, part])
+                for part in parts
+            },
         }
         for size in sizes
     ]  # fmt: skip
@@ -204,6 +211,16 @@ def differentiate_world_model(learner: DreamerLearner, data: Any) -> None:
     with learner.autocast():
         found = learner.losses["world_model"](data)
     torch.stack([value for key, value in found.items() if key.startswith("loss_")]).sum().backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def differentiate_observe(learner: DreamerLearner, data: Any) -> None:
+    """Compute the gradients of sums of what the RSSM makes of embeddings of zero, and drop them."""
+    model = learner.agent.world_model
+    embedding = torch.zeros(*data.batch_size, model.encoder.embedding_size, device=learner.device)
+    with learner.autocast():
+        posterior = model.rssm.observe(embedding, data["previous_action"], data["is_init"].squeeze(-1))
+    torch.stack([value.sum() for value in posterior]).sum().backward()
     learner.optimizer.zero_grad(set_to_none=True)
 
 

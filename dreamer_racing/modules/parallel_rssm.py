@@ -42,8 +42,8 @@ class DiagonalSSM(nn.Module):
     Raises:
         ValueError: If the belief cannot be divided among the layers.
 
-    Reference: Gu & Dao 2023, "Mamba", Theorem 1; Feng et al. 2024, "Were RNNs All We Needed?" (minGRU: the same
-    recurrence); Tallec & Ollivier 2018 (initial decays by time constants).
+    Reference: Gu & Dao 2023, "Mamba", Theorem 1; Feng et al. 2024, "Were RNNs All We Needed?" (minGRU: the same but for
+    the tanh); Tallec & Ollivier 2018, "Can Recurrent Neural Networks Warp Time?" (initial decays by time constants).
     """
 
     def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
