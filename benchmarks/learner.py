@@ -15,9 +15,9 @@ time of sampling and moving a replay batch over that of the update; `memory` is 
 (resident) or of the device, GiB.
 
 With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
-all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`)
-and of its RSSM's `observe` alone (`observe`). Each `ratio` is the median over the turns of the first size's time over
-this one's.
+all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
+of its RSSM's `observe` alone (`observe`), and of the same window through `observe_step` (`steps`). Each `ratio` is the
+median over the turns of the first size's time over this one's.
 """
 
 import argparse
@@ -49,7 +49,7 @@ PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
 IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
-            "world_model_ratio", "observe", "observe_ratio")  # fmt: skip
+            "world_model_ratio", "observe", "observe_ratio", "steps")  # fmt: skip
 
 
 def main() -> None:
@@ -185,6 +185,7 @@ def measure_in_turns(
         "s": lambda learner: learner.update(data),
         "world_model": lambda learner: differentiate_world_model(learner, data),
         "observe": lambda learner: differentiate_observe(learner, data),
+        "steps": lambda learner: differentiate_steps(learner, data),
     }
     times: dict[tuple[str, str], list[float]] = {(size, part): [] for size in sizes for part in parts}
     for _ in range(3 + updates):
@@ -221,6 +222,23 @@ def differentiate_observe(learner: DreamerLearner, data: Any) -> None:
     with learner.autocast():
         posterior = model.rssm.observe(embedding, data["previous_action"], data["is_init"].squeeze(-1))
     torch.stack([value.sum() for value in posterior]).sum().backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def differentiate_steps(learner: DreamerLearner, data: Any) -> None:
+    """Do what `differentiate_observe` does record by record, without logits."""
+    model = learner.agent.world_model
+    batch, length = data.batch_size
+    embedding = torch.zeros(batch, model.encoder.embedding_size, device=learner.device)
+    total = torch.zeros((), device=learner.device)
+    with learner.autocast():
+        belief, state = (value.expand(batch, -1) for value in model.rssm.initial())
+        for step in range(length):
+            record = data[:, step]
+            is_init = record["is_init"].squeeze(-1)
+            belief, state = model.rssm.observe_step(embedding, record["previous_action"], is_init, belief, state)
+            total = total + belief.sum() + state.sum()
+    total.backward()
     learner.optimizer.zero_grad(set_to_none=True)
 
 
