@@ -99,7 +99,7 @@ class DiagonalSSM(nn.Module):
         for index, (gates, before) in enumerate(zip(self.gates, belief.chunk(LAYERS, -1), strict=True)):
             if index:
                 hidden = hidden + self.mixes[index - 1](after[-1])
-            # In float32, also under autocast: in bfloat16 a decay near 1 would be 1.
+            # In float32, also under autocast: just below 1 numbers of bfloat16 are 0.004 apart.
             decay, candidate = gates(hidden).float().chunk(2, -1)
             decay = torch.sigmoid(decay)
             drive = torch.lerp(torch.tanh(candidate), before, decay)
