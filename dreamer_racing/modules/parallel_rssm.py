@@ -85,8 +85,8 @@ class DiagonalSSM(nn.Module):
             belief: Where a step begins from a given belief, that one; zero elsewhere. ``(B, T, D)``.
             state: Before each step, ``(B, T, S)``.
             projected_action: ``(B, T, U)``.
-            begins: Whether a step goes on from ``belief``, as the first one must, instead of from the step before it;
-                bool ``(B, T, 1)``.
+            begins: Whether a step goes on from ``belief`` instead of from the step before it, bool ``(B, T, 1)``; the
+                first one always does.
 
         Returns:
             ``(B, T, D)``.
@@ -173,6 +173,5 @@ class ParallelRSSM(RSSM):
         before = torch.where(resets, start[1], before)
         given = torch.cat((belief.unsqueeze(1), belief.new_zeros(batch, time - 1, belief.shape[-1])), 1)
         given = torch.where(resets, start[0], given)
-        first = torch.arange(time, device=is_init.device).view(1, -1, 1) == 0
-        beliefs = self.cell.scan(given, before, actions, resets | first)
+        beliefs = self.cell.scan(given, before, actions, resets)
         return Posterior(beliefs, states, logits, self.prior_logits(beliefs))
