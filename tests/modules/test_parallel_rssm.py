@@ -101,6 +101,13 @@ def test_a_fresh_layer_forgets_at_its_time_constants():
         assert (part.diff() > 0).all()
 
 
+def test_the_second_layer_reads_the_first_and_teaches_it():
+    rssm = make_rssm()
+    second = rssm.observe(*make_window()).belief.chunk(LAYERS, -1)[1]
+    second.square().sum().backward()
+    assert rssm.cell.gates[0].weight.grad.abs().sum() > 0
+
+
 def test_a_window_costs_a_few_calls_more_where_it_is_longer():
     rssm = make_rssm()
     calls = {}
