@@ -5,6 +5,7 @@
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
     python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
+    python benchmarks/learner.py --in-turns --sizes cpu_small ssm_cpu_small --json results/learner_in_turns.json
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
 Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
@@ -12,9 +13,15 @@ Columns: `s` is the median of one whole update (losses, gradients, optimiser, sl
 GFLOP / s over the speed of a large matrix product measured in the same run at the same precision; `sample_share` is the
 time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
 (resident) or of the device, GiB.
+
+With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
+all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
+of its RSSM's `observe` alone (`observe`), and of the same window through `observe_step` (`steps`). Each `ratio` is the
+median over the turns of the first size's time over this one's.
 """
 
 import argparse
+import functools
 import resource
 import statistics
 import time
@@ -41,6 +48,8 @@ PRIVILEGED_DIM = 21
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
+IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
+            "world_model_ratio", "observe", "observe_ratio", "steps")  # fmt: skip
 
 
 def main() -> None:
@@ -59,13 +68,29 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
     parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
     parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
+    parser.add_argument("--in-turns", action="store_true", help="compare the sizes, eager, in one process")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     if arguments.table:
         write_size_table(Path(arguments.table))
         return
+    if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
+        parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
     shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    if arguments.in_turns:
+        keep_freed_memory()
+        records = [
+            record | {"threads": arguments.threads}
+            for loss in arguments.losses
+            for actor in arguments.actor_losses
+            for record in measure_in_turns(
+                arguments.sizes, loss, actor, arguments.mixed_precision, arguments.image_size, *shared
+            )
+        ]
+        print_table(records, IN_TURNS)
+        write_json(records, arguments.json)
+        return
     prepare = None if arguments.return_freed_memory else keep_freed_memory
     jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
         (measure, (size, loss, actor, backend, arguments.mixed_precision, arguments.image_size, *shared), prepare)
@@ -133,6 +158,93 @@ def measure(
         "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
         "sample_share": statistics.median(samples) / median, "memory": memory,
     }  # fmt: skip
+
+
+def measure_in_turns(
+    sizes: list[str],
+    loss: str,
+    actor: str,
+    mixed_precision: bool,
+    image_size: int,
+    batch: tuple[int, int],
+    horizon: int,
+    device: str,
+    threads: int,
+    updates: int,
+) -> list[dict[str, Any]]:
+    """Time updates of several sizes, one of each after the other; return a record of each."""
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision("high")
+    config, losses = LearnerConfig(mixed_precision=mixed_precision), LossConfig(world_model=loss, actor=actor)
+    interface = interface_of(image_size)
+    learners = {
+        size: make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0) for size in sizes
+    }
+    data = filled_replay(batch, device, image_size).sample()
+    parts: dict[str, Callable[[DreamerLearner], Any]] = {
+        "s": lambda learner: learner.update(data),
+        "world_model": lambda learner: differentiate_world_model(learner, data),
+        "observe": lambda learner: differentiate_observe(learner, data),
+        "steps": lambda learner: differentiate_steps(learner, data),
+    }
+    times: dict[tuple[str, str], list[float]] = {(size, part): [] for size in sizes for part in parts}
+    for _ in range(3 + updates):
+        for part, run in parts.items():
+            for size, learner in learners.items():
+                times[size, part].append(seconds(functools.partial(run, learner), device))
+    return [
+        {
+            "benchmark": "learner_in_turns", "size": size, "loss": loss, "actor": actor,
+            "backend": "eager" + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
+            "horizon": horizon, "image_size": image_size, "parameters": parameters(learners[size]), "updates": updates,
+            **{part: statistics.median(times[size, part][3:]) for part in parts},
+            **{
+                "ratio" if part == "s" else f"{part}_ratio": ratio(times[sizes[0], part], times[size, part])
+                for part in parts
+            },
+        }
+        for size in sizes
+    ]  # fmt: skip
+
+
+def differentiate_world_model(learner: DreamerLearner, data: Any) -> None:
+    """Compute the gradients of the world model's loss alone, and drop them."""
+    with learner.autocast():
+        found = learner.losses["world_model"](data)
+    torch.stack([value for key, value in found.items() if key.startswith("loss_")]).sum().backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def differentiate_observe(learner: DreamerLearner, data: Any) -> None:
+    """Compute the gradients of sums of what the RSSM makes of embeddings of zero, and drop them."""
+    model = learner.agent.world_model
+    embedding = torch.zeros(*data.batch_size, model.encoder.embedding_size, device=learner.device)
+    with learner.autocast():
+        posterior = model.rssm.observe(embedding, data["previous_action"], data["is_init"].squeeze(-1))
+    torch.stack([value.sum() for value in posterior]).sum().backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def differentiate_steps(learner: DreamerLearner, data: Any) -> None:
+    """Do what `differentiate_observe` does record by record, without logits."""
+    model = learner.agent.world_model
+    batch, length = data.batch_size
+    embedding = torch.zeros(batch, model.encoder.embedding_size, device=learner.device)
+    total = torch.zeros((), device=learner.device)
+    with learner.autocast():
+        belief, state = (value.expand(batch, -1) for value in model.rssm.initial())
+        for step in range(length):
+            record = data[:, step]
+            is_init = record["is_init"].squeeze(-1)
+            belief, state = model.rssm.observe_step(embedding, record["previous_action"], is_init, belief, state)
+            total = total + belief.sum() + state.sum()
+    total.backward()
+    learner.optimizer.zero_grad(set_to_none=True)
+
+
+def ratio(first: list[float], other: list[float]) -> float:
+    """Return the median of one list over another, turn by turn, without the 3 of warm-up."""
+    return statistics.median(one / two for one, two in list(zip(first, other, strict=True))[3:])
 
 
 def interface_of(image_size: int) -> Interface:

@@ -7,6 +7,7 @@ from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
 from dreamer_racing.modules.encoder import ImageEncoder, ObservationEncoder, VectorEncoder
 from dreamer_racing.modules.heads import MLP, ContinueHead, TwoHot, TwoHotHead, symexp, symlog
 from dreamer_racing.modules.interface import Interface
+from dreamer_racing.modules.parallel_rssm import DiagonalSSM, ParallelRSSM
 from dreamer_racing.modules.policy import DreamerPolicy
 from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, DenseGRUCell, Posterior
 from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
@@ -23,12 +24,14 @@ __all__ = [
     "ContinueHead",
     "Critic",
     "DenseGRUCell",
+    "DiagonalSSM",
     "DreamerPolicy",
     "ImageDecoder",
     "ImageEncoder",
     "Interface",
     "ModelSize",
     "ObservationEncoder",
+    "ParallelRSSM",
     "Posterior",
     "TwoHot",
     "TwoHotHead",

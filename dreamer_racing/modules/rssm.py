@@ -7,7 +7,7 @@ S state = L·K, U hidden. Everything here is plain tensors, so that a time loop 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -153,10 +153,6 @@ class BlockGRUCell(nn.Module):
         return _gated_update(reset, candidate, update, belief)
 
 
-CELLS: dict[str, type[DenseGRUCell] | type[BlockGRUCell]] = {"dense": DenseGRUCell, "block": BlockGRUCell}
-"""Recurrent cells by the name that a ``ModelSize`` gives."""
-
-
 class RSSM(nn.Module):
     """World model's dynamics: ``h_t = f(h_{t−1}, z_{t−1}, a_{t−1})``, ``z_t ~ q(z | h_t, o_t)`` or ``p(z | h_t)``.
 
@@ -170,7 +166,7 @@ class RSSM(nn.Module):
         latents: L.
         classes: K.
         hidden: U.
-        recurrence: ``"block"`` or ``"dense"``.
+        recurrence: Key of ``cells``; default the first.
         blocks: Blocks of the block GRU.
         prior_layers: Hidden layers from h to the prior's logits.
         norm: ``"rms"`` or ``"layer"``.
@@ -178,6 +174,9 @@ class RSSM(nn.Module):
         unimix: Share of the uniform distribution in every categorical.
         sampled: Whether a state is a sample of its categoricals, as in DreamerV3, or their probabilities themselves:
             then nothing is drawn, in acting, training and imagination alike.
+
+    Raises:
+        ValueError: If there is no cell of that name.
 
     Example:
         >>> import torch
@@ -189,6 +188,11 @@ class RSSM(nn.Module):
     Reference: danijar/dreamerv3, ``rssm.RSSM``; DreamerV3, Eq. 3.
     """
 
+    cells: ClassVar[dict[str, Any]] = {"block": BlockGRUCell, "dense": DenseGRUCell}
+    """Recurrent cells by the name that a ``ModelSize`` gives."""
+    posterior_layer: ClassVar[Any] = SplitNormedLinear
+    """Hidden layer of the posterior, of belief and embedding."""
+
     def __init__(
         self,
         embedding: int,
@@ -197,7 +201,7 @@ class RSSM(nn.Module):
         latents: int,
         classes: int,
         hidden: int,
-        recurrence: str = "block",
+        recurrence: str | None = None,
         blocks: int = 8,
         prior_layers: int = 2,
         norm: str = "rms",
@@ -206,15 +210,18 @@ class RSSM(nn.Module):
         sampled: bool = True,
     ) -> None:
         super().__init__()
+        recurrence = recurrence or next(iter(self.cells))
+        if recurrence not in self.cells:
+            raise ValueError(f"{type(self).__name__}: recurrence={recurrence!r}, known here: {', '.join(self.cells)}.")
         self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
         state = latents * classes
-        self.cell = CELLS[recurrence](belief, state, action, hidden, norm, blocks)
+        self.cell = self.cells[recurrence](belief, state, action, hidden, norm, blocks)
         widths = [belief] + [hidden] * prior_layers
         self.prior = nn.Sequential(
             *(NormedLinear(before, after, norm) for before, after in pairwise(widths)),
             linear(hidden, state),
         )
-        self.posterior_hidden = SplitNormedLinear(belief, embedding, hidden, norm)
+        self.posterior_hidden = self.posterior_layer(belief, embedding, hidden, norm)
         self.posterior_output = linear(hidden, state)
         self.learned_initial = learned_initial
         self.initial_belief = nn.Parameter(torch.zeros(1, belief), requires_grad=learned_initial)
@@ -340,14 +347,15 @@ class RSSM(nn.Module):
         belief = torch.where(reset, start[0], belief)
         state = torch.where(reset, start[1], state)
         belief = self.cell(belief, state, projected_action)
-        logits = (
-            self.posterior_output(self.posterior_hidden(belief, embedded))
-            .float()
-            .unflatten(-1, (self.latents, self.classes))
-        )
+        logits = self._posterior_logits(belief, embedded)
         return belief, self._sample(logits, noise), logits
 
+    def _posterior_logits(self, belief: Tensor, embedded: Tensor) -> Tensor:
+        """Map beliefs ``(..., D)`` and projected embeddings ``(..., U)`` to the posterior's logits ``(..., L, K)``."""
+        logits = self.posterior_output(self.posterior_hidden(belief, embedded))
+        return logits.float().unflatten(-1, (self.latents, self.classes))
+
     def _sample(self, logits: Tensor, noise: Tensor | None) -> Tensor:
-        """Return a state ``(N, S)`` by logits ``(N, L, K)``."""
+        """Return states ``(..., S)`` by logits ``(..., L, K)``."""
         probabilities = mix_uniform(logits, self.unimix)
         return (sample_one_hot(probabilities, noise) if self.sampled else probabilities).flatten(-2)

@@ -16,7 +16,9 @@ class ModelSize:
         latents: Number of categorical latents in z.
         classes: Classes of each categorical latent.
         units: Width of the reward, continue, actor and critic layers.
-        recurrence: ``"block"`` (2025 block GRU) or ``"dense"`` (2023 GRU).
+        recurrence: ``"block"`` (2025 block GRU), ``"dense"`` (2023 GRU) or ``"ssm"`` (an extension: a diagonal
+            state-space model, which a training window runs through as a parallel scan; the posterior then sees the
+            observation alone).
         blocks: Diagonal blocks of the block GRU and of the decoder's first layer (1: dense decoder input).
         prior_layers: Hidden layers from h to the prior's logits.
         head_layers: Hidden layers of the reward and continue heads.
@@ -146,7 +148,12 @@ SIZES: dict[str, ModelSize] = {
 """Sizes by name.
 
 Reference: ``size*`` danijar/dreamerv3 ``configs.yaml``; ``paper_*`` S, M and L of Hafner et al. 2023, Appendix B, of
-which the paper uses L."""
+which the paper uses L; ``ssm_*`` are the same widths with a state-space model in place of the GRU."""
+
+SIZES |= {
+    f"ssm_{name}": replace(SIZES[name], name=f"ssm_{name}", recurrence="ssm")
+    for name in ("debug", "cpu_small", "size12m", "paper_large")
+}
 
 
 def get_size(size: ModelSize | str) -> ModelSize:

@@ -14,8 +14,12 @@ from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
 from dreamer_racing.modules.encoder import ObservationEncoder
 from dreamer_racing.modules.heads import ContinueHead, TwoHotHead
 from dreamer_racing.modules.interface import Interface
+from dreamer_racing.modules.parallel_rssm import ParallelRSSM
 from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import ModelSize, get_size
+
+RSSMS: dict[str, type[RSSM]] = {recurrence: kind for kind in (RSSM, ParallelRSSM) for recurrence in kind.cells}
+"""Dynamics by the recurrence that a ``ModelSize`` gives."""
 
 
 def join_features(belief: Tensor, state: Tensor) -> Tensor:
@@ -35,6 +39,9 @@ class WorldModel(nn.Module):
         decoder: ``ImageDecoder``, or None.
         vector_decoder: ``VectorDecoder`` of what is seen under ``"vector"``, or None.
 
+    Raises:
+        ValueError: If there is no recurrence of the name that the size gives.
+
     Example:
         >>> import torch
         >>> world_model = WorldModel("debug")
@@ -49,7 +56,11 @@ class WorldModel(nn.Module):
         size, interface = get_size(size), interface or Interface()
         self.size, self.interface = size, interface
         self.encoder = ObservationEncoder(size, interface)
-        self.rssm = RSSM(
+        if size.recurrence not in RSSMS:
+            raise ValueError(
+                f"Model size {size.name!r} has recurrence={size.recurrence!r}; there are {', '.join(RSSMS)}."
+            )
+        self.rssm = RSSMS[size.recurrence](
             self.encoder.embedding_size,
             interface.action_dim,
             size.belief,

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,8 @@ REFERENCE = ModelSize("tiny", belief=16, hidden=8, classes=4, units=8, cnn_depth
 LEARNED = ModelSize("tiny_learned", belief=16, hidden=8, classes=4, units=8, cnn_depth=2, latents=4,
                     recurrence="dense", norm="layer", learned_initial=True, strided=True)  # fmt: skip
 """The 2023 architecture: dense GRU, layer norm, a learned initial state."""
+STATE_SPACE = replace(LEARNED, name="tiny_ssm", recurrence="ssm")
+"""The same with a state-space model in place of the GRU."""
 
 
 def make_agent(size: ModelSize | str = "debug", interface: Interface | None = None, seed: int = 0) -> Agent:
@@ -121,7 +124,7 @@ def test_the_step_flies_as_the_policy_did(agent: Agent) -> None:
 
 
 @pytest.mark.parametrize("step_class", [ActorStep, SampledActorStep])
-@pytest.mark.parametrize("size", ["debug", LEARNED], ids=["zero", "learned"])
+@pytest.mark.parametrize("size", ["debug", LEARNED, STATE_SPACE], ids=["zero", "learned", "state space"])
 def test_a_reset_forgets_everything(size: ModelSize | str, step_class: type[ActorStep]) -> None:
     step = step_class(make_agent(size))
     inputs = step.example_inputs()
@@ -164,8 +167,13 @@ def test_noise_of_zero_is_no_accident(agent: Agent) -> None:
 @pytest.mark.parametrize("latent", ["mode", "sample"])
 @pytest.mark.parametrize(
     ("size", "interface"),
-    [(REFERENCE, Interface()), (LEARNED, Interface()), ("debug", Interface(pixels=False, vector_dim=21))],
-    ids=["block", "learned", "vector"],
+    [
+        (REFERENCE, Interface()),
+        (LEARNED, Interface()),
+        (STATE_SPACE, Interface()),
+        ("debug", Interface(pixels=False, vector_dim=21)),
+    ],
+    ids=["block", "learned", "state space", "vector"],
 )
 def test_every_architecture_flies_alike(
     size: ModelSize | str, interface: Interface, latent: str, tmp_path: Path

@@ -312,7 +312,7 @@ def test_losses_are_chosen_by_name(monkeypatch):
         learner_of(**CONFIG | {"actor": "timid"})
 
 
-@pytest.mark.parametrize("recurrence", ["block", "dense"])
+@pytest.mark.parametrize("recurrence", ["block", "dense", "ssm"])
 @pytest.mark.parametrize("norm", ["rms", "layer"])
 def test_every_variant_updates(recurrence, norm):
     size = replace(
@@ -329,7 +329,7 @@ def test_every_variant_updates(recurrence, norm):
     assert learner.update(make_batch())["loss"].isfinite()
 
 
-@pytest.mark.parametrize("recurrence", ["block", "dense"])
+@pytest.mark.parametrize("recurrence", ["block", "dense", "ssm"])
 def test_mixed_precision_is_close_to_full(recurrence):
     size = replace(SIZES["debug"], name="variant", recurrence=recurrence, blocks=2, norm="rms")
     results = []

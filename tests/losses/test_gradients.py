@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ActorPPOConfig, DecoderFreeLoss
 from dreamer_racing.losses.actor import frozen
-from dreamer_racing.modules import RSSM, Interface, WorldModel
+from dreamer_racing.modules import Interface, WorldModel
+from dreamer_racing.modules.world_model import RSSMS
 from tests.dreamers import learner_of
 
 PRIVILEGED_DIM = 5
@@ -235,11 +236,12 @@ def test_actor_through_the_dynamics_leaves_the_flags_as_they_were():
     assert trainable(learner.agent) == before
 
 
-@pytest.mark.parametrize("recurrence", ["dense", "block"])
+@pytest.mark.parametrize("recurrence", ["dense", "block", "ssm"])
 def test_gradients_of_an_unroll_are_those_of_its_steps(recurrence, monkeypatch):
     """Also across a reset, and with the same samples."""
     torch.manual_seed(0)
-    rssm = RSSM(8, 4, 16, latents=3, classes=4, hidden=8, recurrence=recurrence, blocks=4, learned_initial=True)
+    kind = RSSMS[recurrence]
+    rssm = kind(8, 4, 16, latents=3, classes=4, hidden=8, recurrence=recurrence, blocks=4, learned_initial=True)
     embedding, action = torch.randn(2, 6, 8), torch.rand(2, 6, 4) * 2 - 1
     is_init = torch.zeros(2, 6, dtype=torch.bool)
     is_init[1, 3] = True

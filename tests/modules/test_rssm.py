@@ -4,17 +4,20 @@ import pytest
 import torch
 
 from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, mix_uniform, sample_one_hot
+from dreamer_racing.modules.world_model import RSSMS
 
 KINDS = [
     {"recurrence": "dense", "norm": "layer", "learned_initial": False},
     {"recurrence": "dense", "norm": "layer", "learned_initial": True},
     {"recurrence": "block", "norm": "rms", "learned_initial": False},
+    {"recurrence": "ssm", "norm": "layer", "learned_initial": False},
+    {"recurrence": "ssm", "norm": "rms", "learned_initial": True},
 ]
 
 
 def make_rssm(**kind) -> RSSM:
     torch.manual_seed(0)
-    rssm = RSSM(embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, blocks=4, **kind)
+    rssm = RSSMS[kind["recurrence"]](embedding=8, action=4, belief=16, latents=3, classes=4, hidden=8, blocks=4, **kind)
     if rssm.learned_initial:
         torch.nn.init.normal_(rssm.initial_belief)
     return rssm
@@ -88,8 +91,9 @@ def test_reset_forgets_everything_before_it(kind):
     torch.testing.assert_close(again.belief, whole.belief)
 
 
-def test_continuing_from_a_state_equals_one_window():
-    rssm = make_rssm(**KINDS[0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_continuing_from_a_state_equals_one_window(kind):
+    rssm = make_rssm(**kind)
     embedding, action, is_init = make_sequence()
     whole = rssm.observe(embedding, action, is_init, deterministic=True)
     carried = (whole.belief[:, 1], whole.state[:, 1])
@@ -107,8 +111,9 @@ def test_actions_beyond_the_bounds_count_as_the_bounds(kind):
     )
 
 
-def test_imagining_is_the_same_recurrence_as_observing():
-    rssm = make_rssm(**KINDS[2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_imagining_is_the_same_recurrence_as_observing(kind):
+    rssm = make_rssm(**kind)
     embedding, action, _ = make_sequence()
     posterior = rssm.observe(embedding, action, torch.zeros(2, 6, dtype=torch.bool), deterministic=True)
     belief, state = rssm.imagine_step(posterior.belief[:, 2], posterior.state[:, 2], action[:, 3], deterministic=True)
@@ -130,11 +135,18 @@ def test_block_cell_equals_blocks_that_read_the_shared_inputs():
         torch.testing.assert_close(ours[:, part], expected)
 
 
-def test_gradient_reaches_the_first_record_but_not_across_a_reset():
-    rssm = make_rssm(**KINDS[0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradient_reaches_the_first_record_but_not_across_a_reset(kind):
+    rssm = make_rssm(**kind)
     embedding, action, is_init = make_sequence()
     embedding.requires_grad_()
     rssm.observe(embedding, action, is_init).belief[:, -1].sum().backward()
     assert embedding.grad[0, 0].abs().sum() > 0
     assert embedding.grad[1, :3].abs().sum() == 0
     assert embedding.grad[1, 3].abs().sum() > 0
+
+
+@pytest.mark.parametrize("recurrence", ["dense", "ssm"])
+def test_unknown_recurrences_are_refused(recurrence):
+    with pytest.raises(ValueError, match=r"recurrence='lstm', known here: "):
+        RSSMS[recurrence](8, 4, 16, latents=3, classes=4, hidden=8, recurrence="lstm")

@@ -97,6 +97,12 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
+def test_what_races_goes_with_a_state_space_model() -> None:
+    gru, ssm = compose("dreamer_v3", "tuned=race"), compose("dreamer_v3", "tuned=race", "model=ssm_cpu_small")
+    assert OmegaConf.to_container(gru) | {"model": None} == OmegaConf.to_container(ssm) | {"model": None}
+    assert OmegaConf.to_container(gru.model) | {"size": "ssm_cpu_small"} == OmegaConf.to_container(ssm.model)
+
+
 def test_dreamer_as_published_is_one_word_away() -> None:
     """Every number of losses, model and schedule as in the reference, or as its size says."""
     faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
@@ -119,6 +125,7 @@ def test_dreamer_as_published_is_one_word_away() -> None:
         (["model=debug"], "none"),
         (["model=size12m"], "none"),
         (["model=cpu_small"], "race"),
+        (["model=ssm_cpu_small"], "none"),
         (["budget=smoke"], "none"),
         (["env.from_pixels=false"], "none"),
         (["env=dmc", "task=walker_walk"], "none"),

@@ -111,7 +111,11 @@ RACE = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tuned", [["tuned=none"], [*RACE, "loss.actor=ppo"]], ids=["none", "race in imagination"])
+@pytest.mark.parametrize(
+    "tuned",
+    [["tuned=none"], [*RACE, "loss.actor=ppo"], [*RACE, "model=ssm_debug"]],
+    ids=["none", "race in imagination", "state space"],
+)
 def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: Path) -> None:
     train(tmp_path, *SETTINGS, *tuned, "track=circle", "env=faithful", "run_dir=whole")
     kill(tmp_path / "whole", tmp_path / "killed")

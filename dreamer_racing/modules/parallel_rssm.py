@@ -1,0 +1,177 @@
+"""RSSM without a loop over time: a diagonal state-space model, which a window runs through as a parallel scan.
+
+Shape legend: B batch, T time, N any one-dimensional batch, A action, E embedding, D belief, S state, U hidden,
+W = D / LAYERS channels of a layer.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, linear
+from dreamer_racing.modules.linear_recurrence import linear_recurrence
+from dreamer_racing.modules.rssm import RSSM, Posterior
+
+LAYERS = 2
+"""Layers of the recurrence: channels of one do not see each other's past, those of the next one read all of it."""
+TIME_CONSTANTS = (2.0, 64.0)
+"""Shortest and longest memory of a fresh layer's channels, control steps; the others are spaced in between them,
+evenly in the logarithm. The project's own choice."""
+
+
+class DiagonalSSM(nn.Module):
+    """Layers of a selective diagonal state-space model, of which the belief is the states side by side.
+
+    ``ḣ = −h + x`` in each channel, discretised by zero-order hold over a step whose length the inputs choose:
+    ``h_t = α_t · h_{t−1} + (1 − α_t) · tanh(x_t)``. α and x depend on the previous state and action and on the layers
+    below, never on the layer's own past, so that h is linear in what it was: a scan computes a whole window. As a mean
+    of numbers in [−1, 1] the belief stays there, like that of a GRU.
+
+    Args:
+        belief: D, divisible by ``LAYERS``.
+        state: S.
+        action: A.
+        hidden: U.
+        norm: ``"rms"`` or ``"layer"``.
+        blocks: Ignored; here so that all cells are made alike.
+
+    Raises:
+        ValueError: If the belief cannot be divided among the layers.
+
+    Reference: Gu & Dao 2023, "Mamba", Theorem 1; Feng et al. 2024, "Were RNNs All We Needed?" (minGRU: the same but for
+    the tanh); Tallec & Ollivier 2018, "Can Recurrent Neural Networks Warp Time?" (initial decays by time constants).
+    """
+
+    def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
+        super().__init__()
+        if belief % LAYERS:
+            raise ValueError(f"DiagonalSSM: belief={belief} must divide into {LAYERS} layers: choose a multiple.")
+        self.action_dim = action
+        width = belief // LAYERS
+        self.inputs = SplitNormedLinear(state, action, hidden, norm)
+        gates = [linear(hidden, 2 * width) for _ in range(LAYERS)]
+        shortest, longest = map(math.log10, TIME_CONSTANTS)
+        for layer in gates:
+            # σ(ln(τ − 1)) = 1 − 1/τ
+            layer.bias.data[:width] = (torch.logspace(shortest, longest, width) - 1.0).log()
+        self.gates = nn.ModuleList(gates)
+        self.mixes = nn.ModuleList(NormedLinear(width, hidden, norm) for _ in range(LAYERS - 1))
+
+    def project_action(self, action: Tensor) -> Tensor:
+        """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
+        return self.inputs.project(action)
+
+    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
+        """Return the next belief.
+
+        Args:
+            belief: ``(N, D)``.
+            state: ``(N, S)``.
+            projected_action: From ``project_action``, ``(N, U)``.
+
+        Returns:
+            ``(N, D)``.
+        """
+        return self._run(belief, state, projected_action, None)
+
+    def scan(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor) -> Tensor:
+        """Return the next belief of every step of a window.
+
+        Args:
+            belief: Where a step begins from a given belief, that one; zero elsewhere. ``(B, T, D)``.
+            state: Before each step, ``(B, T, S)``.
+            projected_action: ``(B, T, U)``.
+            begins: Whether a step goes on from ``belief`` instead of from the step before it, bool ``(B, T, 1)``; the
+                first one always does.
+
+        Returns:
+            ``(B, T, D)``.
+        """
+        return self._run(belief, state, projected_action, begins)
+
+    def _run(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor | None) -> Tensor:
+        hidden = self.inputs(state, projected_action)
+        after: list[Tensor] = []
+        for index, (gates, before) in enumerate(zip(self.gates, belief.chunk(LAYERS, -1), strict=True)):
+            if index:
+                hidden = hidden + self.mixes[index - 1](after[-1])
+            # In float32, also under autocast: just below 1 numbers of bfloat16 are 0.004 apart.
+            decay, candidate = gates(hidden).float().chunk(2, -1)
+            decay = torch.sigmoid(decay)
+            drive = torch.lerp(torch.tanh(candidate), before, decay)
+            after.append(drive if begins is None else linear_recurrence(decay.masked_fill(begins, 0.0), drive))
+        return torch.cat(after, -1)
+
+
+class EmbeddingLayer(NormedLinear):
+    """Hidden layer of a posterior that sees the embedding alone; the arguments and methods of ``SplitNormedLinear``.
+
+    Args:
+        first_features: Ignored, as the belief is.
+        second_features: E.
+        out_features: U.
+        norm: Key of ``NORMS``.
+    """
+
+    def __init__(self, first_features: int, second_features: int, out_features: int, norm: str) -> None:
+        super().__init__(second_features, out_features, norm)
+
+    def project(self, second: Tensor) -> Tensor:
+        """Map embeddings ``(..., E)`` to the layer's output ``(..., U)``."""
+        return super().forward(second)
+
+    def forward(self, first: Tensor, projected: Tensor) -> Tensor:  # type: ignore[override]  # as SplitNormedLinear's
+        """Return what was projected, ``(..., U)``."""
+        return projected
+
+
+class ParallelRSSM(RSSM):
+    """RSSM whose posterior sees the observation alone: ``z_t ~ q(z | o_t)``, ``h_t = f(h_{t−1}, z_{t−1}, a_{t−1})``.
+
+    All z of a window are known before the first h, which is linear in the one before it: ``observe`` has no loop over
+    T. ``observe_step`` and ``imagine_step`` are those of ``RSSM``, and compute the same function step by step.
+
+    Arguments as for ``RSSM``; the recurrence is ``"ssm"``.
+
+    Example:
+        >>> import torch
+        >>> rssm = ParallelRSSM(embedding=8, action=4, belief=16, latents=2, classes=4, hidden=8)
+        >>> posterior = rssm.observe(torch.zeros(2, 5, 8), torch.zeros(2, 5, 4), torch.zeros(2, 5, dtype=torch.bool))
+        >>> posterior.belief.shape
+        torch.Size([2, 5, 16])
+
+    Reference: Krinner et al. 2025, "Accelerating Model-Based Reinforcement Learning with State-Space World Models";
+    Samsami et al. 2024, "Mastering Memory Tasks with World Models" (R2I).
+    """
+
+    cells: ClassVar[dict[str, Any]] = {"ssm": DiagonalSSM}
+    posterior_layer: ClassVar[Any] = EmbeddingLayer
+
+    def observe(
+        self,
+        embedding: Tensor,
+        previous_action: Tensor,
+        is_init: Tensor,
+        initial: tuple[Tensor, Tensor] | None = None,
+        deterministic: bool = False,
+    ) -> Posterior:
+        """Observe a sequence, all records at once; arguments and result as of ``RSSM.observe``."""
+        batch, time = is_init.shape
+        start = self.initial()
+        belief, state = initial or (value.expand(batch, -1) for value in start)
+        resets = is_init.unsqueeze(-1)
+        actions = self._project_action(previous_action, resets)
+        logits = self._posterior_logits(belief, self.posterior_hidden.project(embedding))
+        noise = None if deterministic else self.draw_noise(time, batch).transpose(0, 1).contiguous()
+        states = self._sample(logits, noise)
+        # What each step begins from: what was before it, or an episode's start.
+        before = torch.cat((state.unsqueeze(1), states[:, :-1]), 1)
+        before = torch.where(resets, start[1], before)
+        given = torch.cat((belief.unsqueeze(1), belief.new_zeros(batch, time - 1, belief.shape[-1])), 1)
+        given = torch.where(resets, start[0], given)
+        beliefs = self.cell.scan(given, before, actions, resets)
+        return Posterior(beliefs, states, logits, self.prior_logits(beliefs))
