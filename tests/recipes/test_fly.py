@@ -66,7 +66,9 @@ def test_without_a_display_it_says_in_a_sentence_how_to_get_a_video(monkeypatch:
     monkeypatch.setattr("dreamer_racing.envs.viewer.sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    words = r"cannot open a window here: no display .*; leave out viewer=true for a video, a GIF and a plot in runs/fly\.$"
+    words = (
+        r"cannot open a window here: no display .*; leave out viewer=true for a video, a GIF and a plot in runs/fly\.$"
+    )
     for flown in ({"agent": "kidney"}, {"pilot": "hover"}):
         with pytest.raises(ValueError, match=words):
             fly.check(fly.FlyConfig(viewer=True, **flown))
