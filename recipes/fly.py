@@ -2,39 +2,44 @@
 
     python recipes/fly.py track=kidney preset=easy pilot=scripted run_dir=runs/fly
     python recipes/fly.py agent=kidney
+    python recipes/fly.py agent=kidney viewer=true
     python recipes/fly.py track=figure8 pilot=keyboard
 
 A scripted pilot sees the true state, not images: it shows what a track asks for, and what lap times are in reach. An
 agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path.
 `pilot=keyboard` and `pilot=gamepad` are you, by what the camera sees in a window (arrows: roll and pitch; A, D: yaw;
-W, S: throttle). For scripted pilots, `viewer=true` opens dm_control's interactive viewer. Windows need a display.
+W, S: throttle). `viewer=true` shows agents and scripted pilots live in MuJoCo's viewer, the camera's image in a corner,
+and writes nothing. Windows need a display.
 """
 
-import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import restore
 from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import as_tensor, tensor
+from torch import tensor
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.viewer import RaceWindow, ViewerUnavailableError, WindowClosedError, check_window
 from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandPolicy, PygameSticks, check_by_hand
-from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, evaluate
-from dreamer_racing.evaluation.protocol import fly as fly_races
+from dreamer_racing.evaluation.course import Course
+from dreamer_racing.evaluation.evaluate import Episode, Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, race_words
@@ -45,6 +50,7 @@ GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
 PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
 GIF_STEPS = 300  # control steps shown if there is no second lap
+BREAK = 1.0  # s between two flights in the viewer
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -62,7 +68,7 @@ class FlyConfig:
     camera_tilt: float | None = None  # degrees upwards; null: 25
     control_rate: float | None = None  # Hz; null: 50
     renderer: str = "auto"  # as env.renderer in training, docs/options.md
-    viewer: bool = False  # watch in a window instead of writing files
+    viewer: bool = False  # watch agent or pilot live in a window instead of writing files
     seed: int = 0
 
 
@@ -101,9 +107,8 @@ def check(config: FlyConfig) -> None:
     Raises:
         ValueError: bad value; the message names the field and what is allowed.
     """
-    if config.agent is not None and (config.pilot is not None or config.viewer):
-        other = f"pilot={config.pilot}" if config.pilot is not None else "viewer=true, which shows pilots,"
-        raise ValueError(f"{other} and agent={config.agent}: give one of them.")
+    if config.agent is not None and config.pilot is not None:
+        raise ValueError(f"pilot={config.pilot} and agent={config.agent}: give one of them.")
     if config.pilot not in (None, *PILOTS, *KINDS):
         raise ValueError(f"pilot={config.pilot}: there are {', '.join((*PILOTS, *KINDS))}.")
     if config.pilot in KINDS:
@@ -114,20 +119,73 @@ def check(config: FlyConfig) -> None:
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name}={value}: must be at least 1.")
+    if config.viewer:
+        check_display(config)
+
+
+def check_display(config: FlyConfig) -> None:
+    """Refuse to be watched where there is no window, and say how to see the flight all the same.
+
+    Raises:
+        ValueError: no window can be opened here.
+    """
+    try:
+        check_window()
+    except ViewerUnavailableError as error:
+        raise ValueError(
+            f"{error}; leave out viewer=true for a video, a GIF and a plot in {config.run_dir}."
+        ) from error
+
+
+@dataclass
+class Flight:
+    """A race that is about to be flown."""
+
+    track: str | Track  # as it was named
+    env: DroneRacingEnv
+    fly: Callable[..., Evaluation]  # one episode of all laps; takes further arguments of `evaluate`
+
+
+def make_flight(config: FlyConfig) -> Flight:
+    """Put together who flies, and where."""
+    return pilots_flight(config) if config.agent is None else agents_flight(config)
 
 
 def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
     with plain_errors():
         Path(config.run_dir).mkdir(parents=True, exist_ok=True)
-    track, result = fly_pilot(config) if config.agent is None else fly_agent(config)
+    flight = make_flight(config)
+    result = flight.fly()
+    flight.env.close()
     laps = ", ".join(f"{time:.2f} s" for time in result.lap_times)
     print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-    write(Path(config.run_dir), track, result)
+    write(Path(config.run_dir), flight.track, result)
 
 
-def fly_pilot(config: FlyConfig) -> tuple[str | Track, Evaluation]:
-    """Fly by the true state."""
+def watch(config: FlyConfig) -> None:
+    """Fly one episode of all laps after the other before someone's eyes, until the window is closed."""
+    flight = make_flight(config)
+    window = RaceWindow(flight.env.worlds)
+    print("close the window, or press Ctrl-C, to end")
+    try:
+        with suppress(WindowClosedError, KeyboardInterrupt):
+            for number in count(1):
+                print(f"flight {number}: {in_words(flight.fly(on_step=window.show, num_trajectories=0).episodes[0])}")
+                time.sleep(BREAK)
+    finally:
+        window.close()
+        flight.env.close()
+
+
+def in_words(episode: Episode) -> str:
+    """Say how a flight ended, and what its laps took."""
+    laps = ", ".join(f"{duration:.2f} s" for duration in episode.lap_times)
+    return f"{episode.outcome.replace('_', ' ')} after {episode.gates_passed} gates, laps: {laps or 'none'}"
+
+
+def pilots_flight(config: FlyConfig) -> Flight:
+    """Let a pilot fly by the true state, or somebody by hand."""
     pilot, preset = config.pilot or PILOT, config.preset or PRESET
     camera = Camera()
     if config.image_size is not None:
@@ -141,11 +199,9 @@ def fly_pilot(config: FlyConfig) -> tuple[str | Track, Evaluation]:
         env = DroneRacingEnv(config.track or TRACK, 1, preset=preset, seed=config.seed, **worlds)
     print(f"{pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {preset}")
     if pilot in KINDS:
-        result = fly_by_hand(pilot, env)
-    else:
-        result = evaluate(env, PILOTS[pilot](env.track, env.worlds.parameters), episodes=1)
-    env.close()
-    return config.track or TRACK, result
+        return Flight(config.track or TRACK, env, partial(fly_by_hand, pilot, env))
+    policy = PILOTS[pilot](env.track, env.worlds.parameters)
+    return Flight(config.track or TRACK, env, partial(evaluate, env, policy, episodes=1))
 
 
 def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
@@ -162,8 +218,8 @@ def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
         sticks.close()
 
 
-def fly_agent(config: FlyConfig) -> tuple[str | Track, Evaluation]:
-    """Fly the deterministic policy of a trained agent."""
+def agents_flight(config: FlyConfig) -> Flight:
+    """Let the deterministic policy of a trained agent fly."""
     with plain_errors():
         race = EvaluateConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
         restored = restore(replace(race, checkpoint=str(config.agent)))
@@ -176,8 +232,8 @@ def fly_agent(config: FlyConfig) -> tuple[str | Track, Evaluation]:
         worlds = worlds_of(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
-    policy, judge = restored.flyer.evaluation_policy(), restored.flyer.judge()
-    return worlds["track"], fly_races(policy, worlds, episodes=1, judge=judge)
+    course = Course(restored.flyer.evaluation_policy(), worlds, num_envs=1)
+    return Flight(worlds["track"], course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
 
 
 def write(directory: Path, named: str | Track, result: Evaluation) -> None:
@@ -205,32 +261,6 @@ def second_lap(trajectory: Trajectory) -> tuple[int, int]:
     gate = trajectory.target_gate
     ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
     return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
-
-
-def watch(config: FlyConfig) -> None:
-    """Open the interactive viewer, if this machine can."""
-    from dreamer_racing.envs.viewer import ViewerUnavailableError, check_viewer, view
-
-    try:
-        check_viewer()
-        with plain_errors():
-            track, preset = config.track or TRACK, config.preset or PRESET
-            pilot = PILOTS[config.pilot or PILOT](load_track(track), load_preset(preset))
-        view(track, preset, on_time_steps(pilot), evaluation=True)
-    except ViewerUnavailableError as error:
-        print(f"error: {error} viewer=false writes a plot, a video and a GIF instead.", file=sys.stderr)
-        raise SystemExit(2) from error
-
-
-def on_time_steps(policy: Policy) -> Callable[[Any], np.ndarray]:
-    """Let a policy of the batched environment fly the dm_control task: dm_env `TimeStep` → action (4,)."""
-
-    def act(time_step: Any) -> np.ndarray:
-        state = {name: as_tensor(np.asarray(value)).unsqueeze(0) for name, value in time_step.observation.items()}
-        floats = {name: value.float() if value.is_floating_point() else value for name, value in state.items()}
-        return policy(TensorDict({"privileged": TensorDict(floats, [1])}, [1]))["action"][0].numpy()
-
-    return act
 
 
 if __name__ == "__main__":

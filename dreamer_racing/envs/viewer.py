@@ -1,23 +1,122 @@
-"""dm_control's interactive viewer on the race: `view("kidney")`.
+"""Windows on the race: `RaceWindow`, MuJoCo's viewer beside a flight, and `view("kidney")`, dm_control's viewer.
 
-It needs a display. Where there is none, `launch_viewer` says what is missing instead of failing inside GLFW; record a
-video or call `env.physics.render(480, 640, camera_id="spectator")` there. In the window, F1 lists the keys, and `[` and
-`]` switch between the free camera, the drone's `nose` and the `spectator`.
+They need a display. Where there is none, both say what is missing instead of failing inside GLFW; record a video or
+call `env.physics.render(480, 640, camera_id="spectator")` there. In either window F1 lists the keys; in dm_control's,
+`[` and `]` switch between the free camera, the drone's `nose` and the `spectator`.
 """
 
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Mapping
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
+from tensordict import TensorDictBase
+
+from dreamer_racing.envs.simulator.scene import build_scene
+from dreamer_racing.envs.worlds import RaceWorlds
 
 GL_WINDOW_LIBRARIES = ("libGL.so.1", "libGL.so", "libOpenGL.so.0")
+INSET_SHARE, INSET_MARGIN = 0.4, 8  # of the window's lesser side that the camera's image takes, at most; pixels
+CHASE_DISTANCE, CHASE_ELEVATION = 5.0, -35.0  # m and degrees, from the drone to who looks at it
+HIDDEN_GROUP = 4  # of geoms, which the viewer shows at the press of this digit
 
 
 class ViewerUnavailableError(RuntimeError):
     """No window can be opened here; the message names what is missing and what would help."""
+
+
+class WindowClosedError(Exception):
+    """The one who looked on has closed the window."""
+
+
+class RaceWindow:
+    """MuJoCo's viewer on the flight of one drone, with what its camera sees in a corner.
+
+    The window follows the drone, and can be turned with the mouse; walls and ceiling, which would stand in the way, are
+    hidden until the key 4 is pressed. It keeps a flight at the speed of time.
+
+    Args:
+        worlds: of the flight, N = 1; they fly on their own, the window has a scene of its own.
+
+    Raises:
+        ViewerUnavailableError: no window can be opened here.
+    """
+
+    def __init__(self, worlds: RaceWorlds) -> None:
+        check_window()
+        from mujoco import viewer
+
+        self._track, self._control_dt = worlds.track, worlds.parameters.control_dt
+        self._model = _scene_to_look_into(worlds)
+        self._data = mujoco.MjData(self._model)
+        self._due = time.monotonic()
+        before = set(threading.enumerate())
+        self._viewer = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._threads = set(threading.enumerate()) - before
+        camera = self._viewer.cam
+        camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, self._model.body("drone").id
+        camera.distance, camera.elevation = CHASE_DISTANCE, CHASE_ELEVATION
+
+    def show(self, tensordict: TensorDictBase) -> None:
+        """Show a flight as it is, when that is due.
+
+        Args:
+            tensordict: of a `DroneRacingEnv`, [1]: `privileged`, `race` and, where the drone sees images, `pixels`.
+
+        Raises:
+            WindowClosedError: nobody looks on any longer.
+        """
+        if not self._viewer.is_running():
+            raise WindowClosedError
+        state = {name: value[0].cpu().numpy() for name, value in tensordict["privileged"].items()}
+        with self._viewer.lock():
+            self._data.qpos[:] = *state["position"], *state["attitude"]
+            mujoco.mj_forward(self._model, self._data)
+        self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._words(tensordict)))
+        images = tensordict.get("pixels", None)
+        if images is not None:
+            self._viewer.set_images(self._inset(images[0].cpu().numpy()))
+        self._viewer.sync()
+        self._due = max(self._due + self._control_dt, time.monotonic())
+        time.sleep(max(0.0, self._due - time.monotonic()))
+
+    def close(self) -> None:
+        """Close the window."""
+        self._viewer.close()
+        for thread in self._threads:  # at the interpreter's end GLFW would be taken from one that still draws
+            thread.join()
+
+    def _words(self, tensordict: TensorDictBase) -> tuple[str, str]:
+        """Names and values of what can be read off a flight, a line each."""
+        gates, lap = self._track.num_gates, int(tensordict["race", "gates_passed"]) // self._track.num_gates + 1
+        rows = {
+            "lap": f"{lap}/{self._track.laps}",
+            "gate": f"{int(tensordict['race', 'target_gate']) + 1}/{gates}",
+            "speed": f"{float(tensordict['privileged', 'linear_velocity'].norm()):.1f} m/s",
+        }
+        return "\n".join(rows), "\n".join(rows.values())
+
+    def _inset(self, image: np.ndarray) -> tuple[mujoco.MjrRect, np.ndarray]:
+        """An image (H, W, 3) enlarged by a whole factor, and its place in the window: below, on the right."""
+        window = self._viewer.viewport
+        scale = max(1, int(INSET_SHARE * min(window.width, window.height) / max(image.shape[:2])))
+        large = image.repeat(scale, axis=0).repeat(scale, axis=1)
+        height, width = large.shape[:2]
+        return mujoco.MjrRect(window.width - width - INSET_MARGIN, INSET_MARGIN, width, height), large
+
+
+def _scene_to_look_into(worlds: RaceWorlds) -> mujoco.MjModel:
+    """Compile the scene of these worlds, walls and ceiling hidden."""
+    spec = build_scene(worlds.track, worlds.parameters, worlds.camera)
+    for geom in spec.geoms:
+        if geom.name.startswith(("wall", "ceiling")):
+            geom.group = HIDDEN_GROUP
+    return spec.compile()
 
 
 def view(
@@ -64,7 +163,7 @@ def hover(time_step: Any) -> np.ndarray:
 
 
 def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
-    """Check that a window can be opened, before dm_control tries.
+    """Check that dm_control can open a window, before it tries.
 
     Args:
         environment: the environment variables to judge.
@@ -72,17 +171,32 @@ def check_viewer(environment: Mapping[str, str] = os.environ) -> None:
     Raises:
         ViewerUnavailableError: it cannot; the message is one paragraph that names everything that is missing.
     """
-    missing = _missing_display(environment)
-    backend = environment.get("MUJOCO_GL", "").lower()
-    if backend not in ("", "glfw", "enable", "enabled", "on", "true", "1"):
-        missing.append(f"MUJOCO_GL={backend} chooses drawing without a window (unset it, or MUJOCO_GL=glfw)")
-    if not missing:
-        missing = _missing_glfw()
-    if missing:
+    chosen = environment.get("MUJOCO_GL", "").lower()
+    windowless = []
+    if chosen not in ("", "glfw", "enable", "enabled", "on", "true", "1"):
+        windowless.append(f"MUJOCO_GL={chosen} chooses drawing without a window (unset it, or MUJOCO_GL=glfw)")
+    try:
+        check_window(environment, windowless)
+    except ViewerUnavailableError as error:
         raise ViewerUnavailableError(
-            f"The viewer cannot open a window here: {'; '.join(missing)}. Without a window, images come from "
-            "env.physics.render(480, 640, camera_id='spectator') (EGL or OSMesa) and from the environments' pixels."
-        )
+            f"{error}. Without a window, images come from env.physics.render(480, 640, camera_id='spectator') (EGL or "
+            "OSMesa) and from the environments' pixels."
+        ) from error
+
+
+def check_window(environment: Mapping[str, str] = os.environ, missing: Sequence[str] = ()) -> None:
+    """Check that a window can be opened, before MuJoCo tries.
+
+    Args:
+        environment: the environment variables to judge.
+        missing: what is known to be in the way.
+
+    Raises:
+        ViewerUnavailableError: it cannot; the message, without a full stop, names everything that is missing.
+    """
+    missing = [*_missing_display(environment), *missing] or _missing_glfw()
+    if missing:
+        raise ViewerUnavailableError(f"The viewer cannot open a window here: {'; '.join(missing)}")
 
 
 def _missing_display(environment: Mapping[str, str]) -> list[str]:

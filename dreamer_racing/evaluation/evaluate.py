@@ -225,6 +225,7 @@ def evaluate(
     record_pixels: bool = True,
     judge: Judge | None = None,
     on_episode: Callable[[int, int], None] | None = None,
+    on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
     """Fly exactly this many whole episodes.
 
@@ -242,6 +243,7 @@ def evaluate(
         record_pixels: whether recordings keep images, 12 KB a step.
         judge: what says the value of each recorded state, after the policy has acted on it; None: recordings have none.
         on_episode: is told after each step in which one ended how many have, and of how many.
+        on_step: is shown before each step what the policy is about to see, as `RaceWindow.show`.
 
     Returns:
         The episodes and the recordings.
@@ -266,6 +268,8 @@ def evaluate(
         recorder = TrajectoryRecorder(tensordict, recorded, max_recorded_steps, record_pixels)
         action = torch.zeros(env.action_spec.shape, device=env.device)
         while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
+            if on_step:
+                on_step(tensordict)
             acted = policy(tensordict)
             value = judge(acted[:recorded]) if judge and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)

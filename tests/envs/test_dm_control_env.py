@@ -5,7 +5,6 @@ import gc
 import os
 import unittest
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,9 +14,7 @@ from torchrl.envs import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import dm_control_env as task_module
-from dreamer_racing.envs import viewer
 from dreamer_racing.envs.dm_control_env import OnboardView, load
-from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.rewards import RewardWeights
@@ -383,34 +380,6 @@ def test_torchrl_wraps_it(from_pixels: bool) -> None:
     assert len(long) == 10
     assert long["next", "truncated"][-1].item()
     assert not long["next", "terminated"].any()
-
-
-def test_viewer_without_display_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
-    with pytest.raises(viewer.ViewerUnavailableError, match="no display.*ssh -X") as caught:
-        viewer.check_viewer({})
-    assert "\n" not in str(caught.value)
-    with pytest.raises(viewer.ViewerUnavailableError, match="MUJOCO_GL=egl chooses drawing without a window"):
-        viewer.check_viewer({"DISPLAY": ":0", "MUJOCO_GL": "egl"})
-
-
-def test_viewer_without_opengl_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
-    monkeypatch.setattr(viewer, "_loads", lambda library: False)
-    with pytest.raises(viewer.ViewerUnavailableError, match="no OpenGL library libGL"):
-        viewer.check_viewer({"DISPLAY": ":0"})
-
-
-def test_viewer_gets_the_environment_and_a_hovering_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    launched = []
-    monkeypatch.setattr(viewer, "check_viewer", lambda: None)
-    monkeypatch.setattr("dm_control.viewer.launch", lambda env, policy: launched.append((env, policy)))
-    viewer.view("circle", replace(PRESETS["easy"], physics_dt=0.004), random=0)
-    env, policy = launched[0]
-    time_step = env.reset()
-    for _ in range(3):
-        time_step = env.step(policy(time_step))
-    assert not time_step.last()
 
 
 def test_another_control_rate() -> None:

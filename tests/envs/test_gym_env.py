@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 
 import gymnasium
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from torchrl.envs import GymEnv
+from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import DroneRaceGymEnv, DroneRaceVectorEnv
+from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv, DroneRaceVectorEnv
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
@@ -70,10 +73,13 @@ def test_importing_the_package_registers_and_is_cheap() -> None:
     assert ran.stdout.split() == ["[]", str(len(IDS))]
 
 
-def test_module_form_of_the_name() -> None:
-    env = gymnasium.make("dreamer_racing:dreamer_racing/Kidney-v0", observation="state")
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_module_form_of_the_name_needs_no_import(make: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    for identifier in IDS:
+        monkeypatch.delitem(gymnasium.registry, identifier)
+    monkeypatch.delitem(sys.modules, "dreamer_racing")  # as where nobody has imported it
+    env = make("dreamer_racing:dreamer_racing/Kidney-v0", observation="state")
+    assert env.observation_space.contains(env.reset(seed=0)[0])
 
 
 def test_pixels_by_default_and_frames_of_the_same_view() -> None:
@@ -295,12 +301,28 @@ def test_reset_forgets_pending_autoresets() -> None:
     assert (observation["linear_velocity"][:, 2] > 0.0).all()
 
 
-def test_gymnasiums_own_vectorisation_works_too() -> None:
-    envs = gymnasium.make_vec(IDS[0], num_envs=2, vectorization_mode="sync", observation="state")
-    envs.reset(seed=0)
-    _, _, _, _, info = envs.step(envs.action_space.sample())
+@pytest.mark.parametrize(
+    ("mode", "kind"),
+    [(None, DroneRaceVectorEnv), ("vector_entry_point", DroneRaceVectorEnv), ("sync", gymnasium.vector.SyncVectorEnv)],
+)
+def test_every_mode_of_make_vec(mode: str | None, kind: type) -> None:
+    envs = gymnasium.make_vec(IDS[0], num_envs=2, vectorization_mode=mode, observation="vector")
+    assert isinstance(envs, kind) and envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert envs.reset(seed=0)[0].shape == (2, 21)
+    observations, rewards, terminated, truncated, info = envs.step(envs.action_space.sample())
+    assert observations.shape == (2, 21) and rewards.shape == terminated.shape == truncated.shape == (2,)
     assert list(info["crash"]) == ["none", "none"]
     envs.close()
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_torchrl_takes_a_single_environment(observation: str) -> None:
+    env = GymEnv(f"dreamer_racing:{IDS[0]}", observation=observation)
+    check_env_specs(env)
+    flown = env.rollout(3)
+    seen = {"pixels": {"pixels"}, "vector": {"observation"}}.get(observation, {"position", "attitude", "target_gate"})
+    assert seen <= set(flown.keys()) and flown["next", "reward"].shape == (3, 1)
+    env.close()
 
 
 def test_videos_play_at_the_control_rate():
