@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--examples", nargs="*", choices=EXAMPLES, default=list(EXAMPLES))
-    parser.add_argument("--env-steps", type=int, default=2_000_000)
+    parser.add_argument("--env-steps", type=int, default=1_500_000)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     for name in arguments.examples:

@@ -1,6 +1,7 @@
 """PPO in one file, as CleanRL has it, in a Gymnasium vector environment: `python examples/cleanrl.py`."""
 
 import argparse
+import math
 
 import gymnasium
 import numpy as np
@@ -10,9 +11,10 @@ from torch import nn
 from torch.distributions import Normal
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--env-steps", type=int, default=2_000_000)
-parser.add_argument("--num-envs", type=int, default=512)
-parser.add_argument("--rollout-steps", type=int, default=32)
+parser.add_argument("--env-steps", type=int, default=1_500_000)
+parser.add_argument("--num-envs", type=int, default=256)
+parser.add_argument("--episode-steps", type=int, default=300, help="short ones practise the start more often")
+parser.add_argument("--rollout-steps", type=int, default=64)
 parser.add_argument("--learning-rate", type=float, default=1e-3, help="falls to 0 at the end")
 parser.add_argument("--epochs", type=int, default=5)
 parser.add_argument("--minibatches", type=int, default=8)
@@ -20,6 +22,7 @@ parser.add_argument("--gamma", type=float, default=0.99)
 parser.add_argument("--lambda", type=float, default=0.95, dest="lambda_")
 parser.add_argument("--clip", type=float, default=0.2)
 parser.add_argument("--reward-scale", type=float, default=0.1)
+parser.add_argument("--body-rate-weight", type=float, default=0.01, help="of the reward, for a steadier flight")
 parser.add_argument("--seed", type=int, default=0)
 arguments = parser.parse_args()
 torch.manual_seed(arguments.seed)
@@ -27,11 +30,17 @@ torch.manual_seed(arguments.seed)
 CIRCLE = {"id": "dreamer_racing:dreamer_racing/Circle-v0", "observation": "vector"}
 
 
+def layer(inputs: int, outputs: int, scale: float = math.sqrt(2.0)) -> nn.Linear:
+    """An orthogonal layer."""
+    linear = nn.Linear(inputs, outputs)
+    nn.init.orthogonal_(linear.weight, scale)
+    nn.init.zeros_(linear.bias)
+    return linear
+
+
 def mlp(outputs: int, scale: float) -> nn.Sequential:
-    """Two hidden layers, and an output layer that begins small."""
-    layers = nn.Linear(21, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, outputs)
-    nn.init.orthogonal_(layers[-1].weight, scale)
-    return nn.Sequential(*layers)
+    """Two hidden layers, and an output layer of another scale."""
+    return nn.Sequential(layer(21, 128), nn.Tanh(), layer(128, 128), nn.Tanh(), layer(128, outputs, scale))
 
 
 class Agent(nn.Module):
@@ -51,7 +60,9 @@ class Agent(nn.Module):
         return self.critic(observation).squeeze(-1)
 
 
-envs = RecordEpisodeStatistics(gymnasium.make_vec(**CIRCLE, num_envs=arguments.num_envs))
+worlds = {"max_episode_steps": arguments.episode_steps, "body_rate_weight": arguments.body_rate_weight}
+envs = gymnasium.make_vec(**CIRCLE, num_envs=arguments.num_envs, **worlds)
+envs = RecordEpisodeStatistics(envs)
 agent = Agent()
 optimizer = torch.optim.Adam(agent.parameters(), lr=arguments.learning_rate, eps=1e-5)
 shape = arguments.rollout_steps, arguments.num_envs  # (T, N)

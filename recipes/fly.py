@@ -158,7 +158,7 @@ def fly(config: FlyConfig) -> None:
     flight = make_flight(config)
     result = flight.fly()
     flight.env.close()
-    laps = ", ".join(f"{time:.2f} s" for time in result.lap_times)
+    laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
     print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
     write(Path(config.run_dir), flight.track, result)
 
