@@ -128,13 +128,13 @@ for update in range(1, updates + 1):
         returns, gates = [], []
 envs.close()
 
-# Three laps of the mean action, from 100 starts with noise.
+# Three laps from 100 starts with noise, by the policy that was trained: its actions are sampled.
 envs = gymnasium.make_vec(**CIRCLE, num_envs=100, evaluation=True, start_noise=1.0)
 seen, _ = envs.reset(seed=1)
 flying, finished, laps = np.ones(100, bool), 0, []
 while flying.any():
     with torch.no_grad():
-        action = agent.mean(torch.from_numpy(seen)).numpy()
+        action = agent.policy(torch.from_numpy(seen)).sample().numpy()
     seen, _, crashed, stopped, infos = envs.step(action)
     laps += infos["lap_time"][flying & (infos["lap_time"] > 0)].tolist()
     finished += (flying & infos["finished"]).sum()
