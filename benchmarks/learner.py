@@ -27,6 +27,7 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import SIZES, Interface
 
 PRIVILEGED_DIM = 21
+WARM_UP = 3  # updates that are not counted
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
@@ -65,7 +67,7 @@ def main() -> None:
     parser.add_argument("--mixed-precision", action="store_true", help="bfloat16 autocast")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--updates", type=int, default=20, help="timed, after 3 of warm-up")
+    parser.add_argument("--updates", type=int, default=20, help="timed, after those of warm-up")
     parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
     parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
     parser.add_argument("--in-turns", action="store_true", help="compare the sizes, eager, in one process")
@@ -77,26 +79,27 @@ def main() -> None:
         return
     if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
         parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
-    shared = (arguments.batch, arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    shared = (tuple(arguments.batch), arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    settings = [
+        Setting(loss, actor, arguments.mixed_precision, arguments.image_size, *shared)
+        for loss in arguments.losses
+        for actor in arguments.actor_losses
+    ]
     if arguments.in_turns:
         keep_freed_memory()
         records = [
             record | {"threads": arguments.threads}
-            for loss in arguments.losses
-            for actor in arguments.actor_losses
-            for record in measure_in_turns(
-                arguments.sizes, loss, actor, arguments.mixed_precision, arguments.image_size, *shared
-            )
+            for setting in settings
+            for record in measure_in_turns(arguments.sizes, setting)
         ]
         print_table(records, IN_TURNS)
         write_json(records, arguments.json)
         return
     prepare = None if arguments.return_freed_memory else keep_freed_memory
     jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
-        (measure, (size, loss, actor, backend, arguments.mixed_precision, arguments.image_size, *shared), prepare)
+        (measure, (size, backend, setting), prepare)
         for size in arguments.sizes
-        for loss in arguments.losses
-        for actor in arguments.actor_losses
+        for setting in settings
         for backend in arguments.backends
     ]
     if arguments.peers:
@@ -108,51 +111,66 @@ def main() -> None:
     records = []
     for function, values, initializer in jobs:
         with ProcessPoolExecutor(1, get_context("spawn"), initializer) as process:
-            settings = {"threads": arguments.threads, "keeps_freed_memory": initializer is not None}
-            records.append(process.submit(function, *values).result() | settings)
+            how = {"threads": arguments.threads, "keeps_freed_memory": initializer is not None}
+            records.append(process.submit(function, *values).result() | how)
             print_table(records[-1:], COLUMNS)
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
 
-def measure(
-    size: str,
-    loss: str,
-    actor: str,
-    backend: str,
-    mixed_precision: bool,
-    image_size: int,
-    batch: tuple[int, int],
-    horizon: int,
-    device: str,
-    threads: int,
-    updates: int,
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Setting:
+    """What is measured of each size."""
+
+    loss: str  # of the world model
+    actor: str
+    mixed_precision: bool
+    image_size: int  # pixels
+    batch: tuple[int, int]  # B, T
+    horizon: int  # imagined steps
+    device: str
+    threads: int
+    updates: int  # timed, after WARM_UP
+
+    def learner(self, size: str, backend: str = "eager") -> DreamerLearner:
+        """Make the learner of a size."""
+        torch.set_num_threads(self.threads)
+        torch.set_float32_matmul_precision("high")
+        config = LearnerConfig(
+            mixed_precision=self.mixed_precision, compile="compile" in backend, cuda_graph="graph" in backend
+        )
+        losses, interface = LossConfig(world_model=self.loss, actor=self.actor), interface_of(self.image_size)
+        return make_dreamer(size, interface, losses, config, horizon=self.horizon, device=self.device, seed=0)
+
+    def columns(self, size: str, learner: DreamerLearner, backend: str = "eager") -> dict[str, Any]:
+        """Say what a record is of."""
+        return {
+            "size": size, "loss": self.loss, "actor": self.actor,
+            "backend": backend + ("+bf16" if self.mixed_precision else ""), "batch": "x".join(map(str, self.batch)),
+            "horizon": self.horizon, "image_size": self.image_size, "parameters": parameters(learner),
+        }  # fmt: skip
+
+
+def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
     """Time updates of one configuration; return one record."""
-    torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision("high")
-    config = LearnerConfig(mixed_precision=mixed_precision, compile="compile" in backend, cuda_graph="graph" in backend)
-    losses = LossConfig(world_model=loss, actor=actor)
-    interface = interface_of(image_size)
-    learner = make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0)
-    replay = filled_replay(batch, device, image_size)
+    device = setting.device
+    learner = setting.learner(size, backend)
+    replay = filled_replay(setting.batch, device, setting.image_size)
     samples = [seconds(replay.sample, device) for _ in range(5)]
     data = replay.sample()
     start = time.perf_counter()
     learner.update(data)
     synchronize(device)
     first = time.perf_counter() - start
-    for _ in range(2):
+    for _ in range(WARM_UP - 1):
         learner.update(data)
-    times = [seconds(lambda: learner.update(data), device) for _ in range(updates)]
+    times = [seconds(lambda: learner.update(data), device) for _ in range(setting.updates)]
     median = statistics.median(times)
     memory = peak_memory(device)
-    limit = matmul_speed(device, torch.bfloat16 if mixed_precision else torch.float32)
-    flops = dry_update(size, loss, actor, batch, horizon, image_size)[0]
+    limit = matmul_speed(device, torch.bfloat16 if setting.mixed_precision else torch.float32)
+    flops = dry_update(size, setting.loss, setting.actor, setting.batch, setting.horizon, setting.image_size)[0]
     return {
-        "benchmark": "learner", "size": size, "loss": loss, "actor": actor,
-        "backend": backend + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
-        "horizon": horizon, "image_size": image_size, "parameters": parameters(learner),
+        "benchmark": "learner", **setting.columns(size, learner, backend),
         "s": median, "s_min": min(times), "s_first": first,
         "calls": count_calls(learner, data) if backend == "eager" else None, "GFLOP": flops / 1e9,
         "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
@@ -160,27 +178,11 @@ def measure(
     }  # fmt: skip
 
 
-def measure_in_turns(
-    sizes: list[str],
-    loss: str,
-    actor: str,
-    mixed_precision: bool,
-    image_size: int,
-    batch: tuple[int, int],
-    horizon: int,
-    device: str,
-    threads: int,
-    updates: int,
-) -> list[dict[str, Any]]:
+def measure_in_turns(sizes: list[str], setting: Setting) -> list[dict[str, Any]]:
     """Time updates of several sizes, one of each after the other; return a record of each."""
-    torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision("high")
-    config, losses = LearnerConfig(mixed_precision=mixed_precision), LossConfig(world_model=loss, actor=actor)
-    interface = interface_of(image_size)
-    learners = {
-        size: make_dreamer(size, interface, losses, config, horizon=horizon, device=device, seed=0) for size in sizes
-    }
-    data = filled_replay(batch, device, image_size).sample()
+    device = setting.device
+    learners = {size: setting.learner(size) for size in sizes}
+    data = filled_replay(setting.batch, device, setting.image_size).sample()
     parts: dict[str, Callable[[DreamerLearner], Any]] = {
         "s": lambda learner: learner.update(data),
         "world_model": lambda learner: differentiate_world_model(learner, data),
@@ -188,16 +190,14 @@ def measure_in_turns(
         "steps": lambda learner: differentiate_steps(learner, data),
     }
     times: dict[tuple[str, str], list[float]] = {(size, part): [] for size in sizes for part in parts}
-    for _ in range(3 + updates):
+    for _ in range(WARM_UP + setting.updates):
         for part, run in parts.items():
             for size, learner in learners.items():
                 times[size, part].append(seconds(functools.partial(run, learner), device))
     return [
         {
-            "benchmark": "learner_in_turns", "size": size, "loss": loss, "actor": actor,
-            "backend": "eager" + ("+bf16" if mixed_precision else ""), "batch": "x".join(map(str, batch)),
-            "horizon": horizon, "image_size": image_size, "parameters": parameters(learners[size]), "updates": updates,
-            **{part: statistics.median(times[size, part][3:]) for part in parts},
+            "benchmark": "learner_in_turns", **setting.columns(size, learners[size]), "updates": setting.updates,
+            **{part: statistics.median(times[size, part][WARM_UP:]) for part in parts},
             **{
                 "ratio" if part == "s" else f"{part}_ratio": ratio(times[sizes[0], part], times[size, part])
                 for part in parts
@@ -228,23 +228,22 @@ def differentiate_observe(learner: DreamerLearner, data: Any) -> None:
 def differentiate_steps(learner: DreamerLearner, data: Any) -> None:
     """Do what `differentiate_observe` does record by record, without logits."""
     model = learner.agent.world_model
-    batch, length = data.batch_size
+    batch = len(data)
     embedding = torch.zeros(batch, model.encoder.embedding_size, device=learner.device)
     total = torch.zeros((), device=learner.device)
+    actions, resets = data["previous_action"].unbind(1), data["is_init"].squeeze(-1).unbind(1)
     with learner.autocast():
         belief, state = (value.expand(batch, -1) for value in model.rssm.initial())
-        for step in range(length):
-            record = data[:, step]
-            is_init = record["is_init"].squeeze(-1)
-            belief, state = model.rssm.observe_step(embedding, record["previous_action"], is_init, belief, state)
+        for action, is_init in zip(actions, resets, strict=True):
+            belief, state = model.rssm.observe_step(embedding, action, is_init, belief, state)
             total = total + belief.sum() + state.sum()
     total.backward()
     learner.optimizer.zero_grad(set_to_none=True)
 
 
 def ratio(first: list[float], other: list[float]) -> float:
-    """Return the median of one list over another, turn by turn, without the 3 of warm-up."""
-    return statistics.median(one / two for one, two in list(zip(first, other, strict=True))[3:])
+    """Return the median of one list over another, turn by turn, without warm-up."""
+    return statistics.median(one / two for one, two in list(zip(first, other, strict=True))[WARM_UP:])
 
 
 def interface_of(image_size: int) -> Interface:

@@ -19,23 +19,21 @@ from typing import Any
 
 from omegaconf import MISSING
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "options.md"
-sys.path.append(str(ROOT / "recipes"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "recipes"))  # where the next ones are found
 
-# Below code, because it is found only with the recipes' folder on the path.
-import dashboard  # noqa: E402
-import doctor  # noqa: E402
-import fly  # noqa: E402
-import hil  # noqa: E402
-import plant  # noqa: E402
-import sim_to_real  # noqa: E402
-import tracks  # noqa: E402
-from composing import schema  # noqa: E402
+import dashboard
+import doctor
+import fly
+import hil
+import plant
+import sim_to_real
+import tracks
+from composing import schema
 
-from dreamer_racing.settings import ALLOWED  # noqa: E402
-from dreamer_racing.training.schedule import RampClock  # noqa: E402
+from dreamer_racing.settings import ALLOWED
+from dreamer_racing.training.schedule import RampClock
 
+PAGE = Path(__file__).with_name("options.md")
 COMMON, RECIPES = schema.RunConfig, tuple(schema.RECIPES.values())
 OTHERS = (
     schema.ExperimentConfig,
@@ -70,7 +68,7 @@ def main() -> None:
     if not arguments.check:
         PAGE.write_text(text, encoding="utf-8")
     elif PAGE.read_text(encoding="utf-8") != text:
-        parser.error(f"{PAGE.relative_to(ROOT)} is not what the schemas make: run python docs/options.py.")
+        parser.error(f"docs/{PAGE.name} is not what the schemas make: run python docs/options.py.")
 
 
 def make_page() -> str:

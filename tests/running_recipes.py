@@ -59,8 +59,13 @@ def rows(run_dir: Path) -> list[dict[str, str]]:
 
 
 def recipe_module(name: str) -> ModuleType:
-    """A module of the recipes' folder, which is no package."""
-    sys.path.insert(0, str(ROOT / "recipes"))
+    """A module of the recipes' folder."""
+    return module_of("recipes", name)
+
+
+def module_of(folder: str, name: str) -> ModuleType:
+    """A module of a folder of this repository that is no package."""
+    sys.path.insert(0, str(ROOT / folder))
     try:
         return importlib.import_module(name)
     finally:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import json
 import re
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -19,36 +17,28 @@ from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
 from dreamer_racing.envs.worlds import RaceOptions
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES
+from tests.running_recipes import module_of
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
 
 
-def script(name: str) -> ModuleType:
-    """A script beside the pages."""
-    sys.path.insert(0, str(ROOT / "docs"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.pop(0)
-
-
 @pytest.fixture(scope="module")
 def options() -> ModuleType:
     """The generator of the page of options."""
-    return script("options")
+    return module_of("docs", "options")
 
 
 @pytest.fixture(scope="module")
 def reliability() -> ModuleType:
     """What fills the last column of the page on faults."""
-    return script("reliability")
+    return module_of("docs", "reliability")
 
 
 @pytest.fixture(scope="module")
 def site_links() -> ModuleType:
     """What mkdocs does with links."""
-    return script("site_links")
+    return module_of("docs", "site_links")
 
 
 class SiteLoader(yaml.SafeLoader):

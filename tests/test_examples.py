@@ -1,6 +1,5 @@
 """The examples, run as a user runs them, and the page that shows them."""
 
-import importlib
 import json
 import os
 import re
@@ -10,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from tests.running_recipes import module_of
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples" / "first_flight.ipynb"
@@ -21,11 +22,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
     """What runs the examples to their ends, and reads them."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module("front_doors")
-    finally:
-        sys.path.pop(0)
+    return module_of("benchmarks", "front_doors")
 
 
 def run(name: str, *arguments: str, cwd: Path) -> str:

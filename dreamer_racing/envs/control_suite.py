@@ -42,7 +42,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
 _choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
 
-import mujoco as mujoco_bindings  # noqa: E402
+import mujoco as mujoco_bindings  # noqa: E402 - decides by MUJOCO_GL as it is imported
 from dm_control import _render, mujoco, suite  # noqa: E402
 from dm_control.rl import control  # noqa: E402
 

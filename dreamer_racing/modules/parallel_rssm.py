@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, linear
+from dreamer_racing.modules.layers import NormedLinear, linear
 from dreamer_racing.modules.linear_recurrence import linear_recurrence
-from dreamer_racing.modules.rssm import RSSM, Posterior
+from dreamer_racing.modules.rssm import RSSM, Posterior, SplitInputCell
 
 LAYERS = 2
 """Layers of the recurrence: channels of one do not see each other's past, those of the next one read all of it."""
@@ -23,7 +23,7 @@ TIME_CONSTANTS = (2.0, 64.0)
 evenly in the logarithm. The project's own choice."""
 
 
-class DiagonalSSM(nn.Module):
+class DiagonalSSM(SplitInputCell):
     """Layers of a selective diagonal state-space model, of which the belief is the states side by side.
 
     ``ḣ = −h + x`` in each channel, discretised by zero-order hold over a step whose length the inputs choose:
@@ -47,12 +47,10 @@ class DiagonalSSM(nn.Module):
     """
 
     def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
-        super().__init__()
+        super().__init__(state, action, hidden, norm)
         if belief % LAYERS:
             raise ValueError(f"DiagonalSSM: belief={belief} must divide into {LAYERS} layers: choose a multiple.")
-        self.action_dim = action
         width = belief // LAYERS
-        self.inputs = SplitNormedLinear(state, action, hidden, norm)
         gates = [linear(hidden, 2 * width) for _ in range(LAYERS)]
         shortest, longest = map(math.log10, TIME_CONSTANTS)
         for layer in gates:
@@ -61,21 +59,8 @@ class DiagonalSSM(nn.Module):
         self.gates = nn.ModuleList(gates)
         self.mixes = nn.ModuleList(NormedLinear(width, hidden, norm) for _ in range(LAYERS - 1))
 
-    def project_action(self, action: Tensor) -> Tensor:
-        """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
-        return self.inputs.project(action)
-
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
-        """Return the next belief.
-
-        Args:
-            belief: ``(N, D)``.
-            state: ``(N, S)``.
-            projected_action: From ``project_action``, ``(N, U)``.
-
-        Returns:
-            ``(N, D)``.
-        """
+        """Return the next belief; arguments as in ``DenseGRUCell.forward``."""
         return self._run(belief, state, projected_action, None)
 
     def scan(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor) -> Tensor:

@@ -69,7 +69,27 @@ def _gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tens
     return torch.lerp(belief, candidate, torch.sigmoid(update - 1.0))
 
 
-class DenseGRUCell(nn.Module):
+class SplitInputCell(nn.Module):
+    """Recurrent cell that reads the state and the action through one normalised layer, the action's part ahead of time.
+
+    Args:
+        state: S.
+        action: A.
+        hidden: U.
+        norm: ``"rms"`` or ``"layer"``.
+    """
+
+    def __init__(self, state: int, action: int, hidden: int, norm: str) -> None:
+        super().__init__()
+        self.action_dim = action
+        self.inputs = SplitNormedLinear(state, action, hidden, norm)
+
+    def project_action(self, action: Tensor) -> Tensor:
+        """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
+        return self.inputs.project(action)
+
+
+class DenseGRUCell(SplitInputCell):
     """GRU of the 2023 DreamerV3: one dense layer before it, one normalised dense layer for its three gates.
 
     Args:
@@ -82,15 +102,9 @@ class DenseGRUCell(nn.Module):
     """
 
     def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
-        super().__init__()
-        self.action_dim = action
-        self.inputs = SplitNormedLinear(state, action, hidden, norm)
+        super().__init__(state, action, hidden, norm)
         self.gates_norm = NORMS[norm](3 * belief)
         self.gates = linear(hidden + belief, 3 * belief, bias=not self.gates_norm.shifts)
-
-    def project_action(self, action: Tensor) -> Tensor:
-        """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
-        return self.inputs.project(action)
 
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
         """Return the next belief.

@@ -14,8 +14,8 @@ KNOWN = 0.4
 """Share from which on a way through the hardest gate is known [choice]."""
 
 PACE = 3.0
-"""What `PassShare.known` gains over a whole run at least, once that gate is known: 0.4 in 200,000 of 1,500,000
-env_steps, which the slowest run that took off by itself took (experiments.md, 24)."""
+"""What `PassShare.known` gains over a whole run at least, once that gate is known [choice]: 0.4 in 200,000 of 1,500,000
+env_steps (experiments.md, 24)."""
 
 
 class PassShare:
@@ -51,7 +51,7 @@ class PassShare:
         self._passes = torch.zeros(num_gates, dtype=torch.float64)  # (G,), forgotten at the rate of one in MEMORY
         self._attempts = torch.zeros(num_gates, dtype=torch.float64)  # (G,)
 
-    def update(self, episodes: TensorDictBase, env_steps: int = 0) -> float:
+    def update(self, episodes: TensorDictBase, env_steps: int) -> float:
         """Take note of finished episodes; return the share.
 
         Args:

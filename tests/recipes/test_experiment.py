@@ -175,32 +175,22 @@ def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Pat
     assert (runs / "figures" / "learning_curves.png").exists()
 
 
-LONG = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
-
-
-def interrupt(number: signal.Signals, cwd: Path) -> Path:
-    """Send a long experiment a signal while its first run trains; return that run's newest checkpoint."""
-    run_dir = cwd / "runs" / "few" / "ppo_circle_state_seed0"
-    process = experiment(*LONG, "total_env_steps=100000000", cwd=cwd)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+    runs = tmp_path / "runs" / "few"
+    length = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
+    process = experiment(*length, "total_env_steps=100000000", cwd=tmp_path)
+    metrics = runs / "ppo_circle_state_seed0" / "metrics.csv"
     deadline = time.monotonic() + 200
-    while not ((run_dir / "metrics.csv").exists() and len(rows(run_dir)) > 0):
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.2)
     process.send_signal(number)
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 128 + number, output
     assert "interrupted" in output and "seed1" not in output and "done" not in output
-    return latest_checkpoint(run_dir)
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_experiment(tmp_path: Path) -> None:
-    interrupt(signal.SIGINT, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(tmp_path: Path) -> None:
-    reached = int(interrupt(signal.SIGTERM, tmp_path).name.rpartition("-")[2])
-    process = experiment(*LONG, f"total_env_steps={reached + 500}", "seed=0", cwd=tmp_path)
+    reached = int(latest_checkpoint(runs / "ppo_circle_state_seed0").name.rpartition("-")[2])
+    process = experiment(*length, f"total_env_steps={reached + 500}", "seed=0", cwd=tmp_path)
     output, _ = process.communicate(timeout=200)
     assert process.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output

@@ -231,10 +231,9 @@ def test_tensorboard_goes_on_after_a_write_that_failed(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="No space left"):
             log.write(env_steps)
     log.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    # files made within a second are read in no certain order
-    assert sorted(event.step for event in events.Scalars("loss")) == [10, 30]
+    files = sorted((tmp_path / "tensorboard").iterdir(), key=lambda file: int(file.suffix[1:]))  # as they were made
+    accumulated = [EventAccumulator(str(file)).Reload() for file in files]
+    assert [[event.step for event in events.Scalars("loss")] for events in accumulated] == [[10], [30]]
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20", "30"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
+import weakref
 from typing import Any
 
 import pytest
@@ -100,6 +101,16 @@ def test_closing_twice_frees_once() -> None:
     renderer.close()
     renderer.close()
     assert freed == [True, True]
+
+
+def test_one_closed_while_the_interpreter_exits_ends_its_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    freed: list[bool] = []
+    renderer = Renderer("noted", lambda: NotedWorker(freed), Camera(), num_workers=2)
+    monkeypatch.setattr(weakref.finalize, "_shutdown", True)  # what is set before destructors are called
+    closing = threading.Thread(target=renderer.close, daemon=True)
+    closing.start()
+    closing.join(10.0)
+    assert not closing.is_alive() and freed == [True, True]
 
 
 def test_workers_that_were_made_are_freed_where_another_fails() -> None:
