@@ -46,6 +46,7 @@ class RaceOptions(TypedDict, total=False):
     num_threads: int | None
     backend: str
     start_beyond_gate: float
+    start_at_gate: float
     start_on_line: float
     start_noise: float
     miss_radius: float
@@ -79,6 +80,7 @@ class RaceWorlds:
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and of the randomisation of physics and looks.
         start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
+        start_at_gate: share of the others, but for those on the line, that begin before a gate instead of at the start.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.
         miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
@@ -115,6 +117,7 @@ class RaceWorlds:
         backend: str = "auto",
         seed: int | None = None,
         start_beyond_gate: float = 0.0,
+        start_at_gate: float = 0.5,
         start_on_line: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
@@ -147,7 +150,7 @@ class RaceWorlds:
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
-        self._starts = self._make_starts(start_beyond_gate, start_noise, start_on_line)
+        self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
@@ -166,7 +169,7 @@ class RaceWorlds:
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
 
-    def _make_starts(self, beyond_gate: float, noise: float, on_line: float) -> StartSampler:
+    def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
         if not 0.0 <= on_line <= 1.0:
             raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
@@ -183,6 +186,7 @@ class RaceWorlds:
             noise,
             on_line=on_line,
             line=line,
+            at_gate=at_gate,
         )
 
     @property

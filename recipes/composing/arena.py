@@ -52,6 +52,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             episode_steps=env.episode_steps,
             privileged=bool(readers),
             start_beyond_gate=env.start_beyond_gate,
+            start_at_gate=env.start_at_gate,
             start_on_line=env.start_on_line,
             miss_radius=env.miss_radius,
             device=env.device,

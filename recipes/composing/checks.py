@@ -39,6 +39,7 @@ from dreamer_racing.training.schedule import RampClock
 RACE_ONLY = (
     "env.control_rate",
     "env.start_beyond_gate",
+    "env.start_at_gate",
     "env.start_on_line",
     "env.miss_radius",
     "evaluation.start_noise",

@@ -30,6 +30,8 @@ class EnvConfig:
     episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
     # share of training episodes that begin behind a gate, to practise turns
     start_beyond_gate: float = setting(0.0, SHARE)
+    # share of those that begin neither there nor on a line, that begin in flight before a gate instead of at the start
+    start_at_gate: float = setting(0.5, SHARE)
     # share of training episodes that begin in flight on a planned racing line
     start_on_line: float = setting(0.0, SHARE)
     # m; training episodes end where a gate is missed by less than this; 0: they go on

@@ -34,10 +34,11 @@ class StartSampler:
     """Draws the poses in which episodes begin [choice].
 
     Evaluation starts at the track's start pose, at rest; ``start_noise`` adds that many times the noise of training. In
-    training half of the drones start there too and half 1–3 m before a random race gate, facing it and flying towards
-    its centre at 1.5–2.5 m/s; all of them with uniform noise of ±0.5/0.5/0.3 m (forward/left/up of the pose), ±5° roll
-    and pitch, ±10° yaw. Positions are then moved into the free box, 0.3 m from its sides. ``load_track`` accepts only
-    tracks on which neither the noise nor this move can carry a drone across the plane of its first gate.
+    training they start there too, but for a share ``at_gate``: those 1–3 m before a random race gate, facing it and
+    flying towards its centre at 1.5–2.5 m/s; all of them with uniform noise of ±0.5/0.5/0.3 m (forward/left/up of the
+    pose), ±5° roll and pitch, ±10° yaw. Positions are then moved into the free box, 0.3 m from its sides.
+    ``load_track`` accepts only tracks on which neither the noise nor this move can carry a drone across the plane of
+    its first gate.
 
     A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random one, facing and flying along its
     direction at 1.5–5 m/s, to the next gate. They practise the turn from one gate to the next before the policy flies
@@ -55,13 +56,15 @@ class StartSampler:
         device: where the poses are wanted.
         dtype: floating-point type of the poses.
         beyond_gate: share of training episodes that begin beyond a gate, of those that do not begin on the line.
+        at_gate: share of training episodes that begin before a gate, of those that begin neither beyond one nor on the
+            line.
         on_line: share of training episodes that begin on ``line``; all others are as if there was none.
         line: the racing line; needed if ``on_line`` is above zero.
         start_noise: of evaluation starts, as a multiple of the noise of training.
 
     Raises:
-        ValueError: ``beyond_gate`` or ``on_line`` is not a share, there is no line, or ``start_noise`` is negative or
-            could carry a drone across the plane of its first gate.
+        ValueError: ``beyond_gate``, ``at_gate`` or ``on_line`` is not a share, there is no line, or ``start_noise`` is
+            negative or could carry a drone across the plane of its first gate.
 
     Example:
         >>> pose = StartSampler(load_track("circle")).sample(2, evaluation=True)
@@ -90,10 +93,12 @@ class StartSampler:
         start_noise: float = 0.0,
         on_line: float = 0.0,
         line: RacingLine | None = None,
+        at_gate: float = 0.5,
     ):
         _check_share("beyond_gate", beyond_gate)
+        _check_share("at_gate", at_gate)
         _check_start_noise(start_noise, track)
-        self._beyond_gate = beyond_gate
+        self._beyond_gate, self._at_gate = beyond_gate, at_gate
         self._line = line.to(device, dtype) if line is not None else None
         self.on_line = on_line
         self._start_noise = start_noise
@@ -153,7 +158,7 @@ class StartSampler:
         draw = torch.rand(num, 9, generator=self._generator, device=self._device, dtype=self._dtype)
         gate = torch.randint(len(self._gate_yaws), (num,), generator=self._generator, device=self._device)
         beyond = draw[:, 0] < self._beyond_gate  # (N,)
-        at_gate = draw[:, 0] < 0.5 * (1.0 + self._beyond_gate)
+        at_gate = draw[:, 0] < self._beyond_gate + (1.0 - self._beyond_gate) * self._at_gate  # or beyond one
         before = _spread(draw[:, 1], self.GATE_DISTANCE)
         distance = torch.where(beyond, -_spread(draw[:, 1], self.BEYOND_DISTANCE), before)
         speed = torch.where(beyond, _spread(draw[:, 2], self.BEYOND_SPEED), _spread(draw[:, 2], self.SPEED))

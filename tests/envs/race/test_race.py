@@ -453,6 +453,27 @@ def test_the_share_of_starts_beyond_a_gate_leaves_the_rest_as_it_was():
         StartSampler(load_track("circle"), beyond_gate=2)
 
 
+def test_the_share_of_starts_at_gates_leaves_those_beyond_as_they_were():
+    def sample(at_gate):
+        pose = StartSampler(load_track("circle"), torch.Generator().manual_seed(0), beyond_gate=0.4, at_gate=at_gate)
+        return pose.sample(20_000)
+
+    none, some, all_of_them = (sample(at_gate) for at_gate in (0.0, 0.25, 1.0))
+    for pose, at_rest in ((none, 0.6), (some, 0.45), (all_of_them, 0.0)):
+        assert (pose.linear_velocity.norm(dim=-1) == 0).float().mean() == pytest.approx(at_rest, abs=0.02)
+    fast = none.linear_velocity.norm(dim=-1) > 0  # beyond a gate
+    torch.testing.assert_close(some.position[fast], none.position[fast])
+    assert (none.target_gate[~fast] == 0).all()
+    with pytest.raises(ValueError, match=r"at_gate=-0.1: a share"):
+        StartSampler(load_track("circle"), at_gate=-0.1)
+
+
+def test_worlds_can_begin_every_episode_at_the_start():
+    worlds = RaceWorlds("circle", 200, from_pixels=False, start_at_gate=0.0, seed=0)
+    worlds.reset()
+    assert (worlds.simulator.state.linear_velocity == 0).all() and (worlds.race.target_gate == 0).all()
+
+
 N_ON_LINE = 400
 
 
