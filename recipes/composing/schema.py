@@ -10,7 +10,7 @@ from omegaconf import MISSING
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.learners import PPOConfig, SACConfig
-from dreamer_racing.learners.dreamer import LearnerConfig
+from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, setting
 from dreamer_racing.training.replay_ratio import ReplayRatio
