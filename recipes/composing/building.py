@@ -23,6 +23,7 @@ from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -36,7 +37,7 @@ from dreamer_racing.machine import (
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training import parallel
-from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
+from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker

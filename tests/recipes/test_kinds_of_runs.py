@@ -73,14 +73,14 @@ def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
 
 
 FULL_DISK = """
-import dreamer_racing.training.checkpoint as checkpoint
-sync, calls = checkpoint._sync_tree, []
+import dreamer_racing.training.publishing as publishing
+sync, calls = publishing._sync_tree, []
 def full(path):
     calls.append(path)
     if len(calls) <= {times}:
         raise OSError(28, "No space left on device")
     sync(path)
-checkpoint._sync_tree = full
+publishing._sync_tree = full
 """
 
 
