@@ -26,6 +26,7 @@ from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.learners.saved_dreamer import LossState
@@ -44,7 +45,6 @@ from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
-from dreamer_racing.training.loggers import RunLogger, make_loggers
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.run import Report, Run
 
