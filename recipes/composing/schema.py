@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 from enum import Enum
+from functools import cache
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -371,8 +372,9 @@ def is_race(config: RunConfig) -> bool:
     return config.env.suite == "race"
 
 
+@cache
 def register() -> None:
-    """Make the schemas known to hydra."""
+    """Make the schemas known to hydra, which keeps them."""
     store = ConfigStore.instance()
     for algorithm, schema in RECIPES.items():
         store.store(name=f"{algorithm}_schema", node=schema)

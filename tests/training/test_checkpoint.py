@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import os
 import random
 import shutil
@@ -35,6 +34,7 @@ from dreamer_racing.training.checkpoint import (
 from dreamer_racing.training.checksums import CHECKSUMS, HAS_CHECKSUMS, write_checksums
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.signals import GracefulExit
+from tests.forked import SERVER
 
 
 class Run:
@@ -285,21 +285,11 @@ def die_inside(run_dir: Path, function: str, call: int) -> None:
     run.save()
 
 
-@pytest.fixture(scope="module")
-def processes():
-    """Children fork from a clean server, which has imported torch once."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        ["dreamer_racing.training.checkpoint", "dreamer_racing.experience.replay", "torchrl.collectors"]
-    )
-    return context
-
-
-def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path, processes):
-    announced = processes.Value("q", 0)
+def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path):
+    announced = SERVER.Value("q", 0)
     leftovers = 0
     for delay in (0.002, 0.008, 0.014, 0.02, 0.026, 0.032):
-        process = processes.Process(target=save_forever, args=(tmp_path, announced))
+        process = SERVER.Process(target=save_forever, args=(tmp_path, announced))
         before = announced.value
         process.start()
         deadline = time.monotonic() + 30
@@ -322,8 +312,8 @@ def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path, processes):
     ("function", "call"),
     [("os.replace", call) for call in range(3)] + [("os.fsync", 0), ("os.fsync", 5), ("shutil.rmtree", 0)],
 )
-def test_kill_at_each_step_of_publishing(saved, processes, function, call):
-    process = processes.Process(target=die_inside, args=(saved, function, call))
+def test_kill_at_each_step_of_publishing(saved, function, call):
+    process = SERVER.Process(target=die_inside, args=(saved, function, call))
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
