@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
+from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Curve, LearningCurves
 from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
 from dreamer_racing.figures.runs import CLOCKS, CurveKey
@@ -279,9 +279,8 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
     names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]
     panels[0].set_yticks(np.arange(len(results)), names)
     panels[0].invert_yaxis()
-    figure.supxlabel(
-        textwrap.fill(CAPTION, int(NOTE_LETTERS * figure.get_figwidth())), x=0.01, ha="left", fontsize=8, color=MUTED
-    )
+    caption = textwrap.fill(comparison.caption, int(NOTE_LETTERS * figure.get_figwidth()))
+    figure.supxlabel(caption, x=0.01, ha="left", fontsize=8, color=MUTED)
     save(figure, path, comparison.problems)
 
 

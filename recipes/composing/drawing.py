@@ -219,7 +219,7 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
         return Drawn([], [])
-    comparison = compare_variants(runs, problems)
+    comparison = compare_variants(runs, problems, config.axis)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")
     plot_comparison(comparison, output / "comparison.png")
     return Drawn(["comparison.md", "comparison.png"], comparison.problems)
