@@ -43,7 +43,7 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
-from dreamer_racing.training.checkpoint import CHECKSUMS
+from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"

@@ -40,7 +40,8 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig, make_dreamer
+from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
+from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import SIZES, Interface

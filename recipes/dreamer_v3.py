@@ -38,7 +38,8 @@ from torch import Tensor
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
-from dreamer_racing.learners.dreamer import DreamerLearner, make_optimizer
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Interface

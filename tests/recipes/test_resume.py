@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.training.checkpoint import CHECKSUMS
+from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import recipe, rows
 
