@@ -5,8 +5,8 @@
 
 The commands are `git clone` and `./dev python recipes/fly.py agent=kidney`; they see of this machine its programs and
 system libraries, and of its environment variables nothing but PATH and what `--keep` names (a proxy, where packages
-come from). So nothing is left of earlier starts: no packages, no pip cache, no byte code, no compiled kernels. The clone
-is of this repository's last commit, by git's own transport from this disk: a network's time comes on top.
+come from). So nothing is left of earlier starts: no packages, no pip cache, no byte code, no compiled kernels. The
+clone is of this repository's last commit, by git's own transport from this disk: a network's time comes on top.
 
 A record a time: `clone_s`, `environment_s` (until `./dev` has made it) with its `steps_s`, `flight_s` (until video and
 map are written), `total_s`, `cpu_s` (user and system of all processes), and `load` (the mean number of processes that
