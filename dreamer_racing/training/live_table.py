@@ -40,7 +40,8 @@ class LiveTable:
             self._write(row, [NOTHING] * (1 + len(COLUMNS)), number)
 
     def advance(self, env_steps: int) -> None:
-        """Take note of how far the run is."""
+        """Take note of how far the run is; the last rollout may go past the end."""
+        self._bar.total = max(self._bar.total, env_steps)
         self._bar.update(env_steps - self._bar.n)
 
     def show(self, metrics: Mapping[str, float], failing: str = "") -> None:

@@ -63,6 +63,13 @@ def test_training_and_evaluation_have_a_row_each(monkeypatch: pytest.MonkeyPatch
     assert evaluation.split() == ["evaluation", "100,000", "30.25", "–", "50%", "4.50", "–", "–"]
 
 
+def test_the_bar_is_full_at_the_end_where_that_was_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = open_terminal(monkeypatch)
+    with Progress(total=100) as progress:
+        progress.advance(112)
+    assert terminal.screen[0].startswith("100%|") and "112/112" in terminal.screen[0]
+
+
 def test_an_evaluation_shows_how_far_it_is_and_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = open_terminal(monkeypatch)
     with Progress(total=100) as progress:

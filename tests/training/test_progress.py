@@ -9,7 +9,6 @@ import pytest
 
 from dreamer_racing.training.progress import Progress
 
-
 METRICS = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
 
 
