@@ -48,7 +48,7 @@ def main() -> None:
             records.append(begin(Path(folder), {"PATH": PATHS, **kept}))
         print_table(records[-1:], COLUMNS)
         print("  ".join(f"{what}: {seconds}" for what, seconds in records[-1]["steps_s"].items()), flush=True)
-    write_json(records, arguments.json)
+        write_json(records, arguments.json)
 
 
 def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
@@ -79,8 +79,14 @@ def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
         "load": round(load, 2),
         "steps_s": _steps(said),
         "rendering": next((line.partition("rendering: ")[2] for _, line in said if "rendering" in line), ""),
-        "success": next((line for _, line in lines if re.search("three laps|laps", line)), ""),
+        "laps": next(line.removeprefix("laps").strip() for _, line in lines if re.match("laps ", line)),
+        "cloned": _revision(clone),
     }
+
+
+def _revision(clone: Path) -> str:
+    """Return the commit that was flown."""
+    return subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=clone, text=True).strip()
 
 
 def _timed_lines(clone: Path, environment: dict[str, str]) -> list[tuple[float, str]]:
