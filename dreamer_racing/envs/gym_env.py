@@ -389,8 +389,8 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """
         begun = self._ended
         if begun.any() and self.autoreset_mode is AutoresetMode.DISABLED:
-            ended = begun.nonzero()[0].tolist()
-            raise gymnasium.error.ResetNeeded(f"step() where episodes have ended, {ended}: reset them by a reset_mask.")
+            where = begun.nonzero()[0].tolist()
+            raise gymnasium.error.ResetNeeded(f"step() where episodes have ended, {where}: reset them by a reset_mask.")
         outcome, reward = self.race.step(actions)
         if begun.any():
             self.race.begin(begun)
@@ -425,7 +425,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """Return the last observation of each episode that ended, None elsewhere, as Gymnasium has them."""
         final = np.full(self.num_envs, None, dtype=object)
         for index in ended.nonzero()[0]:
-            final[index] = row_of(observation, index)
+            final[index] = row_of(observation, int(index))
         return {"final_obs": final, "_final_obs": ended}
 
     def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
