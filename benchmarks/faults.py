@@ -55,7 +55,7 @@ SETTINGS = [
 ]  # fmt: skip
 TO_THE_END = SETTINGS[-1]
 HALF_WAY = "total_env_steps=800"  # at an evaluation, so that this end leaves no row that a longer run has not
-CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
+CLOCKS = ("time/", "rate/", "wall_clock", "cpu_clock")  # columns that clocks write
 REFUSED = 2
 COUNT_CALLS = """
 import atexit, io, os, signal

@@ -53,7 +53,8 @@ NUM_ENVS = 32
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
-  70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
+  70 % of training episodes begin in flight on a planned racing line, until the hardest gate is passed; then all come
+  to begin at the start, as a race does; a missed gate ends one
   25 actions a second; the actor learns by PPO from what it flew, in the model's latents; in training a critic that
   sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""

@@ -22,6 +22,8 @@ from tests.forked import Forked
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
+EXPERIMENTS = ("ablation", "crutches")
+"""Configurations of `recipes/experiment.py`, beside the one of its name."""
 
 SMALL = [
     "track=circle", "model=debug", "env.num_envs=4", "prefill=400", "total_env_steps=800", "replay.capacity=4000",

@@ -115,7 +115,7 @@ class Run:
         with self.clock.timed("save"):
             self.learner.check_finite()
             self.settle()
-            return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
+            return self.checkpoints.save(self.counters["env_steps"], self.clock.total)
 
     @contextmanager
     def attempt(self, what: str) -> Iterator[None]:

@@ -303,7 +303,7 @@ def assemble(
     clock = RunClock(counters)
     if config.resume:
         saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
-        clock.total = saved.get("wall_clock", 0.0)
+        clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         if curriculum:
             env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too

@@ -352,7 +352,8 @@ class PlotConfig:
     output: str = "figures"  # folder
     quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
     aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
-    # of the curves' running mean, env_steps; null: 2 % of the longest run
+    axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
+    # of the curves' running mean, in units of their axis; null: 2 % of the longest run
     window: float | None = setting(None, NOT_NEGATIVE)
     flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
     flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)

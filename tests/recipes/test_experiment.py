@@ -139,6 +139,7 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
             "evaluation/success_rate",
             "curriculum/body_rate_weight",
             "wall_clock",
+            "cpu_clock",
         ):
             assert any(row[column] for row in table), f"{algorithm}: {column}"
         assert list((run_dir / "videos").glob("*.mp4")) and list((run_dir / "plots").glob("*.png"))
