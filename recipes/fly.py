@@ -21,7 +21,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import torch
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
@@ -30,6 +29,7 @@ from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import set_num_threads, tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
@@ -82,7 +82,7 @@ def scripted(track: Track, parameters: QuadrotorParameters) -> Policy:
 
 def hover(track: Track, parameters: QuadrotorParameters) -> Policy:
     """Make the pilot that stays at the start."""
-    still = torch.tensor([parameters.hover_action, 0.0, 0.0, 0.0])
+    still = tensor([parameters.hover_action, 0.0, 0.0, 0.0])
     return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
 
 
@@ -93,7 +93,7 @@ PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Policy]] = {"scripted":
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
     start_logging()
-    torch.set_num_threads(1)  # a single drone: further threads would wait, and keep cores busy with it
+    set_num_threads(1)  # a single drone: further threads would wait, and keep cores busy with it
     with plain_errors():
         check(config)
     if config.viewer:

@@ -36,10 +36,10 @@ def test_the_options_of_all_training_recipes_are_in_the_help_of_each() -> None:
     assert set(usage.TRAINING) == set(recipe_module("composing.schema").RECIPES)
 
 
-@pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_help_loads_no_torch(flag: str, tmp_path: Path) -> None:
-    done = recipe("export", flag, cwd=tmp_path, before="import sys; sys.modules['torch'] = None")
-    assert done.returncode == 0 and done.stdout.startswith("usage: python recipes/export.py"), done.stderr
+@pytest.mark.parametrize(("name", "flag"), [*((name, "--help") for name in RECIPES), ("export", "-h")])
+def test_help_loads_no_torch(name: str, flag: str, tmp_path: Path) -> None:
+    done = recipe(name, flag, cwd=tmp_path, before="import sys; sys.modules['torch'] = None")
+    assert done.returncode == 0 and done.stdout.startswith(f"usage: python recipes/{name}.py"), done.stderr
 
 
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
