@@ -77,6 +77,9 @@ def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
     done = recipe("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
     assert done.returncode == 0, done.stderr
     assert f"complete already, at {env_steps:,} env_steps" in done.stdout and "go on:" in done.stdout
+    said = dict(line.split(":", 1) for line in done.stdout.splitlines() if ":" in line)
+    left = [run_dir.parent / said[what].strip() for what in ("run", "best policy", "film", "plot")]
+    assert all(path.exists() for path in left) and left[2].stem == left[3].stem == f"{env_steps:09d}"
     assert everything_in(run_dir) == before
 
 
