@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/faults.py --kills 50 --json results/faults.json
 
-Every case is a short training by `recipes/dreamer_v3.py` in a process of its own, disturbed in one way and continued
+Every case is a short training by `recipes/dreamer_v3.py` in processes of its own, disturbed in one way and continued
 to its end: by the same command as long as it has no checkpoint, then by `resume=`. It *survived* if the last checkpoint
 then holds what that of an undisturbed run holds, bit for bit, the rows of metrics.csv, wall clock aside, are the same,
 no process left a traceback or another exit status than it should, and what was lost was said. Kinds of faults:
@@ -43,12 +43,14 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
+sys.path.append(str(Path(__file__).parents[1]))
 from dreamer_racing.training.checkpoint import CHECKSUMS
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from tests.running_recipes import recipe
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [
-    "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4",
+    "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=1",
     "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=600",
     "evaluation.every=400", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=200",
     "checkpoint.keep=2", "logger.every=200", "logger=csv", "device=cpu", "total_env_steps=1200",
@@ -130,6 +132,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", help="written after each kind")
     arguments = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"  # of every process to come, so that all compute the same
     draw, most = random.Random(arguments.seed), arguments.most
     with tempfile.TemporaryDirectory() as folder:
         arena = Arena(Path(folder))
@@ -166,9 +169,10 @@ class Arena:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._number = 0
-        self._limit: float | None = None
         begun = time.monotonic()
-        if problem := self._to_its_end("whole"):
+        with self._start(*self._arguments("whole")) as process:
+            _, said = process.communicate()
+        if problem := trouble(process.returncode, said):
             raise SystemExit(f"the undisturbed run: {problem}")
         self._seconds = time.monotonic() - begun
         self._limit = 10 * self._seconds + 60
@@ -314,27 +318,20 @@ class Arena:
             return [f"resume={name}", TO_THE_END]
         return [f"run_dir={name}", *SETTINGS, *settings]
 
-    def _start(self, *overrides: str, before: str = "") -> subprocess.Popen[str]:
-        program = [str(RECIPE)]
-        if before:
-            start = f"import runpy, sys\nsys.path.insert(0, {str(RECIPE.parent)!r})\nsys.argv[0] = {str(RECIPE)!r}\n"
-            program = ["-c", f"{start}{before}\nrunpy.run_path({str(RECIPE)!r}, run_name='__main__')"]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    def _start(self, *overrides: str) -> subprocess.Popen[str]:
+        """Start a process that is disturbed by the clock, which is to find it while it imports, too."""
         return subprocess.Popen(
-            [sys.executable, *program, *overrides],
-            cwd=self._folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, str(RECIPE), *overrides],
+            cwd=self._folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
 
     def _run(self, *overrides: str, before: str = "") -> subprocess.CompletedProcess[str]:
-        """Run until it ends; one that hangs is killed, and has the status of that."""
-        with self._start(*overrides, before=before) as process:
-            try:
-                printed = process.communicate(timeout=self._limit)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                printed = process.communicate()
-                printed = (printed[0], f"{printed[1]}\nit hung for {self._limit:.0f} s")
-        return subprocess.CompletedProcess(overrides, process.returncode, *printed)
+        """Run until it ends, forked off one that has imported; one that hangs is killed, and has the status of that."""
+        try:
+            return recipe(RECIPE.stem, *overrides, cwd=self._folder, timeout=self._limit, before=before)
+        except subprocess.TimeoutExpired as late:
+            said = f"{late.stderr}\nit hung for {self._limit:.0f} s"
+            return subprocess.CompletedProcess(overrides, -signal.SIGKILL, late.stdout, said)
 
     def _to_its_end(self, name: str, *settings: str) -> str:
         """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""

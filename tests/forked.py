@@ -17,7 +17,7 @@ SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     [
         "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
-        "torchrl.envs", "torchrl.record",
+        "torchrl.envs", "torchrl.record", "warp",
     ]
 )  # fmt: skip
 
