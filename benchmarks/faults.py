@@ -12,7 +12,8 @@ no process left a traceback or another exit status than it should, and what was 
 * `kill early`: SIGKILL just after the n-th file was opened for writing, for every n before the first checkpoint; once a
   checkpoint is there, the same command is to name it and how to go on;
 * `kill at open`, `kill at rename`, `kill at fsync`: SIGKILL at each of them in the second half of a run, which saves,
-  replaces checkpoints, evaluates, and finishes: just after an opening, just before a rename or an fsync;
+  replaces checkpoints and the best, evaluates, and finishes: just after an opening, just before a rename or an fsync,
+  in a random order, so that of a benchmark that is stopped a fair sample is left;
 * `SIGTERM`: at a random time, which is to end the process with the status 143;
 * `damage`: each file of the newest checkpoint in turn, with 16 bytes in its middle turned, with its second half cut
   off, removed;
@@ -131,7 +132,7 @@ def main() -> None:
     parser.add_argument("--sigterms", type=int, default=10, help="at random times")
     parser.add_argument("--most", type=int, help="of the cases of the other kinds, spread evenly; all if left out")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", help="written after each kind")
+    parser.add_argument("--json", help="written after each case")
     arguments = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"  # of every process to come, so that all compute the same
     draw, most = random.Random(arguments.seed), arguments.most
@@ -143,9 +144,9 @@ def main() -> None:
                 "kill by the clock", max(1, arguments.kills // 5), draw, "checkpoint.minutes=1e-6"
             ),
             "early": lambda: arena.early_kills(most),
-            "open": lambda: arena.kills_at_calls("open", most),
-            "rename": lambda: arena.kills_at_calls("rename", most),
-            "fsync": lambda: arena.kills_at_calls("fsync", most),
+            "open": lambda: arena.kills_at_calls("open", most, draw),
+            "rename": lambda: arena.kills_at_calls("rename", most, draw),
+            "fsync": lambda: arena.kills_at_calls("fsync", most, draw),
             "sigterm": lambda: arena.terminations(arguments.sigterms, draw),
             "damage": lambda: arena.damages(most),
             "disk": arena.full_disks,
@@ -154,8 +155,9 @@ def main() -> None:
         }
         cases = []
         for kind in arguments.faults:
-            cases += list(ways[kind]())
-            write_json([{"benchmark": "faults", **case} for case in cases], arguments.json)
+            for case in ways[kind]():
+                cases.append({"benchmark": "faults", **case})
+                write_json(cases, arguments.json)
     all_cases = Counter(case["fault"] for case in cases)
     survived = Counter(case["fault"] for case in cases if case["survived"])
     counts = [{"fault": kind, "cases": number, "survived": survived[kind]} for kind, number in all_cases.items()]
@@ -223,12 +225,13 @@ class Arena:
         problem = problem or self._to_its_end(name)
         yield self._verdict("kill early", "the same command where a checkpoint is", name, problem)
 
-    def kills_at_calls(self, function: str, most: int | None) -> Iterator[Case]:
-        """Kill at calls of a function in the second half of a run."""
+    def kills_at_calls(self, function: str, most: int | None, draw: random.Random) -> Iterator[Case]:
+        """Kill at calls of a function in the second half of a run, in a random order."""
         name = self._half_way()
         done = self._run(f"resume={name}", TO_THE_END, before=COUNT_CALLS.format(name=function, last=0))
         total = int(done.stdout.rpartition("calls ")[2].split()[-1])
-        for call in spread(range(1, total + 1), most):
+        calls = spread(range(1, total + 1), most)
+        for call in draw.sample(calls, len(calls)):
             name = self._half_way()
             before = COUNT_CALLS.format(name=function, last=call)
             killed = self._run(f"resume={name}", TO_THE_END, before=before)
