@@ -153,7 +153,7 @@ def main() -> None:
             "clock": arena.clocks,
             "not_finite": arena.not_finite,
         }
-        cases = []
+        cases: list[Case] = []
         for kind in arguments.faults:
             for case in ways[kind]():
                 cases.append({"benchmark": "faults", **case})
