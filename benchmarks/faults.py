@@ -336,8 +336,8 @@ class Arena:
         try:
             return recipe(RECIPE.stem, *overrides, cwd=self._folder, timeout=self._limit, before=before)
         except subprocess.TimeoutExpired as late:
-            said = f"{late.stderr}\nit hung for {self._limit:.0f} s"
-            return subprocess.CompletedProcess(overrides, -signal.SIGKILL, late.stdout, said)
+            said = f"it hung for {self._limit:.0f} s: {late.stderr!r}"
+            return subprocess.CompletedProcess(overrides, -signal.SIGKILL, "", said)
 
     def _to_its_end(self, name: str, *settings: str) -> str:
         """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""
