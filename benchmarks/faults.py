@@ -61,6 +61,7 @@ TO_THE_END = SETTINGS[-1]
 HALF_WAY = "total_env_steps=800"  # at an evaluation, so that this end leaves no row that a longer run has not
 CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
 REFUSED = 2
+HUNG = 124  # as of `timeout`
 COUNT_CALLS = """
 import atexit, io, os, signal
 from dreamer_racing.training import checkpoint
@@ -332,12 +333,12 @@ class Arena:
         )  # fmt: skip
 
     def _run(self, *overrides: str, before: str = "") -> subprocess.CompletedProcess[str]:
-        """Run until it ends, forked off one that has imported; one that hangs is killed, and has the status of that."""
+        """Run until it ends, forked off one that has imported; what hangs is ended, with a status of its own."""
         try:
             return recipe(RECIPE.stem, *overrides, cwd=self._folder, timeout=self._limit, before=before)
         except subprocess.TimeoutExpired as late:
             said = f"it hung for {self._limit:.0f} s: {late.stderr!r}"
-            return subprocess.CompletedProcess(overrides, -signal.SIGKILL, "", said)
+            return subprocess.CompletedProcess(overrides, HUNG, "", said)
 
     def _to_its_end(self, name: str, *settings: str) -> str:
         """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""

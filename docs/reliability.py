@@ -35,7 +35,7 @@ ATTACKS = {
     "a checkpoint from elsewhere": ("checkpoints",),
 }  # fmt: skip
 """Kinds of attacks by the fault that a row is about."""
-CALLS = re.compile(r"call \d+ of (\d+)")
+CALLS = re.compile(r"(?:call|after opening) \d+ of (\d+)")
 """Where a case was killed that is one of so many."""
 
 
@@ -60,8 +60,8 @@ def read_results(folder: Path) -> dict[str, str]:
         cases = [record for record in faults if record["fault"] == kind]
         survived = sum(record["survived"] for record in cases)
         there = max((int(calls[1]) for case in cases if (calls := CALLS.fullmatch(case.get("where", "")))), default=0)
-        drawn = f", drawn from {there}" if there > len(cases) else ""
-        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived{drawn} ({cases[0]['commit']})"
+        among = f", among {there}" if there > len(cases) else ""
+        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived{among} ({cases[0]['commit']})"
     for record in _read(folder / "fuzz.json"):
         phrases[record["kind"]] = (
             f"{record['kind']}: {record['failed']} of {record['cases']:,} failed ({record['commit']})"
