@@ -79,7 +79,7 @@ class RaceWindow:
         self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._words(tensordict)))
         images = tensordict.get("pixels", None)
         if images is not None:
-            self._refuse_closed()  # while it took the texts: to ask a closed window for its size is a segmentation fault
+            self._refuse_closed()  # by now: to ask a closed window for its size is a segmentation fault
             self._viewer.set_images(self._inset(images[0].cpu().numpy()))
         self._viewer.sync()
         self._due = max(self._due + self._control_dt, time.monotonic())
