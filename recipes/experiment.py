@@ -18,18 +18,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
-import yaml
 from composing.checks import check_variant
 from composing.command_line import merge_overrides, override_key
 from composing.entry import in_plain_words, recipe
 from composing.report import FAILURES
 from composing.saved import read_yaml
 from composing.schema import ExperimentConfig, RunConfig, register
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
+from yaml import YAMLError, safe_load
 
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -106,7 +106,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}"]
     overrides = merge_overrides(chosen, [override for override in given if override_key(override) not in OWN])
     overrides += [*config.variants[config.variant], *config.overrides]
-    wanted = cast(RunConfig, hydra.compose(config.algorithm, overrides))
+    wanted = cast(RunConfig, compose(config.algorithm, overrides))
     recipe = [sys.executable, str(FOLDER / f"{config.algorithm}.py")]
     try:
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
@@ -114,7 +114,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
         return [*recipe, f"run_dir={run_dir}", *overrides]
     refuse_other_settings(run_dir, overrides)
     if tuned := tuned_by_recipe(run_dir, overrides):
-        wanted = cast(RunConfig, hydra.compose(config.algorithm, [*overrides, tuned]))
+        wanted = cast(RunConfig, compose(config.algorithm, [*overrides, tuned]))
     if RunDirectory(run_dir).finished_env_steps() >= wanted.total_env_steps:
         return None
     return [*recipe, f"resume={run_dir}", f"total_env_steps={wanted.total_env_steps}"]
@@ -156,8 +156,8 @@ def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
     values = {}
     for override in map(str, overrides):
         try:
-            values[override_key(override)] = yaml.safe_load(override.partition("=")[2])
-        except yaml.YAMLError as error:
+            values[override_key(override)] = safe_load(override.partition("=")[2])
+        except YAMLError as error:
             raise ValueError(f"The override {shortened(override)} has no value that can be read.") from error
     return {name: value for name, value in values.items() if name not in ("run_dir", "total_env_steps")}
 

@@ -71,8 +71,7 @@ class RaceWindow:
         Raises:
             WindowClosedError: nobody looks on any longer.
         """
-        if not self._viewer.is_running():
-            raise WindowClosedError
+        self._refuse_closed()
         state = {name: value[0].cpu().numpy() for name, value in tensordict["privileged"].items()}
         with self._viewer.lock():
             self._data.qpos[:] = *state["position"], *state["attitude"]
@@ -80,6 +79,7 @@ class RaceWindow:
         self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *self._words(tensordict)))
         images = tensordict.get("pixels", None)
         if images is not None:
+            self._refuse_closed()  # by now: to ask a closed window for its size is a segmentation fault
             self._viewer.set_images(self._inset(images[0].cpu().numpy()))
         self._viewer.sync()
         self._due = max(self._due + self._control_dt, time.monotonic())
@@ -90,6 +90,10 @@ class RaceWindow:
         self._viewer.close()
         for thread in self._threads:  # at the interpreter's end GLFW would be taken from one that still draws
             thread.join()
+
+    def _refuse_closed(self) -> None:
+        if not self._viewer.is_running():
+            raise WindowClosedError
 
     def _words(self, tensordict: TensorDictBase) -> tuple[str, str]:
         """Names and values of what can be read off a flight, a line each."""

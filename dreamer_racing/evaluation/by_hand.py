@@ -132,7 +132,8 @@ class PygameSticks:
         self._pygame: Any = pygame
         self._control_dt, self._due = control_dt, time.monotonic()
         self._at = StickPositions()
-        pygame.init()
+        pygame.display.init()
+        pygame.joystick.init()  # and not what plays sounds: without a sound card that says a dozen errors
         self._gamepad = None
         if kind == "gamepad":
             if not pygame.joystick.get_count():

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -47,6 +48,8 @@ eyes.close()
 
 
 PATIENCE = 15  # s
+SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "dm-control")
+"""Packages whose versions are said also where they are right."""
 
 
 class Verdict(Enum):
@@ -95,7 +98,7 @@ def python() -> Diagnosis:
 def packages() -> Iterator[Diagnosis]:
     """Look at every package that the project requires, and at which extras are complete."""
     extras: dict[str, list[str]] = {}
-    for text in importlib.metadata.requires(DISTRIBUTION) or ():
+    for text in requirements():
         requirement = Requirement(text)
         extra = re.search(r'extra == "(.+?)"', text)
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra[1] if extra else ""}):
@@ -104,7 +107,7 @@ def packages() -> Iterator[Diagnosis]:
         fits = found is not None and found in requirement.specifier
         if extra:
             extras.setdefault(extra[1], []).extend([] if fits else [str(requirement)])
-        elif not fits or requirement.name in ("torch", "torchrl", "tensordict", "mujoco", "mujoco-warp", "dm-control"):
+        elif not fits or requirement.name in SHOWN:
             wanted = f"pip install '{requirement.name}{requirement.specifier}'"
             state = Verdict.fine if fits else Verdict.wrong
             yield Diagnosis(requirement.name, state, found or "not installed", "" if fits else wanted)
@@ -112,6 +115,14 @@ def packages() -> Iterator[Diagnosis]:
     absent = sorted(extra for extra, missing in extras.items() if missing)
     remedy = f"for {', '.join(absent)}: pip install 'dreamer_racing[NAME]'" if absent else ""
     yield Diagnosis("extras", Verdict.fine, ", ".join(complete) or "none", remedy)
+
+
+def requirements() -> Iterator[str]:
+    """Yield what the project requires, and Warp as mujoco-warp requires it: it is Warp that meets the GPU's driver."""
+    yield from importlib.metadata.requires(DISTRIBUTION) or ()
+    with suppress(importlib.metadata.PackageNotFoundError):  # then mujoco-warp is what is missing
+        of_warp = importlib.metadata.requires("mujoco-warp") or ()
+        yield from (text for text in of_warp if text.startswith("warp-lang") and ";" not in text)
 
 
 def version_of(package: str) -> str | None:

@@ -22,11 +22,16 @@ class StandIn:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, pictures: int) -> None:
         self.model, self.data, self.left = model, data, pictures
-        self.cam, self.viewport = mujoco.MjvCamera(), mujoco.MjrRect(0, 0, 800, 600)
+        self.cam = mujoco.MjvCamera()
         self.poses: list[np.ndarray] = []
         self.texts: list[tuple] = []
         self.images: list[tuple[mujoco.MjrRect, np.ndarray]] = []
         self.closed = False
+
+    @property
+    def viewport(self) -> mujoco.MjrRect:
+        assert self.is_running(), "MuJoCo's is a segmentation fault"
+        return mujoco.MjrRect(0, 0, 800, 600)
 
     def is_running(self) -> bool:
         return self.left > 0
@@ -89,6 +94,16 @@ def test_window_shows_the_drone_its_race_and_what_its_camera_sees(windows: list[
     assert seen.closed and seen.cam.trackbodyid == seen.model.body("drone").id
     groups = {seen.model.geom(index).name: seen.model.geom_group[index] for index in range(seen.model.ngeom)}
     assert groups["ceiling"] == groups["wall_x+"] == 4 and groups["floor"] == groups["gate_0"] == 0
+
+
+def test_window_that_is_closed_while_it_takes_texts_is_not_asked_for_its_size(windows: list[StandIn]) -> None:
+    env = DroneRacingEnv("circle", num_envs=1, evaluation=True, seed=0)
+    window = viewer.RaceWindow(env.worlds)
+    windows[0].set_texts = lambda texts: setattr(windows[0], "left", 0)
+    with pytest.raises(viewer.WindowClosedError):
+        window.show(env.reset())
+    assert windows[0].images == []
+    env.close()
 
 
 def test_window_on_a_flight_by_numbers_has_no_inset(windows: list[StandIn]) -> None:

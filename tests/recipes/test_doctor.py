@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,28 @@ def test_a_missing_and_an_old_package_are_named_with_what_to_install(monkeypatch
     assert found["torch"].state is Verdict.wrong and found["torch"].remedy.startswith("pip install 'torch<2.14,>=2.11'")
     assert found["tqdm"][1:3] == (Verdict.wrong, "not installed")
     assert found["torchrl"].state is Verdict.fine
+
+
+def test_warp_is_looked_at_as_mujoco_warp_requires_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    (found,) = (finding for finding in examination.packages() if finding.what == "warp-lang")
+    assert found == examination.Diagnosis("warp-lang", Verdict.fine, version("warp-lang"))
+    version_of = examination.version_of
+    monkeypatch.setattr(examination, "version_of", lambda name: "0.9" if name == "warp-lang" else version_of(name))
+    (found,) = (finding for finding in examination.packages() if finding.what == "warp-lang")
+    assert found[1:3] == (Verdict.wrong, "0.9") and found.remedy.startswith("pip install 'warp-lang>=")
+
+
+def test_without_mujoco_warp_it_is_that_which_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def requires(package: str) -> list[str]:
+        if package == "mujoco-warp":
+            raise PackageNotFoundError(package)
+        return ["mujoco-warp==1"]
+
+    monkeypatch.setattr(examination.importlib.metadata, "requires", requires)
+    monkeypatch.setattr(examination, "version_of", lambda name: None)
+    assert [(finding.what, finding.state) for finding in examination.packages()] == [
+        ("mujoco-warp", Verdict.wrong), ("extras", Verdict.fine),
+    ]  # fmt: skip
 
 
 def test_a_torch_without_cuda_beside_a_gpu_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:

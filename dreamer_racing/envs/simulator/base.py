@@ -127,6 +127,7 @@ class Simulator(ABC):
         """Free contexts and threads; the simulator is unusable afterwards."""
 
 
-def no_images() -> RuntimeError:
-    """The error of asking a simulator without a renderer for images."""
-    return RuntimeError("This simulator has no images to give: it was made with renderer=None, or is closed.")
+def no_images(closed: bool) -> RuntimeError:
+    """The error of asking a simulator for images that is closed, or was made without a renderer."""
+    reason = "is closed" if closed else "was made with renderer=None"
+    return RuntimeError(f"This simulator has no images to give: it {reason}.")

@@ -53,6 +53,7 @@ class MujocoSimulator(Simulator):
         qpos, qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         super().__init__(parameters, qpos, qvel, force, batch.step, generator)
         self.renderer: Renderer | None = None
+        self._closed = False
         if renderer is not None:
             camera = camera or Camera()
             scene = build_scene(track, parameters, camera).compile()
@@ -63,7 +64,7 @@ class MujocoSimulator(Simulator):
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
         if self.renderer is None:
-            raise no_images()
+            raise no_images(self._closed)
         return self.renderer.render(*self._frames(mask))
 
     def close(self) -> None:
@@ -71,3 +72,4 @@ class MujocoSimulator(Simulator):
         if self.renderer is not None:
             self.renderer.close()
             self.renderer = None
+            self._closed = True

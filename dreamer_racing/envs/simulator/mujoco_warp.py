@@ -63,6 +63,7 @@ class WarpSimulator(Simulator):
         self._camera = camera or Camera()
         self._mount = NoseMount(self._camera, self.device, self.dtype)
         self._ray_caster: RayCaster | None = None
+        self._closed = False
         if images:
             scene = build_scene(track, parameters, self._camera).compile()
             self._ray_caster = RayCaster(scene, self._camera, num_envs, device, looks is not None)
@@ -72,7 +73,7 @@ class WarpSimulator(Simulator):
     def render(self, mask: Tensor | None = None) -> Tensor:
         """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
         if self._ray_caster is None:
-            raise no_images()
+            raise no_images(self._closed)
         position, attitude, looks = self._frames(mask)
         eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
         shape = (len(position), self._camera.height, self._camera.width, 3)
@@ -82,6 +83,7 @@ class WarpSimulator(Simulator):
 
     def close(self) -> None:
         """Free the renderer."""
+        self._closed = self._closed or self._ray_caster is not None
         self._ray_caster = None
 
 
