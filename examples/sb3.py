@@ -61,7 +61,7 @@ class MeanActions:
         """As `PPO.predict`."""
         with torch.no_grad():
             normal = agent.policy.get_distribution(agent.policy.obs_to_tensor(observation)[0]).distribution
-            return clipped_mean(normal.mean, normal.stddev).numpy(), state
+            return clipped_mean(normal.mean, normal.stddev).cpu().numpy(), state
 
 
 def race(flyer: Any) -> str:
