@@ -52,6 +52,21 @@ def row_of(batch: Any, index: int) -> Any:
     return row.item() if isinstance(row, np.generic) else row
 
 
+def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
+    """Observations of N environments with other ones in M rows, those masked (N,) bool; the batch stays as it was."""
+    if isinstance(batch, dict):
+        assert isinstance(rows, dict)
+        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
+    assert isinstance(rows, np.ndarray)
+    return _merged(batch, mask, rows)
+
+
+def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    merged = batch.copy()  # last observations of episodes are views of the batch
+    merged[mask] = rows
+    return merged
+
+
 class GymWorlds:
     """What the single and the vector environments share: N worlds in Gymnasium's terms, always batched.
 

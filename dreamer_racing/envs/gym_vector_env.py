@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
+from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, with_rows
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions
 
@@ -130,7 +130,8 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             info |= {**self._final(observation, ended), "final_info": dict(info), "_final_info": ended}
             self.race.begin(ended)
             info |= self._masked(self.race.info(outcome, ended))
-            observation, ended = self.race.observe(), np.zeros_like(ended)
+            observation = with_rows(observation, ended, self.race.observe(ended))
+            ended = np.zeros_like(ended)
         self._ended = ended
         return observation, np.where(begun, 0.0, reward), terminated, truncated, info
 

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
@@ -126,6 +127,28 @@ def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> 
     np.testing.assert_allclose(of(last)[1], of(start)[1], atol=1e-6)  # at the start again: evaluation
     assert not np.allclose(of(info["final_obs"][1]), of(start)[1], atol=1e-6)
     assert "final_obs" not in envs.step(np.tile(HOVER, (3, 1)))[-1]
+    envs.close()
+
+
+@pytest.mark.parametrize("observation", ["pixels", "both"])
+def test_in_mode_same_step_only_the_images_of_new_episodes_are_drawn_again(
+    observation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    envs = make_vec(observation=observation, autoreset_mode="SameStep", evaluation=True)
+    images = (lambda seen: seen) if observation == "pixels" else (lambda seen: seen["pixels"])
+    start, render, drawn = images(envs.reset(seed=0)[0]), envs.race.worlds.render, []
+
+    def noted(mask: torch.Tensor | None = None) -> torch.Tensor:
+        drawn.append(render(mask).clone())
+        return drawn[-1].clone()
+
+    monkeypatch.setattr(envs.race.worlds, "render", noted)
+    last, *_, info = make_and_poison(envs)
+    assert [len(batch) for batch in drawn] == [3, 3, 3, 3, 1]
+    np.testing.assert_array_equal(images(info["final_obs"][1]), drawn[3][1])
+    np.testing.assert_array_equal(images(last)[[0, 2]], drawn[3][[0, 2]])
+    np.testing.assert_array_equal(images(last)[1], drawn[4][0])
+    np.testing.assert_array_equal(images(last)[1], start[1])  # at the start again: evaluation
     envs.close()
 
 
