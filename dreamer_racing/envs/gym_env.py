@@ -140,7 +140,16 @@ class GymWorlds:
         return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
 
     def begin(self, mask: np.ndarray | None = None) -> None:
-        """Begin episodes everywhere, or where masked (N,) bool."""
+        """Begin episodes everywhere, or where masked (N,) bool.
+
+        Raises:
+            ResetNeeded: masked, but no episode has begun yet: the other drones would fly from nowhere.
+        """
+        if mask is not None and not self._begun:
+            raise gymnasium.error.ResetNeeded(
+                f"The first reset() begins {int(mask.sum())} of {len(mask)} episodes: reset all, without a reset_mask, "
+                "before a part."
+            )
         self.worlds.reset(None if mask is None else torch.from_numpy(mask))
         self._begun = True
 

@@ -92,6 +92,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             options: `reset_mask`, (N,) bool: where an episode begins; the others fly on.
 
         Raises:
+            ResetNeeded: some, and not all, are to begin before the first reset of all.
             ValueError: the seed is a list, for all environments draw from one generator; or the mask is none.
         """
         if seed is not None and not isinstance(seed, int | np.integer):

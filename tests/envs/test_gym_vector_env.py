@@ -15,6 +15,18 @@ from tests.envs.test_gym_env import HOVER, IDS, INFO, make_vec
 CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
 
 
+def test_a_part_cannot_begin_before_all_have() -> None:
+    envs = make_vec(observation="state", autoreset_mode="Disabled")
+    part = {"reset_mask": np.array([True, False, False])}
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"begins 1 of 3 episodes: reset all, without a reset_mask"):
+        envs.reset(seed=0, options=part)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="before the first reset"):
+        envs.step(np.zeros((3, 4)))
+    envs.reset(seed=0, options={"reset_mask": np.ones(3, bool)})  # all of them by a mask
+    envs.reset(options=part)
+    envs.step(np.zeros((3, 4)))
+
+
 def test_vector_spaces_infos_and_frames() -> None:
     envs = make_vec(observation="both", privileged=True, render_mode="rgb_array")
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
