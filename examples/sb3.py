@@ -54,7 +54,7 @@ agent.learn(arguments.env_steps, Progress())
 drones.close()
 
 
-class MeanActions:
+class ClippedMeanActions:
     """The agent by the mean of what the race clips; `deterministic=True` is the normal's, which lies beyond."""
 
     def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
@@ -82,4 +82,4 @@ def race(flyer: Any) -> str:
 
 
 print(f"sampled actions: {race(agent)}")
-print(f"mean actions: {race(MeanActions())}")
+print(f"clipped mean actions: {race(ClippedMeanActions())}")
