@@ -5,8 +5,8 @@
 
 Every example is run as a user runs it, and read as it prints. The folder gets two files for each, the curve as CSV
 (`env_steps`, `seconds` since its start, `return` and `gates` of training episodes since the row before; of
-Stable-Baselines3, of the latest hundred) and as JSON what became of 100 noisy starts at the end; and a picture of all
-curves that are there.
+Stable-Baselines3, of the latest hundred) and as JSON what became of 100 noisy starts at the end, by sampled actions
+(`sampled_…`) and by the mean of what the race clips (`clipped_mean_…`); and a picture of all curves that are there.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from measuring import print_table, write_json
 EXAMPLES = {"cleanrl": "CleanRL-style", "ppo": "TorchRL", "sb3": "Stable-Baselines3"}
 CURVE = ("env_steps", "seconds", "return", "gates")
 PROGRESS = re.compile(r"(\d+) steps: return (-?[\d.]+), ([\d.]+) gates an episode")
-RACES = re.compile(r"(sampled|mean) actions: three laps from (\d+) of (\d+) noisy starts, (nan|[\d.]+) s a lap")
+RACES = re.compile(r"(sampled|clipped mean) actions: three laps from (\d+) of (\d+) noisy starts, (nan|[\d.]+) s a lap")
 
 
 def main() -> None:
@@ -72,13 +72,13 @@ def run(name: str, env_steps: int) -> tuple[list[tuple[float, ...]], dict[str, A
 
 
 def _outcome(actions: str, flown: re.Match[str]) -> dict[str, Any]:
-    """Return what flights by sampled or by mean actions came to; the first under plain names."""
-    prefix = "" if actions == "sampled" else f"{actions}_"
+    """Return what flights came to, whose actions were sampled or the means of what the race clips."""
+    prefix = actions.replace(" ", "_")
     lap = float(flown[4])
     return {
-        f"{prefix}finished": int(flown[2]),
-        f"{prefix}starts": int(flown[3]),
-        f"{prefix}lap_s": None if math.isnan(lap) else lap,
+        f"{prefix}_finished": int(flown[2]),
+        f"{prefix}_starts": int(flown[3]),
+        f"{prefix}_lap_s": None if math.isnan(lap) else lap,
     }
 
 

@@ -12,6 +12,6 @@ for _name, _track in GYM_ENVIRONMENTS.items():
     register(
         id=f"dreamer_racing/{_name}-v0",
         entry_point="dreamer_racing.envs.gym_env:DroneRaceGymEnv",
-        vector_entry_point="dreamer_racing.envs.gym_env:DroneRaceVectorEnv",
+        vector_entry_point="dreamer_racing.envs.gym_vector_env:DroneRaceVectorEnv",
         kwargs={"track": _track},
     )

@@ -149,4 +149,4 @@ def race(deterministic: bool) -> str:
 
 
 print(f"sampled actions: {race(deterministic=False)}")
-print(f"mean actions: {race(deterministic=True)}")
+print(f"clipped mean actions: {race(deterministic=True)}")

@@ -69,7 +69,7 @@ collector.shutdown()
 
 # Three laps from 100 starts with noise, by sampled actions and by the mean of what the race clips.
 mean = TensorDictModule(clipped_mean, ["loc", "scale"], ["action"])
-flyers = {"sampled": actor, "mean": TensorDictSequential(actor[0], mean)}
+flyers = {"sampled": actor, "clipped mean": TensorDictSequential(actor[0], mean)}
 for name, flyer in flyers.items():
     race = DroneRacingEnv("circle", num_envs=100, from_pixels=False, evaluation=True, start_noise=1.0, seed=1)
     flights = evaluate(race, flyer, episodes=100, exploration_type=ExplorationType.RANDOM)

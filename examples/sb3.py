@@ -54,14 +54,14 @@ agent.learn(arguments.env_steps, Progress())
 drones.close()
 
 
-class MeanActions:
+class ClippedMeanActions:
     """The agent by the mean of what the race clips; `deterministic=True` is the normal's, which lies beyond."""
 
     def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
         """As `PPO.predict`."""
         with torch.no_grad():
             normal = agent.policy.get_distribution(agent.policy.obs_to_tensor(observation)[0]).distribution
-            return clipped_mean(normal.mean, normal.stddev).numpy(), state
+            return clipped_mean(normal.mean, normal.stddev).cpu().numpy(), state
 
 
 def race(flyer: Any) -> str:
@@ -82,4 +82,4 @@ def race(flyer: Any) -> str:
 
 
 print(f"sampled actions: {race(agent)}")
-print(f"mean actions: {race(MeanActions())}")
+print(f"clipped mean actions: {race(ClippedMeanActions())}")

@@ -1,4 +1,4 @@
-"""The race for Gymnasium: `gymnasium.make("dreamer_racing/Kidney-v0")` and `gymnasium.make_vec(..., num_envs=16)`.
+"""The race for Gymnasium: `gymnasium.make("dreamer_racing/Kidney-v0")`; many drones at once are in `gym_vector_env`.
 
 Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Observation, by the argument `observation`:
 
@@ -26,8 +26,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
@@ -54,8 +52,23 @@ def row_of(batch: Any, index: int) -> Any:
     return row.item() if isinstance(row, np.generic) else row
 
 
+def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
+    """Observations of N environments with other ones in M rows, those masked (N,) bool; the batch stays as it was."""
+    if isinstance(batch, dict):
+        assert isinstance(rows, dict)
+        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
+    assert isinstance(rows, np.ndarray)
+    return _merged(batch, mask, rows)
+
+
+def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    merged = batch.copy()  # last observations of episodes are views of the batch
+    merged[mask] = rows
+    return merged
+
+
 class GymWorlds:
-    """What the single and the vector environment share: N worlds in Gymnasium's terms, always batched.
+    """What the single and the vector environments share: N worlds in Gymnasium's terms, always batched.
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
@@ -127,7 +140,16 @@ class GymWorlds:
         return Dict(spaces if self.observation == "state" else {"pixels": pixels, **spaces})
 
     def begin(self, mask: np.ndarray | None = None) -> None:
-        """Begin episodes everywhere, or where masked (N,) bool."""
+        """Begin episodes everywhere, or where masked (N,) bool.
+
+        Raises:
+            ResetNeeded: masked, but no episode has begun yet: the other drones would fly from nowhere.
+        """
+        if mask is not None and not self._begun:
+            raise gymnasium.error.ResetNeeded(
+                f"The first reset() begins {int(mask.sum())} of {len(mask)} episodes: reset all, without a reset_mask, "
+                "before a part."
+            )
         self.worlds.reset(None if mask is None else torch.from_numpy(mask))
         self._begun = True
 
@@ -287,159 +309,3 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     def close(self) -> None:
         """Free rendering contexts and threads."""
         self.race.close()
-
-
-class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
-    """N drones racing at once in one process, much faster than N single environments.
-
-    Episodes begin anew in one of Gymnasium's modes. NEXT_STEP: the step in which an episode ends returns its last
-    observation, and the step after it ignores that environment's action and returns the first observation of the next
-    episode with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the
-    last one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: whoever steps begins them, by
-    `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. Every entry of `info` but these two is there
-    for every environment (`info["_" + name]` is all true).
-
-    Args:
-        num_envs: N.
-        track: name of a built-in track, path to a YAML file, or a `Track`.
-        observation: `pixels`, `vector`, `state` or `both`.
-        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
-        privileged: whether `info` has the state.
-        body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
-        preset: physics preset (`easy`, `faithful`) or parameters.
-        max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
-        autoreset_mode: `NextStep`, `SameStep` or `Disabled`.
-        worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
-
-    Raises:
-        ValueError: bad argument; the message says which and what is allowed.
-        TrackError: unknown or broken track.
-
-    Example:
-        >>> envs = gymnasium.make_vec("dreamer_racing/Kidney-v0", num_envs=16, observation="state")
-        >>> observations, infos = envs.reset(seed=0)
-        >>> observations["position"].shape
-        (16, 3)
-    """
-
-    metadata = {
-        "render_modes": ["rgb_array"],
-        "render_fps": 50,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        track: str | Track = "kidney",
-        observation: str = "pixels",
-        render_mode: str | None = None,
-        privileged: bool = False,
-        body_rate_weight: float | None = None,
-        preset: str | QuadrotorParameters = "easy",
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        **worlds: Unpack[WorldOptions],
-    ) -> None:
-        self.autoreset_mode = _mode(autoreset_mode)
-        if max_episode_steps is not None:
-            worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps") or max_episode_steps)
-        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
-        own = {"render_fps": self.race.frames_per_second, "autoreset_mode": self.autoreset_mode}
-        self.metadata = {**self.metadata, **own}
-        self.num_envs = num_envs
-        self.render_mode = render_mode
-        self.single_action_space = self.race.action_space()
-        self.single_observation_space = self.race.observation_space()
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._ended = np.zeros(num_envs, dtype=bool)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode everywhere, or where it is asked for; a seed makes all that follow reproducible.
-
-        Args:
-            seed: of all environments together.
-            options: `reset_mask`, (N,) bool: where an episode begins; the others fly on.
-
-        Raises:
-            ValueError: the seed is a list, for all environments draw from one generator; or the mask is none.
-        """
-        if seed is not None and not isinstance(seed, int | np.integer):
-            raise ValueError(f"seed={seed!r}: one number seeds all {self.num_envs} environments together.")
-        mask = self._reset_mask(options)
-        super().reset(seed=seed)
-        if seed is not None:
-            self.race.worlds.seed(int(seed))
-        self.race.begin(None if mask.all() else mask)
-        self._ended &= ~mask
-        return self.race.observe(), self._masked(self.race.info(None), mask)
-
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one control step, or begin an episode where the last one has ended.
-
-        Args:
-            actions: (N, 4); values beyond [-1, 1] are clipped, and one that is not finite is a crash of its drone.
-
-        Raises:
-            ResetNeeded: in mode DISABLED, an episode has ended and none has begun since.
-            ValueError: wrong shape.
-        """
-        begun = self._ended
-        if begun.any() and self.autoreset_mode is AutoresetMode.DISABLED:
-            where = begun.nonzero()[0].tolist()
-            raise gymnasium.error.ResetNeeded(f"step() where episodes have ended, {where}: reset them by a reset_mask.")
-        outcome, reward = self.race.step(actions)
-        if begun.any():
-            self.race.begin(begun)
-        terminated = outcome.terminated.numpy() & ~begun
-        truncated = outcome.truncated.numpy() & ~begun
-        ended = terminated | truncated
-        info = self._masked(self.race.info(outcome, begun))
-        observation = self.race.observe()
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            info |= {**self._final(observation, ended), "final_info": dict(info), "_final_info": ended}
-            self.race.begin(ended)
-            info |= self._masked(self.race.info(outcome, ended))
-            observation, ended = self.race.observe(), np.zeros_like(ended)
-        self._ended = ended
-        return observation, np.where(begun, 0.0, reward), terminated, truncated, info
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
-        return tuple(self.race.frames()) if self.render_mode == "rgb_array" else None
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Free rendering contexts and threads."""
-        self.race.close()
-
-    def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
-        if getattr(mask, "dtype", None) != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask={mask!r}: an array of {self.num_envs} bool, one of them true at least.")
-        return mask
-
-    def _final(self, observation: Observation, ended: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the last observation of each episode that ended, None elsewhere, as Gymnasium has them."""
-        final = np.full(self.num_envs, None, dtype=object)
-        for index in ended.nonzero()[0]:
-            final[index] = row_of(observation, int(index))
-        return {"final_obs": final, "_final_obs": ended}
-
-    def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Add Gymnasium's masks of which environments an entry is there for: all of them, unless masked (N,) bool."""
-        there = np.ones(self.num_envs, dtype=bool) if mask is None else mask
-        entries = {
-            name: self._masked(value, mask) if isinstance(value, dict) else value for name, value in info.items()
-        }
-        return entries | {f"_{name}": there.copy() for name in info}
-
-
-def _mode(mode: str | AutoresetMode) -> AutoresetMode:
-    try:
-        return AutoresetMode(mode)
-    except ValueError as error:
-        known = ", ".join(repr(known.value) for known in AutoresetMode)
-        raise ValueError(f"autoreset_mode={mode!r}: choose one of {known}.") from error

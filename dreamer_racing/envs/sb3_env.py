@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of
+from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, with_rows
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions
 
@@ -105,7 +105,7 @@ class DroneRaceVecEnv(VecEnv):
         info = self.race.info(None)
         for index in np.flatnonzero(mask).tolist():
             self.reset_infos[index] = row_of(info, index)
-        return _with_rows(observation, mask, self.race.observe(mask))
+        return with_rows(observation, mask, self.race.observe(mask))
 
     def _rows(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         return [row_of(info, index) for index in range(self.num_envs)]
@@ -135,18 +135,3 @@ class DroneRaceVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """No drone is wrapped on its own."""
         return [False for _ in self._get_indices(indices)]
-
-
-def _with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
-    """Return observations of N environments, the M masked ones of which are these rows."""
-    if isinstance(batch, dict):
-        assert isinstance(rows, dict)
-        return {name: _merged(batch[name], mask, rows[name]) for name in batch}
-    assert isinstance(rows, np.ndarray)
-    return _merged(batch, mask, rows)
-
-
-def _merged(batch: np.ndarray, mask: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    merged = batch.copy()  # `terminal_observation` is a view of the batch
-    merged[mask] = rows
-    return merged

@@ -151,6 +151,11 @@ class RunDirectory:
             logger.warning("%s is damaged: the run is taken for one that goes on.", self.finished)
             return 0
 
+    def latest_evaluation(self) -> str | None:
+        """Return what files of the deterministic policy's latest evaluation are called, its env_steps; None without."""
+        names = (path.stem for path in self.evaluations.glob("*.json"))
+        return max((name for name in names if name.isdecimal()), key=int, default=None)
+
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
         """Note that the run was begun, or continued at so many env_steps, with which overrides at which commit."""
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}

@@ -162,12 +162,9 @@ def is_finished(config: DictConfig) -> bool:
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
     """Say where best policy, latest film and latest plot of a finished run are, and which commands go on from there."""
-    left = {
-        "run": directory.path,
-        "best policy": directory.best.path,
-        "film": max(directory.videos.glob("*.mp4"), default=None),
-        "plot": max(directory.plots.glob("*.png"), default=None),
-    }
+    left = {"run": directory.path, "best policy": directory.best.path}
+    if (evaluation := directory.latest_evaluation()) is not None:
+        left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
     place, longer = shlex.quote(_from_here(directory.path)), 2 * config.total_env_steps
     commands = {
         "evaluate it": f"{command('evaluate')} checkpoint={place} episodes=100",
@@ -175,7 +172,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         "draw it": f"{command('plot')} runs={place} output=figures",
         "go on": f"{command(config.algorithm)} resume={place} total_env_steps={longer}",
     }
-    files = {what: _from_here(path) for what, path in left.items() if path is not None and path.exists()}
+    files = {what: _from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)
 
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: the checker's verdict, autoreset, seeds, and the same race as everywhere else."""
+"""The Gymnasium environments: the checker's verdict, seeds, and the same race as everywhere else."""
 
 import subprocess
 import sys
@@ -10,20 +10,19 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
-from torchrl.envs import GymEnv, GymWrapper
+from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv, DroneRaceVectorEnv
+from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv
+from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
 
 IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
 HOVER = np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
-CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
 INFO = {"gates_passed", "gate_offset", "lap_time", "crash", "finished", "reward_base", "body_rate_norm"}
 
 
@@ -224,163 +223,6 @@ def test_seeds_reproduce(vector: bool) -> None:
     assert not np.allclose(first, fly(1))
     assert not np.allclose(fly(None), fly(None))
     assert not np.allclose(first[0], first[3])
-
-
-def test_vector_spaces_infos_and_frames() -> None:
-    envs = make_vec(observation="both", privileged=True, render_mode="rgb_array")
-    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert envs.spec.id == "dreamer_racing/Circle-v0"
-    observation, info = envs.reset(seed=0)
-    assert envs.observation_space.contains(observation)
-    assert observation["pixels"].shape == (3, 64, 64, 3)
-    for name in INFO:
-        assert info[name].shape == info["_" + name].shape == (3,)
-    observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
-    assert envs.observation_space.contains(observation)
-    assert reward.shape == terminated.shape == truncated.shape == (3,)
-    assert list(info["crash"]) == ["none"] * 3
-    np.testing.assert_array_equal(info["privileged"]["target_gate"], observation["target_gate"])
-    assert [frame.shape for frame in envs.render()] == [(256, 256, 3)] * 3
-    envs.close()
-    envs.close()
-
-
-def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
-    envs = make_vec(observation="both", evaluation=True, max_episode_steps=4)
-    start, _ = envs.reset(seed=0)
-    hover = np.tile(HOVER, (3, 1))
-    poisoned = hover.copy()
-    poisoned[1] = np.nan
-    _, reward, terminated, _, info = envs.step(poisoned)
-    assert list(terminated) == [False, True, False]
-    assert list(info["crash"]) == ["none", "invalid_action", "none"]
-    assert reward[1] == -4.0
-
-    observation, reward, terminated, _, info = envs.step(poisoned)  # its action does not matter now
-    assert not terminated.any()
-    assert reward[1] == 0.0
-    assert info["crash"][1] == "none"
-    np.testing.assert_array_equal(observation["position"][1], start["position"][1])
-    np.testing.assert_array_equal(observation["pixels"][1], start["pixels"][1])
-
-    ends = [envs.step(hover)[2:5] for _ in range(4)]
-    # two steps more end the undisturbed ones; the other has had an episode's first observation in between
-    assert [list(end[1]) for end in ends] == [
-        [False, False, False],
-        [True, False, True],
-        [False, False, False],
-        [False, True, False],
-    ]
-    assert not any(end[0].any() for end in ends)
-    envs.close()
-
-
-def test_invalid_action_leaves_the_others_alone() -> None:
-    flown = []
-    for poison in (False, True):
-        envs = make_vec(observation="state")
-        envs.reset(seed=0)
-        actions = np.tile(HOVER, (3, 1))
-        if poison:
-            actions[0, 2] = np.inf
-        rows = []
-        for _ in range(2):
-            observation, reward, *_ = envs.step(actions)
-            rows.append((observation["position"][1:], reward[1:]))
-        flown.append(rows)
-    for clean, poisoned in zip(*flown, strict=True):
-        np.testing.assert_array_equal(clean[0], poisoned[0])
-        np.testing.assert_array_equal(clean[1], poisoned[1])
-
-
-def test_reset_forgets_pending_autoresets() -> None:
-    envs = make_vec(observation="state", evaluation=True)
-    envs.reset()
-    envs.step(np.full((3, 4), np.nan))
-    envs.reset()
-    observation, *_ = envs.step(np.tile(np.array([0.5, 0, 0, 0]), (3, 1)))
-    assert (observation["linear_velocity"][:, 2] > 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("mode", "kind"),
-    [(None, DroneRaceVectorEnv), ("vector_entry_point", DroneRaceVectorEnv), ("sync", gymnasium.vector.SyncVectorEnv)],
-)
-def test_every_mode_of_make_vec(mode: str | None, kind: type) -> None:
-    envs = gymnasium.make_vec(IDS[0], num_envs=2, vectorization_mode=mode, observation="vector")
-    assert isinstance(envs, kind) and envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert envs.reset(seed=0)[0].shape == (2, 21)
-    observations, rewards, terminated, truncated, info = envs.step(envs.action_space.sample())
-    assert observations.shape == (2, 21) and rewards.shape == terminated.shape == truncated.shape == (2,)
-    assert list(info["crash"]) == ["none", "none"]
-    envs.close()
-
-
-def poisoned(num_envs: int, index: int) -> np.ndarray:
-    """Hovering, but for one, which crashes by an action that is not finite."""
-    actions = np.tile(HOVER, (num_envs, 1))
-    actions[index] = np.nan
-    return actions
-
-
-@pytest.mark.parametrize("observation", ["vector", "both"])
-def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> None:
-    envs = make_vec(observation=observation, autoreset_mode="SameStep", evaluation=True)
-    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    start, _ = envs.reset(seed=0)
-    last, rewards, terminated, truncated, info = make_and_poison(envs)
-    assert list(terminated) == [False, True, False] and not truncated.any() and rewards[1] == -4.0
-    assert list(info["_final_obs"]) == list(info["_final_info"]) == [False, True, False]
-    assert info["final_info"]["crash"][1] == "invalid_action" and info["crash"][1] == "none"
-    assert info["final_obs"][0] is None and info["final_obs"][2] is None
-    of = (lambda seen: seen) if observation == "vector" else (lambda seen: seen["position"])
-    assert not np.allclose(of(last)[0], of(start)[0])  # flies on
-    np.testing.assert_allclose(of(last)[1], of(start)[1], atol=1e-6)  # at the start again: evaluation
-    assert not np.allclose(of(info["final_obs"][1]), of(start)[1], atol=1e-6)
-    assert "final_obs" not in envs.step(np.tile(HOVER, (3, 1)))[-1]
-    envs.close()
-
-
-def make_and_poison(envs: DroneRaceVectorEnv) -> tuple:
-    """Fly a little, then let the second one crash."""
-    for _ in range(3):
-        envs.step(np.tile(HOVER + CLIMB, (3, 1)))
-    return envs.step(poisoned(3, 1))
-
-
-def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
-    envs = make_vec(observation="vector", autoreset_mode=AutoresetMode.DISABLED, evaluation=True)
-    start, _ = envs.reset(seed=0)
-    last, _, terminated, _, _ = make_and_poison(envs)
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"ended, \[1\]"):
-        envs.step(np.tile(HOVER, (3, 1)))
-    observation, info = envs.reset(options={"reset_mask": terminated})
-    np.testing.assert_allclose(observation[1], start[1], atol=1e-6)
-    np.testing.assert_array_equal(observation[[0, 2]], last[[0, 2]])  # they did not notice
-    assert list(info["_crash"]) == [False, True, False]
-    assert not envs.step(np.tile(HOVER, (3, 1)))[2].any()
-    for mask in (np.zeros(3, bool), np.ones(2, bool), [True, True, True]):
-        with pytest.raises(ValueError, match="reset_mask="):
-            envs.reset(options={"reset_mask": mask})
-    envs.close()
-
-
-def test_an_unknown_autoreset_mode_is_refused() -> None:
-    with pytest.raises(ValueError, match="autoreset_mode='never': choose one of 'NextStep', 'SameStep', 'Disabled'"):
-        make_vec(autoreset_mode="never")
-
-
-@pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_torchrl_takes_the_vector_environment(observation: str) -> None:
-    envs = make_vec(observation=observation, autoreset_mode="Disabled", max_episode_steps=4)
-    env = GymWrapper(envs)
-    check_env_specs(env)
-    flown = env.rollout(10, break_when_any_done=False)
-    assert flown.batch_size == (3, 10)
-    assert flown["next", "truncated"][..., 0].nonzero()[:, 1].tolist() == [3, 7] * 3  # and flies on from new starts
-    key = "observation" if observation in ("pixels", "vector") else "position"
-    assert (flown[key][:, 4] != flown["next", key][:, 3]).flatten(1).any(1).all()
-    env.close()
 
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)

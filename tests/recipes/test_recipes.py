@@ -23,7 +23,7 @@ pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run."""
     directory = tmp_path_factory.mktemp("runs") / "first run"
-    done = recipe("dreamer_v3", *SMALL, f"run_dir='{directory}'", cwd=directory.parent)
+    done = recipe("dreamer_v3", *SMALL, "evaluation.stochastic=true", f"run_dir='{directory}'", cwd=directory.parent)
     assert done.returncode == 0, done.stderr
     assert "device: cpu (device=auto)" in done.stdout and "renderer: " in done.stdout and "GB when full" in done.stdout
     return directory
@@ -78,6 +78,7 @@ def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert f"complete already, at {env_steps:,} env_steps" in done.stdout and "go on:" in done.stdout
     said = dict(line.split(":", 1) for line in done.stdout.splitlines() if ":" in line)
+    assert all((run_dir / "videos" / f"{env_steps:09d}{policy}.mp4").exists() for policy in ("", "_stochastic"))
     left = [run_dir.parent / said[what].strip() for what in ("run", "best policy", "film", "plot")]
     assert all(path.exists() for path in left) and left[2].stem == left[3].stem == f"{env_steps:09d}"
     assert everything_in(run_dir) == before

@@ -49,6 +49,15 @@ def test_a_run_is_finished_where_it_says_so(tmp_path: Path) -> None:
         assert run.finished_env_steps() == 0, damage
 
 
+def test_the_latest_evaluation_is_that_of_the_deterministic_policy(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    assert run.latest_evaluation() is None
+    run.evaluations.mkdir()
+    for name in ("999999999", "1000000064", "1000000064_stochastic", "notes"):
+        (run.evaluations / f"{name}.json").touch()
+    assert run.latest_evaluation() == "1000000064"
+
+
 def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = RunDirectory(tmp_path)
     run.note_start(0, [], None)
