@@ -4,19 +4,34 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+
+class Shown(NamedTuple):
+    """What is shown under a word.
+
+    Attributes:
+        training: the metric, of training episodes or of updates, if there is one.
+        evaluation: that of evaluations.
+        form: how its number is written.
+    """
+
+    training: str | None
+    evaluation: str | None
+    form: str = ".2f"
+
+
 COLUMNS = {
-    "return": ("episode/return", "evaluation/return_mean"),
-    "gates": ("episode/gates_passed", "evaluation/gates_per_episode"),
-    "success": (None, "evaluation/success_rate"),
-    "lap (s)": (None, "evaluation/lap_time_mean"),
-    "loss": ("loss", None),
-    "updates/s": ("rate/updates", None),
+    "return": Shown("episode/return", "evaluation/return_mean"),
+    "gates": Shown("episode/gates_passed", "evaluation/gates_per_episode"),
+    "success": Shown(None, "evaluation/success_rate", ".0%"),
+    "lap (s)": Shown(None, "evaluation/lap_time_mean"),
+    "loss": Shown("loss", None),
+    "updates/s": Shown("rate/updates", None),
 }
-"""Metrics of training episodes and updates, and of evaluations, by the word they are shown under."""
+"""What a terminal and a log show, by the word that it is shown under."""
 ROWS = ("training", "evaluation")
 NOTHING = "–"
 EVALUATING = "  evaluating   {bar:24} {n_fmt} of {total_fmt} episodes"
@@ -46,11 +61,9 @@ class LiveTable:
 
     def show(self, metrics: Mapping[str, float], failing: str = "") -> None:
         """Show what is new in these metrics, beside the env_steps of now, and what cannot be written."""
-        for number, row in enumerate(ROWS):
-            names = [both[number] for both in COLUMNS.values()]
-            new = [_in_words(word, metrics.get(name or "")) for word, name in zip(COLUMNS, names, strict=True)]
-            if any(cell != NOTHING for cell in new):
-                self._write(row, [f"{self._bar.n:,}", *new], 1 + number)
+        for number, row in enumerate(ROWS, start=1):
+            if new := numbers_of(row, metrics):
+                self._write(row, [f"{self._bar.n:,}", *(new.get(word, NOTHING) for word in COLUMNS)], number)
         self._end_evaluation()
         self._bar.set_postfix_str(f"NOT SAVED: {failing}" if failing else "")
 
@@ -83,7 +96,7 @@ class LiveTable:
         self._lines[number].set_description_str(text[: shutil.get_terminal_size().columns - 1])
 
 
-def _in_words(word: str, value: float | None) -> str:
-    if value is None:
-        return NOTHING
-    return f"{value:.0%}" if word == "success" else f"{value:.2f}"
+def numbers_of(row: str, metrics: Mapping[str, float]) -> dict[str, str]:
+    """Return what these metrics have for a row, one of `ROWS`, as it is shown, by its words."""
+    names = {word: getattr(shown, row) for word, shown in COLUMNS.items()}
+    return {word: f"{metrics[name]:{COLUMNS[word].form}}" for word, name in names.items() if name in metrics}
