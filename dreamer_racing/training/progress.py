@@ -10,6 +10,7 @@ from datetime import timedelta
 from typing import TextIO
 
 from dreamer_racing.training.live_table import LiveTable, numbers_of
+from dreamer_racing.training.signals import say_at_once
 
 
 class Progress:
@@ -61,14 +62,22 @@ class Progress:
     def say(self, text: str) -> None:
         """Say something in a line of its own."""
         if self._table is not None:
-            self._table.say(text)
+            self._table.write(text)
         elif self._shown:
             _write(text, sys.stdout)
+
+    def answer(self, text: str) -> None:
+        """Say something at once, from within a signal's handler, in a line of its own."""
+        if self._table is not None:
+            self._table.answer(text)
+        else:
+            say_at_once(text)
 
     def close(self) -> None:
         """Leave bar and table as they stand."""
         if self._table is not None:
             self._table.close()
+            self._table = None
 
     def __enter__(self) -> Progress:
         return self
