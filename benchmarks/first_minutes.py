@@ -16,7 +16,6 @@ wanted a core in the minute before): on a busy machine the wall clock is an uppe
 import argparse
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -25,7 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from measuring import print_table, write_json
+from measuring import cpu_seconds, print_table, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 FLY = ("./dev", "python", "recipes/fly.py", "agent=kidney")
@@ -41,6 +40,8 @@ def main() -> None:
     parser.add_argument("--keep", nargs="*", default=[], metavar="NAME", help="environment variables to hand on")
     parser.add_argument("--json")
     arguments = parser.parse_args()
+    if unset := [name for name in arguments.keep if name not in os.environ]:
+        parser.error(f"--keep {' '.join(unset)}: not set in this environment")
     kept = {name: os.environ[name] for name in arguments.keep}
     records = []
     for _ in range(arguments.times):
@@ -60,7 +61,7 @@ def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
     home, clone = folder / "home", folder / "dreamer_racing"
     home.mkdir()
     environment |= {"HOME": str(home), "TMPDIR": str(folder)}
-    load, spent, begun = os.getloadavg()[0], _cpu_seconds(), time.monotonic()
+    load, spent, begun = os.getloadavg()[0], cpu_seconds(), time.monotonic()
     subprocess.run(["git", "clone", "-q", ROOT.as_uri(), clone], env=environment, check=True)
     cloned = time.monotonic()
     lines = list(_timed_lines(clone, environment))
@@ -75,7 +76,7 @@ def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
         "environment_s": round(ready - cloned, 1),
         "flight_s": round(ended - ready, 1),
         "total_s": round(ended - begun, 1),
-        "cpu_s": round(_cpu_seconds() - spent, 1),
+        "cpu_s": round(cpu_seconds() - spent, 1),
         "load": round(load, 2),
         "steps_s": _steps(said),
         "rendering": next((line.partition("rendering: ")[2] for _, line in said if "rendering" in line), ""),
@@ -91,7 +92,6 @@ def _revision(clone: Path) -> str:
 
 def _timed_lines(clone: Path, environment: dict[str, str]) -> list[tuple[float, str]]:
     """Run the flight; return what it printed, with the moment of each line."""
-    lines = []
     with subprocess.Popen(
         FLY, cwd=clone, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
@@ -108,12 +108,6 @@ def _steps(said: list[tuple[float, str]]) -> dict[str, float]:
     announced = [(moment, line.removeprefix("dev: ").partition(" from ")[0]) for moment, line in said]
     following = pairwise(announced)
     return {what[:40]: round(after - moment, 1) for (moment, what), (after, _) in following if "NOTE" not in what}
-
-
-def _cpu_seconds() -> float:
-    """Return what all ended child processes have used."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":
