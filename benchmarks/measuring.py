@@ -8,6 +8,9 @@ from typing import Any
 
 from dreamer_racing.machine import provenance
 
+COMMIT = provenance()["commit"]
+"""When the benchmark began, which is what it measures: others may come before it writes."""
+
 
 def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     """Print some columns of the records as a Markdown table."""
@@ -26,7 +29,7 @@ def _text(value: Any) -> str:
 def write_json(records: Sequence[dict[str, Any]], path: str | None) -> None:
     """Write the records with their provenance, if a path is given."""
     if path:
-        where = provenance()
+        where = {**provenance(), "commit": COMMIT}
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps([{**record, **where} for record in records], indent=1) + "\n")
 
