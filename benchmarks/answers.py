@@ -9,7 +9,6 @@ waiting: the doctor watches OpenGL draw for one second, which is part of its wal
 
 import argparse
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from measuring import print_table, write_json
+from measuring import cpu_seconds, print_table, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 COLUMNS = ["command", "seconds", "cpu_s", "times", "load"]
@@ -43,10 +42,10 @@ def measure(command: tuple[str, ...], times: int) -> dict[str, Any]:
     """
     load, walls, cpus = os.getloadavg()[0], [], []
     for _ in range(times):
-        before, begun = _cpu_seconds(), time.monotonic()
+        before, begun = cpu_seconds(), time.monotonic()
         done = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
         walls.append(time.monotonic() - begun)
-        cpus.append(_cpu_seconds() - before)
+        cpus.append(cpu_seconds() - before)
         if done.stderr or not done.stdout:
             raise SystemExit(f"{' '.join(command)}: exit status {done.returncode}\n{done.stderr}")
     return {
@@ -56,12 +55,6 @@ def measure(command: tuple[str, ...], times: int) -> dict[str, Any]:
         "times": times,
         "load": round(load, 2),
     }
-
-
-def _cpu_seconds() -> float:
-    """Return what all ended child processes have used."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

@@ -42,12 +42,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from forked import recipe
 from measuring import print_table, write_json
 
-sys.path.append(str(Path(__file__).parents[1]))
 from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from tests.running_recipes import recipe
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [

@@ -6,7 +6,8 @@
 The commands are `git clone` and `./dev python recipes/fly.py agent=kidney`; they see of this machine its programs and
 system libraries, and of its environment variables nothing but PATH and what `--keep` names (a proxy, where packages
 come from). So nothing is left of earlier starts: no packages, no pip cache, no byte code, no compiled kernels. The
-clone is of this repository's last commit, by git's own transport from this disk: a network's time comes on top.
+clone is of the commit that this repository is at in the beginning, the same each time, by git's own transport from this
+disk: a network's time comes on top.
 
 A record a time: `clone_s`, `environment_s` (until `./dev` has made it) with its `steps_s`, `flight_s` (until video and
 map are written), `total_s`, `cpu_s` (user and system of all processes), and `load` (the mean number of processes that
@@ -16,7 +17,6 @@ wanted a core in the minute before): on a busy machine the wall clock is an uppe
 import argparse
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -25,7 +25,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from measuring import print_table, write_json
+from measuring import cpu_seconds, print_table, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 FLY = ("./dev", "python", "recipes/fly.py", "agent=kidney")
@@ -41,17 +41,20 @@ def main() -> None:
     parser.add_argument("--keep", nargs="*", default=[], metavar="NAME", help="environment variables to hand on")
     parser.add_argument("--json")
     arguments = parser.parse_args()
+    if unset := [name for name in arguments.keep if name not in os.environ]:
+        parser.error(f"--keep {' '.join(unset)}: not set in this environment")
     kept = {name: os.environ[name] for name in arguments.keep}
+    commit = _git(ROOT, "rev-parse", "HEAD")
     records = []
     for _ in range(arguments.times):
         with tempfile.TemporaryDirectory(prefix="first_minutes_") as folder:
-            records.append(begin(Path(folder), {"PATH": PATHS, **kept}))
+            records.append(begin(Path(folder), commit, {"PATH": PATHS, **kept}))
         print_table(records[-1:], COLUMNS)
         print("  ".join(f"{what}: {seconds}" for what, seconds in records[-1]["steps_s"].items()), flush=True)
         write_json(records, arguments.json)
 
 
-def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+def begin(folder: Path, commit: str, environment: dict[str, str]) -> dict[str, Any]:
     """Clone, make the environment and fly, as somebody does who has nothing yet.
 
     Raises:
@@ -60,8 +63,8 @@ def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
     home, clone = folder / "home", folder / "dreamer_racing"
     home.mkdir()
     environment |= {"HOME": str(home), "TMPDIR": str(folder)}
-    load, spent, begun = os.getloadavg()[0], _cpu_seconds(), time.monotonic()
-    subprocess.run(["git", "clone", "-q", ROOT.as_uri(), clone], env=environment, check=True)
+    load, spent, begun = os.getloadavg()[0], cpu_seconds(), time.monotonic()
+    clone_at(commit, clone, environment)
     cloned = time.monotonic()
     lines = list(_timed_lines(clone, environment))
     ended = time.monotonic()
@@ -75,23 +78,27 @@ def begin(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
         "environment_s": round(ready - cloned, 1),
         "flight_s": round(ended - ready, 1),
         "total_s": round(ended - begun, 1),
-        "cpu_s": round(_cpu_seconds() - spent, 1),
+        "cpu_s": round(cpu_seconds() - spent, 1),
         "load": round(load, 2),
         "steps_s": _steps(said),
         "rendering": next((line.partition("rendering: ")[2] for _, line in said if "rendering" in line), ""),
         "laps": next(line.removeprefix("laps").strip() for _, line in lines if re.match("laps ", line)),
-        "cloned": _revision(clone),
+        "cloned": _git(clone, "rev-parse", "--short", "HEAD"),
     }
 
 
-def _revision(clone: Path) -> str:
-    """Return the commit that was flown."""
-    return subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=clone, text=True).strip()
+def clone_at(commit: str, clone: Path, environment: dict[str, str]) -> None:
+    """Clone this repository, at a commit that it may have gone on from since."""
+    subprocess.run(["git", "clone", "-q", "--no-checkout", ROOT.as_uri(), clone], env=environment, check=True)
+    subprocess.run(["git", "checkout", "-q", "--detach", commit], cwd=clone, env=environment, check=True)
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    return subprocess.check_output(["git", *arguments], cwd=folder, text=True).strip()
 
 
 def _timed_lines(clone: Path, environment: dict[str, str]) -> list[tuple[float, str]]:
     """Run the flight; return what it printed, with the moment of each line."""
-    lines = []
     with subprocess.Popen(
         FLY, cwd=clone, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
@@ -108,12 +115,6 @@ def _steps(said: list[tuple[float, str]]) -> dict[str, float]:
     announced = [(moment, line.removeprefix("dev: ").partition(" from ")[0]) for moment, line in said]
     following = pairwise(announced)
     return {what[:40]: round(after - moment, 1) for (moment, what), (after, _) in following if "NOTE" not in what}
-
-
-def _cpu_seconds() -> float:
-    """Return what all ended child processes have used."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

@@ -1,11 +1,15 @@
 """What every benchmark does: say where it was measured, print a table, write flat JSON."""
 
 import json
+import resource
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from dreamer_racing.machine import provenance
+
+COMMIT = provenance()["commit"]
+"""When the benchmark began, which is what it measures: others may come before it writes."""
 
 
 def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
@@ -25,6 +29,12 @@ def _text(value: Any) -> str:
 def write_json(records: Sequence[dict[str, Any]], path: str | None) -> None:
     """Write the records with their provenance, if a path is given."""
     if path:
-        where = provenance()
+        where = {**provenance(), "commit": COMMIT}
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps([{**record, **where} for record in records], indent=1) + "\n")
+
+
+def cpu_seconds() -> float:
+    """Return what all ended child processes have used, user and system."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 from matplotlib.figure import Figure
+
+# For `forked`, and for good: its processes look there, too. Last, so that no benchmark stands in for another module.
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

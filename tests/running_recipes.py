@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import os
-import runpy
 import select
 import socket
 import subprocess
@@ -16,9 +15,8 @@ from types import ModuleType
 from typing import Self
 
 import hydra
+from forked import recipe, started  # noqa: F401 - for tests, beside the rest
 from omegaconf import DictConfig, OmegaConf
-
-from tests.forked import Forked
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
@@ -38,26 +36,6 @@ TINY = [
 ]  # fmt: skip
 """The shortest run there is."""
 AT_THE_END = "evaluation.every=1000000"
-
-
-def recipe(
-    name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
-) -> subprocess.CompletedProcess[str]:
-    """Run a recipe in a process of its own, after some lines of Python if need be."""
-    return started(name, *overrides, cwd=cwd, before=before).communicate(timeout)
-
-
-def started(name: str, *overrides: str, cwd: Path, before: str = "") -> Forked:
-    """Start a recipe, as `recipe` does."""
-    return Forked(_run, str(ROOT / "recipes" / f"{name}.py"), overrides, before, cwd=cwd)
-
-
-def _run(path: str, overrides: tuple[str, ...], before: str) -> None:
-    """Be the recipe, as `python PATH OVERRIDE...` would be."""
-    sys.argv = [path, *overrides]
-    sys.path.insert(0, str(Path(path).parent))
-    exec(before, {})
-    runpy.run_path(path, run_name="__main__")
 
 
 def rows(run_dir: Path) -> list[dict[str, str]]:

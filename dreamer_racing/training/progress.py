@@ -9,12 +9,8 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import TextIO
 
-from dreamer_racing.training.live_table import LiveTable
-
-SHOWN = {"return": "episode/return", "gates": "episode/gates_passed", "loss": "loss", "updates/s": "rate/updates"}
-"""Metrics of a line, by the word they are shown under."""
-KEPT = {"success": "evaluation/success_rate"}
-"""Those that are shown until there are newer ones."""
+from dreamer_racing.training.live_table import LiveTable, numbers_of
+from dreamer_racing.training.signals import say_at_once
 
 
 class Progress:
@@ -35,7 +31,7 @@ class Progress:
     def __init__(self, total: int, env_steps: int = 0, seconds: float = 30.0, shown: bool = True) -> None:
         self._total, self._seconds, self._shown = total, seconds, shown
         self._env_steps = env_steps
-        self._kept: dict[str, str] = {}
+        self._evaluated = ""  # the latest evaluation, in every line until the next
         self._since, self._from = time.monotonic(), env_steps  # of the latest line
         self._table = LiveTable(total, env_steps) if shown and sys.stderr.isatty() else None
 
@@ -51,11 +47,12 @@ class Progress:
         if self._table is not None:
             self._table.show(metrics, failing)
             return
-        self._kept |= {word: f"{metrics[name]:.0%}" for word, name in KEPT.items() if name in metrics}
-        numbers = {word: f"{metrics[name]:.2f}" for word, name in SHOWN.items() if name in metrics}
+        if evaluated := _listed(numbers_of("evaluation", metrics)):
+            self._evaluated = f"evaluation: {evaluated}"
         if self._shown and time.monotonic() - self._since >= self._seconds:
-            numbers = ({"NOT SAVED": failing} if failing else {}) | numbers | self._kept
-            self._write_line(", ".join(f"{word} {number}" for word, number in numbers.items()))
+            trained = _listed(numbers_of("training", metrics))
+            parts = (f"NOT SAVED {failing}" if failing else "", trained, self._evaluated)
+            self._write_line("; ".join(part for part in parts if part))
 
     def evaluating(self, episodes: int, total: int) -> None:
         """Show how far an evaluation is, until there are numbers to show; a log has no use for it."""
@@ -65,14 +62,22 @@ class Progress:
     def say(self, text: str) -> None:
         """Say something in a line of its own."""
         if self._table is not None:
-            self._table.say(text)
+            self._table.write(text)
         elif self._shown:
             _write(text, sys.stdout)
+
+    def answer(self, text: str) -> None:
+        """Say something at once, from within a signal's handler, in a line of its own."""
+        if self._table is not None:
+            self._table.answer(text)
+        else:
+            say_at_once(text)
 
     def close(self) -> None:
         """Leave bar and table as they stand."""
         if self._table is not None:
             self._table.close()
+            self._table = None
 
     def __enter__(self) -> Progress:
         return self
@@ -88,6 +93,10 @@ class Progress:
         done = f"{self._env_steps:,} of {self._total:,} env_steps, {speed:.0f}/s, {left} to go"
         _write(f"{done}: {numbers}", sys.stderr)
         self._since, self._from = now, self._env_steps
+
+
+def _listed(numbers: Mapping[str, str]) -> str:
+    return ", ".join(f"{word} {number}" for word, number in numbers.items())
 
 
 def _write(text: str, stream: TextIO) -> None:

@@ -241,6 +241,7 @@ def train(run: Run) -> None:
         graceful_exit() as stop,
         Progress(config.total_env_steps, counters["env_steps"], shown=leads) as progress,
     ):
+        stop.say = progress.answer
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
         if leads and run.directory.finished_env_steps() > counters["env_steps"]:
             run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again

@@ -19,9 +19,12 @@ class GracefulExit:
     is never set.
 
     Args:
-        answer: Said at once on stderr at the first signal, after its name; nothing if empty.
+        answer: Said at once at the first signal, after its name; nothing if empty.
         agree: Where several processes train together, what makes of each one's signal number (0: none yet) the one that
             all go by. Then `requested` is an exchange, for which all must ask equally often.
+
+    Attributes:
+        say: Says the answer, from within the handler: it may have interrupted a write to one of Python's streams.
 
     Example:
         >>> with GracefulExit() as stop:
@@ -30,6 +33,7 @@ class GracefulExit:
     """
 
     def __init__(self, answer: str = "", agree: Callable[[int], int] | None = None) -> None:
+        self.say: Callable[[str], None] = say_at_once
         self._answer = answer
         self._agree = agree
         self._arrived = 0  # number of the signal that came to this process
@@ -63,6 +67,16 @@ class GracefulExit:
         self._arrived = number
         if not self._agree:
             self.signal_name = name
-        if self._answer:  # past Python's streams: the signal may have interrupted a write to one
-            with contextlib.suppress(OSError, ValueError):  # nobody listens any more
-                os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"\n{name}: {self._answer}\n".encode())
+        if self._answer:
+            self.say(f"{name}: {self._answer}")
+
+
+def say_at_once(text: str) -> None:
+    """Say something on stderr from within a signal's handler, in a line below what stands there."""
+    write_at_once(f"\n{text}\n")
+
+
+def write_at_once(text: str) -> None:
+    """Write to stderr past Python's streams, which take nothing while a write to them is interrupted."""
+    with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, text.encode())

@@ -45,10 +45,12 @@ def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
         if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):
             break
         time.sleep(0.2)
+    assert run.process.is_alive() and rows(tmp_path / "run"), run.communicate(timeout=1)
     run.send_signal(number)
     if times == 2:
         while not (tmp_path / "saving slowly").exists() and time.monotonic() < deadline:
             time.sleep(0.1)
+        assert run.process.is_alive(), run.communicate(timeout=1)
         run.send_signal(number)
     done = run.communicate(timeout=120)
     output = done.stdout + done.stderr

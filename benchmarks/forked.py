@@ -1,18 +1,24 @@
-"""Processes that begin with what takes a recipe most of its first seconds, imported once for all of them."""
+"""Processes that begin with what takes a recipe most of its first seconds, imported once for all of them.
+
+Benchmarks and tests run recipes in them.
+"""
 
 from __future__ import annotations
 
 import atexit
 import multiprocessing
 import os
+import runpy
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import reduction
 from pathlib import Path
 from typing import Any
 
+RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 # Not dm_control, nor OpenGL: what they draw with they choose by the environment that they are imported in.
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
@@ -94,3 +100,23 @@ def _begin(
 def _read(pipe: int) -> str:
     with open(pipe) as stream:
         return stream.read()
+
+
+def recipe(
+    name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Run a recipe in a process of its own, after some lines of Python if need be."""
+    return started(name, *overrides, cwd=cwd, before=before).communicate(timeout)
+
+
+def started(name: str, *overrides: str, cwd: Path, before: str = "") -> Forked:
+    """Start a recipe, as `recipe` does."""
+    return Forked(_run, str(RECIPES / f"{name}.py"), overrides, before, cwd=cwd)
+
+
+def _run(path: str, overrides: tuple[str, ...], before: str) -> None:
+    """Be the recipe, as `python PATH OVERRIDE...` would be."""
+    sys.argv = [path, *overrides]
+    sys.path.insert(0, str(Path(path).parent))
+    exec(before, {})
+    runpy.run_path(path, run_name="__main__")
