@@ -66,6 +66,35 @@ def test_decoys_are_a_config_group() -> None:
     assert OmegaConf.to_object(compose("evaluate", "checkpoint=x", "+decoys=none")).decoys == "none"
 
 
+@pytest.mark.parametrize(
+    ("device", "overrides", "expected"),
+    [
+        ("cpu", [], "cpu"),
+        ("cuda", [], "cuda"),
+        ("cuda", ["env.renderer=warp"], "cuda"),
+        ("cuda", ["env.renderer=egl"], "cpu"),
+        ("cuda", ["env=dmc"], "cpu"),
+        ("cuda", ["env.device=cpu"], "cpu"),
+        ("cuda", ["collection=overlapped"], "cpu"),
+    ],
+)
+def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
+    monkeypatch: pytest.MonkeyPatch, device: str, overrides: list[str], expected: str
+) -> None:
+    """Where they can be; the device is asked for, not looked for."""
+    arena, dreamer = recipe_module("composing.arena"), recipe_module("dreamer_v3")
+    for module in (dreamer, recipe_module("composing.building")):
+        monkeypatch.setattr(module, "choose_device", torch.device)
+    monkeypatch.setattr(dreamer, "computes_bfloat16", lambda device: True)
+    config = dreamer.resolve(compose("dreamer_v3", f"device={device}", *overrides))
+    assert config.env.device == expected
+    if config.env.suite == "race":
+        made = []
+        monkeypatch.setattr(arena, "EvaluationReport", lambda *arguments, **options: made.append(arguments[2]))
+        arena.make_report(OmegaConf.to_object(config), Path(), None, 1, 1)
+        assert made[0]["device"] == expected
+
+
 def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
     build(f"run_dir={tmp_path}", "env.num_envs=4", "prefill=64", "total_env_steps=80", "replay.capacity=1000")
     assert OmegaConf.load(tmp_path / "config.yaml").model.batch_length == 16
