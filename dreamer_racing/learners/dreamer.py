@@ -404,14 +404,9 @@ class DreamerLearner:
                 changed then.
         """
         self.adopt(state_dict)
-        # Rates are settings of this learner, not state: a run may be continued with others.
-        names = {"lr", "warmup_steps"}
-        own = [{name: value for name, value in group.items() if name in names} for group in self._groups]
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        _restore(self.optimizer, state_dict["optimizer"])
         if self._actor_optimizer is not None:
-            self._actor_optimizer.load_state_dict(state_dict["actor_optimizer"])
-        for group, settings in zip(self._groups, own, strict=True):
-            group.update(settings)
+            _restore(self._actor_optimizer, state_dict["actor_optimizer"])
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> None:
@@ -497,6 +492,14 @@ def judge_latents(critic: Critic) -> Judge:
         return critic.value(join_features(after["belief"], after["state"]))
 
     return value
+
+
+def _restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Restore an optimiser's state, but not its settings: a run may go on with other rates, or on another device."""
+    names = {"lr", "warmup_steps", "fused"}
+    own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
+    groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
+    optimizer.load_state_dict({**state, "param_groups": groups})
 
 
 def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
