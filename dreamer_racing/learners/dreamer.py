@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
 
@@ -24,7 +25,9 @@ from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.cast_weights import cast_once
 from dreamer_racing.modules.critic import Critic
+from dreamer_racing.modules.few_kernels import save_kernels
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
@@ -43,8 +46,13 @@ class LearnerConfig:
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         slow_critic_rate: Fraction by which the slow critic moves at each update.
-        compile: Compile the losses with ``torch.compile``; minutes at the first update.
-        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph.
+        compile: Compile the arithmetic of the recurrent cell with ``torch.compile``, instead of what ``few_kernels``
+            does there.
+        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
+            whether the run can, is False.
+        few_kernels: Round elsewhere, where that saves kernels: weights are cast once an update instead of at every use
+            (with ``mixed_precision``), gradients of gains and biases are summed after the loop over T. None: on a CUDA
+            device, where a small kernel's launch takes longer than its work.
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
             which the recipes replace by what the device does well, is False.
         learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
@@ -60,7 +68,8 @@ class LearnerConfig:
     average_rate: float | None = setting(None, POSITIVE_SHARE)
     slow_critic_rate: float = setting(0.02, SHARE)
     compile: bool = False
-    cuda_graph: bool = False
+    cuda_graph: bool | None = None
+    few_kernels: bool | None = None
     mixed_precision: bool | None = None
     learning_rate: float = setting(4e-5, POSITIVE)
     behavior_learning_rate: float | None = setting(None, POSITIVE)
@@ -140,6 +149,10 @@ class DreamerLearner:
         self.losses = nn.ModuleDict(losses)
         self.optimizer = optimizer
         self.device = next(agent.parameters()).device
+        few = self.device.type == "cuda" if self.config.few_kernels is None else self.config.few_kernels
+        self._casts_once = few and bool(self.config.mixed_precision)
+        if few:
+            save_kernels(nn.ModuleList([agent, self.losses]))
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
         self.actor_waits = False
@@ -148,7 +161,8 @@ class DreamerLearner:
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(losses["actor"], "optimizer", None)
         self._rates = [group["lr"] for group in self._groups]
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-        self._compiled = torch.compile(self.compute_losses, dynamic=False) if self.config.compile else None
+        if self.config.compile:
+            agent.world_model.rssm.compile_steps()
         self._graph = self._make_graph() if self.config.cuda_graph else None
 
     @property
@@ -178,8 +192,7 @@ class DreamerLearner:
             batch: Replay records, batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``,
                 ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
             timed: Context manager by activity (``world_model``, ``imagine``, of actor and critic whether they imagine
-                or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU and without
-                ``compile``.
+                or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU.
 
         Returns:
             Scalar tensors on the device: every loss and metric of those that were computed, ``gradient_norm/<network>``
@@ -298,14 +311,19 @@ class DreamerLearner:
 
     def _backward(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
-        with self.autocast():
-            # Without a clock where it is compiled, which would break the graph in pieces.
-            metrics = self.compute_losses(batch, timed) if self._compiled is None else self._compiled(batch)
+        with self.autocast(), self._weights():
+            metrics = self.compute_losses(batch, timed)
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with timed("optimise"):
             total.backward()
             norms = self._gradient_norms()
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
+
+    def _weights(self) -> AbstractContextManager:
+        """Return the context in which the losses' layers have their weights in the type that autocast computes in."""
+        return (
+            cast_once(nn.ModuleList([self.agent, self.losses]), torch.bfloat16) if self._casts_once else nullcontext()
+        )
 
     def _gradient_norms(self) -> dict[str, Tensor]:
         """Return the norm of each network's gradient by the metric's name."""

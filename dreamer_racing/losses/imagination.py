@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.deferred import autocast_type
 from dreamer_racing.modules.rssm import RSSM
 from dreamer_racing.modules.world_model import join_features
 
@@ -42,12 +43,33 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
     Returns:
         The rollout.
     """
+    if rssm.few_kernels and not torch.is_grad_enabled():
+        return _imagine_low(rssm, actor, belief, state, horizon)
     features, actions = [join_features(belief, state)], []
     for _ in range(horizon):
         action = actor(features[-1]).sample()
         belief, state = rssm.imagine_step(belief, state, action)
         actions.append(action)
         features.append(join_features(belief, state))
+    return Imagination(torch.stack(features), torch.stack(actions))
+
+
+def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
+    """Let the policy act in the world model, with fewer kernels.
+
+    Noise is drawn ahead. Features are in the type in which autocast computes, to which every head casts them first.
+    """
+    dtype = autocast_type(belief.device.type) or belief.dtype
+    low, state = belief.to(dtype), state.to(dtype)
+    features, actions = [join_features(low, state)], []
+    noises = torch.randn(horizon, len(belief), actor.action_dim, device=belief.device)
+    blanks = low.new_zeros(horizon, len(belief), rssm.latents, rssm.classes)
+    draws = zip(noises, rssm.draw_noise(horizon, len(belief)), blanks, strict=True)
+    for of_action, of_state, blank in draws:
+        action = actor(features[-1]).sample(of_action)
+        belief, low, state = rssm.imagine_low(belief, low, state.to(dtype), action, of_state, blank)
+        actions.append(action)
+        features.append(join_features(low, state.to(dtype)))
     return Imagination(torch.stack(features), torch.stack(actions))
 
 

@@ -59,8 +59,8 @@ class DiagonalSSM(SplitInputCell):
         self.gates = nn.ModuleList(gates)
         self.mixes = nn.ModuleList(NormedLinear(width, hidden, norm) for _ in range(LAYERS - 1))
 
-    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
-        """Return the next belief; arguments as in ``DenseGRUCell.forward``."""
+    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor, low: Tensor | None = None) -> Tensor:
+        """Return the next belief; arguments as in ``DenseGRUCell.forward``, of which ``low`` is not needed."""
         return self._run(belief, state, projected_action, None)
 
     def scan(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor) -> Tensor:

@@ -112,7 +112,8 @@ class SequenceReplayConfig(ReplayConfig):
     held_out: int = setting(1, NOT_NEGATIVE)
     recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
     recent_records: int = setting(20_000, COUNT)  # how many those are
-    context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
+    # windows go on from stored latents, refreshed at each update, instead of from none; null: where batches are short
+    context: bool | None = None
 
 
 @dataclass
