@@ -16,9 +16,9 @@ time of sampling and moving a replay batch over that of the update; `memory` is 
 (resident) or of the device, GiB.
 
 With `--launches` nothing is timed: the kernels that an update would launch on a CUDA device under bfloat16 are counted
-on a CPU that stands in for it (`dreamer_racing/launches.py`), with `few_kernels` and without. Their number depends on
-T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms, which a CPU takes apart,
-count once as on CUDA. `casts` are those of them that change a type.
+on a CPU that stands in for it (`dreamer_racing/launches.py`), with `few_kernels` and without, windows beginning warm.
+Their number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms,
+which a CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
 
 With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
 all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
@@ -353,6 +353,8 @@ def count_launches(
     losses = LossConfig(world_model=loss, actor=actor)
     learner = make_dreamer(narrow, interface_of(64), losses, config, horizon=horizon, seed=0)
     data = filled_replay((2, batch[1]), "cpu").sample()
+    before = (torch.zeros(*data.batch_size, width) for width in (narrow.belief, narrow.state))
+    data["context"] = learner.latent_format.pack(*before)  # windows begin warm
     with patch.object(layers.F, "rms_norm", lambda x, shape, weight, eps: fused_rms_norm(x, weight, eps)):
         learner.update(data)  # the optimiser makes its moments
         learner.update(data)

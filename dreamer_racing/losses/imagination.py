@@ -59,18 +59,17 @@ def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizo
 
     Noise is drawn ahead. Features are in the type in which autocast computes, to which every head casts them first.
     """
-    dtype = autocast_type(belief.device.type) or belief.dtype
-    low, state = belief.to(dtype), state.to(dtype)
-    features, actions = [join_features(low, state)], []
+    shape = (horizon + 1, len(belief), belief.shape[-1] + state.shape[-1])
+    features = belief.new_zeros(shape, dtype=autocast_type(belief.device.type) or belief.dtype)
+    features[0].copy_(join_features(belief, state))
+    actions = []
     noises = torch.randn(horizon, len(belief), actor.action_dim, device=belief.device)
-    blanks = low.new_zeros(horizon, len(belief), rssm.latents, rssm.classes)
-    draws = zip(noises, rssm.draw_noise(horizon, len(belief)), blanks, strict=True)
-    for of_action, of_state, blank in draws:
-        action = actor(features[-1]).sample(of_action)
-        belief, low, state = rssm.imagine_low(belief, low, state.to(dtype), action, of_state, blank)
+    draws = zip(noises, rssm.draw_noise(horizon, len(belief)), features[:-1], features[1:], strict=True)
+    for of_action, of_state, here, following in draws:
+        action = actor(here).sample(of_action)
+        belief = rssm.imagine_low(belief, here, action, of_state, following)
         actions.append(action)
-        features.append(join_features(low, state.to(dtype)))
-    return Imagination(torch.stack(features), torch.stack(actions))
+    return Imagination(features, torch.stack(actions))
 
 
 def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:

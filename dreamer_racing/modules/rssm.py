@@ -412,25 +412,28 @@ class RSSM(nn.Module):
             for begins, goes_on, before in zip(starts, kept, latents, strict=True)
         )
 
-    def imagine_low(
-        self, belief: Tensor, low: Tensor, state: Tensor, action: Tensor, noise: Tensor, blank: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Do what ``imagine_step`` does, with every latent cast once.
+    def imagine_low(self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor) -> Tensor:
+        """Do what ``imagine_step`` does, with every latent cast once, and where it is to be.
 
         Args:
             belief: ``(N, D)``.
-            low: The same in the type that autocast computes in.
-            state: ``(N, S)`` in any type.
+            features: Belief and state in the type that autocast computes in, ``(N, F)``.
             action: ``(N, A)``.
             noise: ``(N, L, 1)``.
-            blank: Zeros ``(N, L, K)`` in the type that the state is to have.
+            following: Zeros of that type, ``(N, F)``, on which the next belief and state are written.
 
         Returns:
-            The next belief, the same in its type, and the next state.
+            The next belief, in its own type.
         """
-        belief = self.cell(belief, state, self.cell.project_action(action.clamp(-1.0, 1.0)), low)
-        low = belief.to(low.dtype)
-        return belief, low, self._sample(self.prior_logits(low), noise, blank)
+        width = belief.shape[-1]
+        action = self.cell.project_action(action.clamp(-1.0, 1.0))
+        belief = self.cell(belief, features[:, width:], action, features[:, :width])
+        low, state = following[:, :width], following[:, width:]
+        logits = self.prior_logits(low.copy_(belief))
+        sample = self._sample(logits, noise, state.unflatten(-1, (self.latents, self.classes)))
+        if not self.sampled:
+            state.copy_(sample)
+        return belief
 
     def _project_action(self, previous_action: Tensor, reset: Tensor) -> Tensor:
         """Clip, zero where ``reset`` and project actions ``(..., A)``."""
