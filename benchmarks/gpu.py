@@ -165,7 +165,7 @@ def measured(device: str, tiny: bool, *details: object) -> list[str]:
 
 def probe_jobs(device: str, tiny: bool, caches: Path) -> Commands:
     """What there is."""
-    yield "machine", 120.0, measured(device, tiny, "probe")
+    yield "machine", 300.0, measured(device, tiny, "probe")
 
 
 def env_jobs(device: str, tiny: bool, caches: Path) -> Commands:
