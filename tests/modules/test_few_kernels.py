@@ -77,7 +77,7 @@ def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(size: str) -> N
         assert all(value.dtype == torch.float32 for value in found.values())
         return float((both[0] - both[1]).norm() / both[1].norm())
 
-    assert error(few) < 1.5 * error(plain) < 0.5
+    assert error(few) < 1.5 * error(plain) < 0.9
 
 
 def test_samples_are_drawn_by_the_same_noise() -> None:
