@@ -23,7 +23,7 @@ def save_kernels(module: nn.Module) -> None:
     """Let all parts of a module that know how to do with fewer kernels do so."""
     for part in module.modules():
         if hasattr(part, "few_kernels"):
-            part.few_kernels = True
+            part.few_kernels = True  # type: ignore[assignment]  # no tensor, nor a module
 
 
 def gate_shift() -> Tensor:

@@ -149,7 +149,8 @@ class LayerNorm(nn.LayerNorm):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``(..., features)`` over its last dimension."""
-        weight, bias = self.weight, self.bias
+        weight: Tensor = self.weight
+        bias: Tensor = self.bias
         if self.of_steps is not None:
             weight, bias = (self.of_steps[name].take() for name in ("weight", "bias"))
         if inputs.device.type != "cpu":  # where one kernel takes float32 beside bfloat16
