@@ -59,7 +59,7 @@ PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
 LAUNCHES = ("size", "loss", "actor", "batch", "horizon", "few_kernels", "launches", "casts")
-NARROW = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
+NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
 IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
             "world_model_ratio", "observe", "observe_ratio", "steps")  # fmt: skip
 

@@ -11,6 +11,7 @@ import os
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 
 from composing.checks import steps_alone
 from composing.schema import DreamerConfig
@@ -101,7 +102,7 @@ def check_captured(config: DreamerConfig) -> None:
         )
 
 
-def imagines(config: DreamerConfig) -> bool:
+def imagines(config: DreamerConfig | DictConfig) -> bool:
     """Whether the actor's loss does."""
     return getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True)
 
