@@ -23,7 +23,7 @@ from measuring import print_table, write_json
 
 from dreamer_racing.training.directory import RunDirectory
 
-RECIPE = Path(__file__).parent.parent / "recipes" / "dreamer_v3.py"
+RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "least", "most", "times", "collect", "learn")
 LEARNING = ("sample", "world_model", "imagine", "optimise", "improve")
 

@@ -43,7 +43,7 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
-from dreamer_racing.training.checkpoint import CHECKSUMS
+from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
@@ -55,7 +55,7 @@ SETTINGS = [
 ]  # fmt: skip
 TO_THE_END = SETTINGS[-1]
 HALF_WAY = "total_env_steps=800"  # at an evaluation, so that this end leaves no row that a longer run has not
-CLOCKS = ("time/", "rate/", "wall_clock")  # columns that a wall clock writes
+CLOCKS = ("time/", "rate/", "wall_clock", "cpu_clock")  # columns that clocks write
 REFUSED = 2
 COUNT_CALLS = """
 import atexit, io, os, signal

@@ -25,6 +25,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, Dream
 from dreamer_racing.evaluation.evaluate import Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_trajectory
+from dreamer_racing.training.directory import RunDirectory
 
 ALGORITHMS, TRACKS = ("dreamer_v3", "ppo", "sac"), ("circle", "kidney", "figure8")
 SKILL = {"dreamer_v3": 1.0, "ppo": 0.1, "sac": 0.05}
@@ -74,22 +75,24 @@ def write_runs(folder: Path, seeds: int, env_steps: int, rows: int) -> None:
     for number, (algorithm, track) in enumerate((a, t) for a in ALGORITHMS for t in TRACKS):
         for seed in range(seeds):
             run = folder / f"{algorithm}_{track}_paper_seed{seed}"
-            write_run(run, np.random.default_rng(100 * number + seed), algorithm, track, seed, env_steps, rows)
+            write_run(
+                RunDirectory(run), np.random.default_rng(100 * number + seed), algorithm, track, seed, env_steps, rows
+            )
 
 
 def write_run(
-    run: Path, generator: np.random.Generator, algorithm: str, track: str, seed: int, env_steps: int, rows: int
+    run: RunDirectory, generator: np.random.Generator, algorithm: str, track: str, seed: int, env_steps: int, rows: int
 ) -> None:
-    """Write `config.yaml`, `metrics.csv` and what three evaluations leave."""
-    run.mkdir(parents=True)
+    """Write configuration, metrics and what three evaluations leave."""
+    run.path.mkdir(parents=True)
     config = {
         "algorithm": algorithm,
         "track": track,
         "seed": seed,
-        "run_dir": str(run),
+        "run_dir": str(run.path),
         "curriculum": {"increment": 0.001},
     }
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    run.config.write_text(yaml.safe_dump(config))
     steps = np.linspace(0, env_steps, rows + 1)[1:]
     names = ["episode/return", "evaluation/success_rate", "evaluation/gates_per_episode", "evaluation/lap_time_mean"]
     skill = 1 / (1 + np.exp(-(steps / env_steps - generator.uniform(0.2, 0.4)) * 15)) * SKILL[algorithm]
@@ -101,9 +104,9 @@ def write_run(
     weight = np.char.mod("%.8g", 0.001 * np.floor(10 * skill))
     header = ["env_steps", "curriculum/body_rate_weight", *names, *(f"other/{i}" for i in range(COLUMNS - 4))]
     lines = [",".join(row) for row in np.column_stack((np.char.mod("%d", steps), weight, cells))]
-    (run / "metrics.csv").write_text("\n".join([",".join(header), *lines]) + "\n")
+    run.metrics.write_text("\n".join([",".join(header), *lines]) + "\n")
     for share in (0.02, 0.5, 1.0):
-        stem = run / "evaluations" / f"{int(share * env_steps):09d}"
+        stem = run.evaluations / f"{int(share * env_steps):09d}"
         write_trajectory(f"{stem}_trajectory.csv", flight(track), track)
         if algorithm == "dreamer_v3":
             images = generator.integers(0, 256, (3, 1, SEEN_FRAMES + PREDICTED_FRAMES, 64, 64, 3), dtype=np.uint8)

@@ -48,7 +48,8 @@ from dreamer_racing.envs.tracks import Track, TrackError, load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.export.onnx_actor import OnnxActor, read_contract
-from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, write_checksums
+from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints
+from dreamer_racing.training.checksums import write_checksums
 from dreamer_racing.training.directory import latest_checkpoint
 
 ROOT = Path(__file__).parents[1]

@@ -297,7 +297,8 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
 
     from dreamer_racing.evaluation.course import Course
     from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-    from dreamer_racing.learners.dreamer import LearnerConfig, make_dreamer
+    from dreamer_racing.learners.dreamer import make_dreamer
+    from dreamer_racing.learners.dreamer_config import LearnerConfig
     from dreamer_racing.losses import LossConfig
 
     config = LearnerConfig(cuda_graph=device != "cpu", learning_rate=1e-3, warmup_updates=0, mixed_precision=True)

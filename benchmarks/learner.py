@@ -16,9 +16,9 @@ time of sampling and moving a replay batch over that of the update; `memory` is 
 (resident) or of the device, GiB.
 
 With `--launches` nothing is timed: the kernels that an update would launch on a CUDA device under bfloat16 are counted
-on a CPU that stands in for it (`dreamer_racing/launches.py`), with `few_kernels` and without, windows beginning warm.
-Their number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms,
-which a CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
+on a CPU that stands in for it (`learners/launches.py`), with `few_kernels` and without, windows beginning warm. Their
+number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms, which a
+CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
 
 With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
 all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
@@ -47,8 +47,9 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.launches import launches
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig, make_dreamer
+from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
+from dreamer_racing.learners.dreamer_config import LearnerConfig
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import SIZES, Interface, get_size, layers

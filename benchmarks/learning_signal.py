@@ -176,7 +176,7 @@ def starts_of(learner: DreamerLearner, replay: StreamReplay, number: int) -> tup
         batch = replay.sample()
         with torch.no_grad():
             context = learner.losses["world_model"](batch).pop("replay_context")
-        parts.append(learner._choose_starts(context, batch))
+        parts.append(learner.starts(context, batch))
     starts = cast(TensorDictBase, torch.cat(cast(Any, parts)))[:number]
     return starts["belief"], starts["state"], starts["terminated"]
 

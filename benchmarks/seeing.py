@@ -28,7 +28,7 @@ from composing.learners import size_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
-from dreamer_racing.learners.dreamer import make_optimizer
+from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Agent, ModelSize
 from dreamer_racing.modules.layers import autocast

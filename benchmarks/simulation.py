@@ -59,7 +59,7 @@ MILLISECONDS = tuple(f"{part}_ms" for part in (*PARTS, "torchrl"))
 COLUMNS = ("images", "num_envs", *MODES, "lost", "least", "actor_lost", *MILLISECONDS, "memory_gib")
 ROLLOUT = 16  # control steps in a batch
 TURNS = 5
-PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- benchmarks/simulation.py writes this -->", "<!-- end -->"
 NAMES = {
     "none": "none", "egl": "EGL (Mesa, in software)", "osmesa": "OSMesa", "warp": "ray caster, no OpenGL library",

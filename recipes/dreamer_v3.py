@@ -39,7 +39,8 @@ from torch import Tensor
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
-from dreamer_racing.learners.dreamer import DreamerLearner, make_optimizer
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Interface
@@ -55,7 +56,8 @@ SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
-  70 % of training episodes begin in flight on a planned racing line; a missed gate ends one
+  70 % of training episodes begin in flight on a planned racing line, until the hardest gate is passed; then all come
+  to begin at the start, as a race does; a missed gate ends one
   25 actions a second; the actor learns by PPO from what it flew, in the model's latents; in training a critic that
   sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""

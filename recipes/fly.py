@@ -52,7 +52,7 @@ PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
 GIF_STEPS = 300  # control steps shown if there is no second lap
 BREAK = 1.0  # s between two flights in the viewer
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
+Acting = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass
@@ -75,18 +75,18 @@ class FlyConfig:
 ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
 
 
-def scripted(track: Track, parameters: QuadrotorParameters) -> Policy:
+def scripted(track: Track, parameters: QuadrotorParameters) -> Acting:
     """Make the pilot that plans a line through the gates and follows it."""
     return PilotPolicy(ScriptedPilot(track, parameters))
 
 
-def hover(track: Track, parameters: QuadrotorParameters) -> Policy:
+def hover(track: Track, parameters: QuadrotorParameters) -> Acting:
     """Make the pilot that stays at the start."""
     still = tensor([parameters.hover_action, 0.0, 0.0, 0.0])
     return TensorDictModule(lambda position: still.repeat(len(position), 1), [("privileged", "position")], ["action"])
 
 
-PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Policy]] = {"scripted": scripted, "hover": hover}
+PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted": scripted, "hover": hover}
 
 
 @recipe("fly")
@@ -138,7 +138,7 @@ def check_display(config: FlyConfig) -> None:
 
 
 @dataclass
-class Flight:
+class PlannedFlight:
     """A race that is about to be flown."""
 
     track: str | Track  # as it was named
@@ -146,7 +146,7 @@ class Flight:
     fly: Callable[..., Evaluation]  # one episode of all laps; takes further arguments of `evaluate`
 
 
-def make_flight(config: FlyConfig) -> Flight:
+def make_flight(config: FlyConfig) -> PlannedFlight:
     """Put together who flies, and where."""
     return pilots_flight(config) if config.agent is None else agents_flight(config)
 
@@ -184,7 +184,7 @@ def in_words(episode: Episode) -> str:
     return f"{episode.outcome.replace('_', ' ')} after {episode.gates_passed} gates, laps: {laps or 'none'}"
 
 
-def pilots_flight(config: FlyConfig) -> Flight:
+def pilots_flight(config: FlyConfig) -> PlannedFlight:
     """Let a pilot fly by the true state, or somebody by hand."""
     pilot, preset = config.pilot or PILOT, config.preset or PRESET
     camera = Camera()
@@ -199,9 +199,9 @@ def pilots_flight(config: FlyConfig) -> Flight:
         env = DroneRacingEnv(config.track or TRACK, 1, preset=preset, seed=config.seed, **worlds)
     print(f"{pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {preset}")
     if pilot in KINDS:
-        return Flight(config.track or TRACK, env, partial(fly_by_hand, pilot, env))
+        return PlannedFlight(config.track or TRACK, env, partial(fly_by_hand, pilot, env))
     policy = PILOTS[pilot](env.track, env.worlds.parameters)
-    return Flight(config.track or TRACK, env, partial(evaluate, env, policy, episodes=1))
+    return PlannedFlight(config.track or TRACK, env, partial(evaluate, env, policy, episodes=1))
 
 
 def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
@@ -218,7 +218,7 @@ def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
         sticks.close()
 
 
-def agents_flight(config: FlyConfig) -> Flight:
+def agents_flight(config: FlyConfig) -> PlannedFlight:
     """Let the deterministic policy of a trained agent fly."""
     with plain_errors():
         race = EvaluateConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
@@ -233,7 +233,7 @@ def agents_flight(config: FlyConfig) -> Flight:
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     course = Course(restored.flyer.evaluation_policy(), worlds, num_envs=1)
-    return Flight(worlds["track"], course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
+    return PlannedFlight(worlds["track"], course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
 
 
 def write(directory: Path, named: str | Track, result: Evaluation) -> None:

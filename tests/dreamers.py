@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig, make_dreamer
+from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
+from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.modules import Interface, ModelSize
 

@@ -13,11 +13,14 @@ from multiprocessing import reduction
 from pathlib import Path
 from typing import Any
 
+# Not dm_control, nor OpenGL: what they draw with they choose by the environment that they are imported in.
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     [
         "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
-        "torchrl.envs", "torchrl.record",
+        "torchrl.envs", "torchrl.record", "torchrl.trainers.algorithms", "warp", "dreamer_racing.envs",
+        "dreamer_racing.figures.loggers", "dreamer_racing.figures.report", "dreamer_racing.learners.dreamer",
+        "dreamer_racing.training.run",
     ]
 )  # fmt: skip
 
@@ -45,6 +48,11 @@ class Forked:
         for read, write in pipes:
             os.close(write)
             self._said.append(self._readers.submit(_read, read))
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process."""
+        assert self.process.pid is not None
+        os.kill(self.process.pid, number)
 
     def communicate(self, timeout: float) -> subprocess.CompletedProcess[str]:
         """Wait for its end; return exit status and what it said.

@@ -22,6 +22,8 @@ from tests.forked import Forked
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
+EXPERIMENTS = ("ablation", "crutches")
+"""Configurations of `recipes/experiment.py`, beside the one of its name."""
 
 SMALL = [
     "track=circle", "model=debug", "env.num_envs=4", "prefill=400", "total_env_steps=800", "replay.capacity=4000",
@@ -42,7 +44,12 @@ def recipe(
     name: str, *overrides: str, cwd: Path, timeout: float = 240, before: str = ""
 ) -> subprocess.CompletedProcess[str]:
     """Run a recipe in a process of its own, after some lines of Python if need be."""
-    return Forked(_run, str(ROOT / "recipes" / f"{name}.py"), overrides, before, cwd=cwd).communicate(timeout)
+    return started(name, *overrides, cwd=cwd, before=before).communicate(timeout)
+
+
+def started(name: str, *overrides: str, cwd: Path, before: str = "") -> Forked:
+    """Start a recipe, as `recipe` does."""
+    return Forked(_run, str(ROOT / "recipes" / f"{name}.py"), overrides, before, cwd=cwd)
 
 
 def _run(path: str, overrides: tuple[str, ...], before: str) -> None:

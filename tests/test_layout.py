@@ -60,6 +60,19 @@ def test_no_module_imports_one_that_imports_it():
     assert [" → ".join(way) for way in circles({name: imported(name) for name in MODULES})] == []
 
 
+def wing(module: str) -> str:
+    """The folder at the package's top, or the file, that a module stands in."""
+    return ".".join(module.split(".")[:2])
+
+
+def test_no_wing_imports_one_that_imports_it():
+    wings: dict[str, set[str]] = {wing(name): set() for name in MODULES}
+    for name in MODULES:
+        wings[wing(name)] |= {wing(other) for other in imported(name)} - {wing(name)}
+    assert {"dreamer_racing.envs", "dreamer_racing.training"} <= wings.keys()
+    assert [" → ".join(way) for way in circles(wings)] == []
+
+
 def functions(folder: str) -> Iterator[tuple[str, ast.FunctionDef]]:
     """Every function of a folder's modules, with a name for messages."""
     for path in sorted((ROOT / folder).rglob("*.py")):

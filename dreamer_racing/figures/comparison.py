@@ -12,17 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dreamer_racing.figures.curves import ENDS_EARLY, QUANTITIES
-from dreamer_racing.figures.runs import REFERENCE, CurveKey, RunData, group_runs
+from dreamer_racing.figures.runs import CLOCKS, REFERENCE, CurveKey, RunData, along, group_runs
 
 LAST_SHARE = 0.2  # of the longest run of an algorithm on a track: where its variants are compared
 COMPARED = ("gates", "success_rate", "evaluation_return", "image_error")  # names out of `QUANTITIES`
 WALL_CLOCK = "wall_clock"  # column: s since the run began
-COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), WALL_CLOCK)  # of `metrics.csv`
-CAPTION = (
-    "Mean ± sample standard deviation (n − 1) over seeds, each the mean of what it logged within the last "
-    f"{100 * LAST_SHARE:.0f} % of the longest run's env_steps. Evaluations are paid at b₂ = 0."
-)
-"""What the numbers are."""
+COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), *CLOCKS.values())  # of `metrics.csv`
+FORMS = {"env_steps": ",.0f", "hours": ".2f", "core_hours": ".2f"}  # of places on an axis
 
 
 @dataclass(frozen=True)
@@ -34,14 +30,15 @@ class VariantResult:
         seeds: S, runs that reach the window.
         values: by name of ``COMPARED``, each run's mean over the window, (S,) or fewer where runs have no value there;
             without those that no run has logged.
-        window: first and last env_steps of what was averaged, common to all variants of the algorithm on the track.
+        window: first and last place on the axis of what was averaged, common to all variants of the algorithm on the
+            track.
         wall_clock: s, mean of these runs; None if none recorded it.
     """
 
     key: CurveKey
     seeds: int
     values: dict[str, np.ndarray]
-    window: tuple[int, int]
+    window: tuple[float, float]
     wall_clock: float | None
 
     @property
@@ -58,58 +55,72 @@ class Comparison:
     results: list[VariantResult]
     problems: list[str]
     """What was left out, a line each."""
+    axis: str = "env_steps"
+    """Along what runs were compared, one of `AXES`."""
+
+    @property
+    def caption(self) -> str:
+        """What the numbers are."""
+        of = f"{self.axis} that every variant has had" if self.axis in CLOCKS else "longest run's env_steps"
+        return (
+            "Mean ± sample standard deviation (n − 1) over seeds, each the mean of what it logged within the last "
+            f"{100 * LAST_SHARE:.0f} % of the {of}. Evaluations are paid at b₂ = 0."
+        )
 
 
-def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = ()) -> Comparison:
+def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis: str = "env_steps") -> Comparison:
     """Average the ends of runs over the seeds of each variant; the reference comes first, then by name.
 
-    Variants of one algorithm on one track are averaged over the same env_steps.
+    Variants of one algorithm on one track are averaged over the same part of the axis: up to the env_steps of the
+    longest run, or up to the time that every variant has had, so that none is judged by more of it than another.
 
     Args:
         runs: of any algorithms and tracks.
         problems: what was left out already.
+        axis: one of `AXES`.
 
     Raises:
         ValueError: there are no runs, or those of one variant were not configured alike.
     """
+    runs, without_clock = along(runs, axis)
     if not runs:
-        raise ValueError("there is no run to compare.")
+        raise ValueError("; ".join(without_clock) or "there is no run to compare.")
     groups = group_runs(runs)
-    longest: dict[tuple[str, str], float] = defaultdict(float)
-    for run in runs:
-        longest[run.key[:2]] = max(longest[run.key[:2]], _end(run))
-    found = list(problems)
+    ends: dict[tuple[str, str], list[float]] = defaultdict(list)  # of the longest run of each variant
+    for key, group in groups.items():
+        ends[key[:2]].append(max(map(_end, group)))
+    found = [*problems, *without_clock]
     results = []
     for key, group in groups.items():
-        last = longest[key[:2]]
+        last = min(ends[key[:2]]) if axis in CLOCKS else max(ends[key[:2]])
         first = (1 - LAST_SHARE) * last
-        found += [_ends_early(run, first, last) for run in group if _end(run) < ENDS_EARLY * last]
+        found += [_ends_early(run, first, last, axis) for run in group if _end(run) < ENDS_EARLY * last]
         results.append(_result(key, [run for run in group if _end(run) >= first], (first, last)))
     order = sorted(results, key=lambda result: (result.key[:2], not result.key.is_reference, result.key))
-    return Comparison(order, found)
+    return Comparison(order, found, axis)
 
 
 def _end(run: RunData) -> float:
     return float(run.metrics.env_steps.max(initial=0.0))
 
 
-def _ends_early(run: RunData, first: float, last: float) -> str:
-    compared = f"compared are {first:,.0f} to {last:,.0f}"
+def _ends_early(run: RunData, first: float, last: float, axis: str) -> str:
+    form = FORMS[axis]
     what = "left out" if _end(run) < first else "it counts as far as it goes"
-    return f"{run.name} ends at {_end(run):,.0f} env_steps, {compared}: {what}"
+    return f"{run.name} ends at {_end(run):{form}} {axis}, compared are {first:{form}} to {last:{form}}: {what}"
 
 
 def _result(key: CurveKey, group: Sequence[RunData], window: tuple[float, float]) -> VariantResult:
+    first, last = window
     values = {}
     for name in COMPARED:
         column = QUANTITIES[name].column
         tables = [run.metrics.columns[column] for run in group if column in run.metrics.columns]
-        late = [found[steps >= window[0]] for steps, found in tables]
+        late = [found[(steps >= first) & (steps <= last)] for steps, found in tables]
         if tables:
             values[name] = np.array([found.mean() for found in late if len(found)])
     clocks = [run.metrics.columns[WALL_CLOCK][1][-1] for run in group if WALL_CLOCK in run.metrics.columns]
-    clock = float(np.mean(clocks)) if clocks else None
-    return VariantResult(key, len(group), values, (round(window[0]), round(window[1])), clock)
+    return VariantResult(key, len(group), values, window, float(np.mean(clocks)) if clocks else None)
 
 
 def comparison_table(comparison: Comparison) -> str:
@@ -117,15 +128,15 @@ def comparison_table(comparison: Comparison) -> str:
     results = comparison.results
     shown = [name for name in COMPARED if any(name in result.values for result in results)]
     labels = [QUANTITIES[name].label for name in shown]
-    headings = ["algorithm", "track", "variant", "seeds", "env_steps", *labels, "wall clock"]
+    headings = ["algorithm", "track", "variant", "seeds", comparison.axis, *labels, "wall clock"]
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     for result in results:
         clock = "" if result.wall_clock is None else f"{result.wall_clock / 60:.1f} min"
-        window = f"{result.window[0]:,}–{result.window[1]:,}"
+        window = "–".join(f"{place:{FORMS[comparison.axis]}}" for place in result.window)
         cells = [result.key.algorithm, result.key.track, result.name, str(result.seeds), window]
         cells += [_cell(result.values.get(name, np.empty(0)), result.seeds) for name in shown]
         lines.append(f"| {' | '.join([*cells, clock])} |")
-    lines += ["", CAPTION]
+    lines += ["", comparison.caption]
     if comparison.problems:
         lines += ["", *(f"- {problem}" for problem in comparison.problems)]
     return "\n".join([*lines, ""])

@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dreamer_racing.figures.runs import CurveKey, RunData, group_runs
+from dreamer_racing.figures.runs import AXES, CLOCKS, CurveKey, RunData, along, group_runs
 
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
+SMALLEST_WINDOW = (1.0, 1e-6)  # env_steps, hours
 GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
 ENDS_EARLY = 0.98  # of the longest run of a curve: one that ends before is mentioned
 WEIGHT = "curriculum/body_rate_weight"
@@ -27,7 +28,7 @@ ALL_TRACKS = "all tracks"
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something to draw over env_steps."""
+    """Something to draw while a run goes on."""
 
     label: str
     column: str
@@ -67,7 +68,8 @@ class Curve:
 
     key: CurveKey
     quantity: str
-    env_steps: np.ndarray
+    x: np.ndarray
+    """Along the figure's axis."""
     centre: np.ndarray
     low: np.ndarray
     """NaN, like `high`, where there is a single seed."""
@@ -82,25 +84,30 @@ class LearningCurves:
 
     curves: list[Curve]
     raises: dict[CurveKey, np.ndarray]
-    """env_steps at which the curriculum raised b₂, of all seeds together."""
+    """Where on the axis the curriculum raised b₂, of all seeds together."""
     aggregate: str
     window: float
-    """Of the running mean, env_steps."""
+    """Of the running mean, in units of the axis."""
     problems: list[str]
     """What was left out, a line each."""
+    axis: str = "env_steps"
+    """One of `AXES`."""
 
 
-def wanted_columns(quantities: Sequence[str]) -> list[str]:
-    """Name the columns of `metrics.csv` that some quantities are drawn from.
+def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[str]:
+    """Name the columns of `metrics.csv` that some quantities are drawn from along an axis.
 
     Raises:
-        ValueError: unknown quantity.
+        ValueError: unknown quantity or axis.
     """
+    if axis not in AXES:
+        raise ValueError(f"axis={axis}: there are {', '.join(AXES)}.")
     for name in quantities:
         if name not in QUANTITIES:
             raise ValueError(f"quantities={name}: there are {', '.join(QUANTITIES)}.")
     columns = [QUANTITIES[name].column for name in quantities]
-    return [*dict.fromkeys([*columns, *(name for column in columns for name in _presence(column)), WEIGHT])]
+    clock = [CLOCKS[axis]] if axis in CLOCKS else []
+    return [*dict.fromkeys([*columns, *(name for column in columns for name in _presence(column)), WEIGHT, *clock])]
 
 
 def _presence(column: str) -> list[str]:
@@ -115,29 +122,34 @@ def learning_curves(
     aggregate: str = "mean",
     window: float | None = None,
     problems: Sequence[str] = (),
+    axis: str = "env_steps",
 ) -> LearningCurves:
-    """Aggregate runs over seeds on a common axis of env_steps.
+    """Aggregate runs over seeds on a common axis.
 
     Args:
         runs: of any algorithms and tracks.
         quantities: names out of `QUANTITIES`.
         aggregate: ``mean`` (with the sample standard deviation) or ``iqm`` (interquartile mean with a 95 % interval).
-        window: of the running mean, env_steps; None for 2 % of the longest run.
+        window: of the running mean, in units of the axis; None for 2 % of the longest run.
         problems: what was left out already.
+        axis: one of `AXES`.
 
     Raises:
         ValueError: no runs, an unknown name, or runs of one curve that were not configured alike.
     """
-    wanted_columns(quantities)
+    wanted_columns(quantities, axis)
     if aggregate not in AGGREGATES:
         raise ValueError(f"aggregate={aggregate}: there are {', '.join(AGGREGATES)}.")
     if not runs:
         raise ValueError(f"there is no run to draw. {'; '.join(problems) or 'None was given.'}")
+    runs, without_clock = along(runs, axis)
+    if not runs:
+        raise ValueError(f"axis={axis}: {'; '.join(without_clock)}.")
     groups = group_runs(runs)
     longest = max(run.metrics.env_steps.max(initial=0) for run in runs)
-    width = float(max(window if window is not None else WINDOW_SHARE * longest, 1.0))
+    width = float(max(window if window is not None else WINDOW_SHARE * longest, SMALLEST_WINDOW[axis in CLOCKS]))
     grid = np.linspace(0.0, longest, POINTS)
-    missing, curves = [*problems, *_short_runs(groups)], []
+    missing, curves = [*problems, *without_clock, *_short_runs(groups, axis)], []
     for name in quantities:
         sampled: dict[CurveKey, Sampled] = {}
         for key, group in groups.items():
@@ -156,7 +168,7 @@ def learning_curves(
     if not curves:
         raise ValueError(f"no run has values of {', '.join(quantities)}. {'; '.join(missing)}")
     raises = {key: np.concatenate([weight_raises(run) for run in group]) for key, group in groups.items()}
-    return LearningCurves(curves, raises, aggregate, width, missing)
+    return LearningCurves(curves, raises, aggregate, width, missing, axis)
 
 
 class Sampled(NamedTuple):
@@ -310,38 +322,42 @@ def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
     return {key: strata for key, strata in pooled.items() if len(strata) == len(tracks) > 1}
 
 
-def _short_runs(groups: dict[CurveKey, list[RunData]]) -> list[str]:
+def _short_runs(groups: dict[CurveKey, list[RunData]], axis: str) -> list[str]:
     """Mention the runs that end before the others of their curve do."""
-    lines = []
+    lines, form = [], ",.2f" if axis in CLOCKS else ",.0f"
     for group in groups.values():
         ends = [run.metrics.env_steps.max(initial=0) for run in group]
         lines += [
-            f"{run.name} ends at {end:,.0f} of {max(ends):,.0f} env_steps: fewer seeds from there"
+            f"{run.name} ends at {end:{form}} of {max(ends):{form}} {axis}: fewer seeds from there"
             for run, end in zip(group, ends, strict=True)
             if end < ENDS_EARLY * max(ends)
         ]
     return lines
 
 
-_COLUMNS = ("quantity", "track", "algorithm", "variant", "env_steps", "centre", "low", "high", "seeds")
+_KEYS = ("quantity", "track", "algorithm", "variant")
+_VALUES = ("centre", "low", "high", "seeds")
 _RAISE = "b2_raised"  # in the column quantity, of rows that have no value
 
 
 def write_curves(path: str | Path, curves: LearningCurves) -> None:
-    """Write curves as one CSV file, a row a point, under lines with `#` that say how they were made."""
+    """Write curves as one CSV file, a row a point, under lines with `#` that say how they were made.
+
+    Columns: `quantity`, `track`, `algorithm`, `variant`, one named as the axis, `centre`, `low`, `high`, `seeds`.
+    """
+    form = ".6g" if curves.axis in CLOCKS else ".0f"
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         file.write(f"# aggregate: {curves.aggregate}\n# window: {curves.window!r}\n")
         file.writelines(f"# problem: {problem}\n" for problem in curves.problems)
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
+        writer.writerow((*_KEYS, curves.axis, *_VALUES))
         for curve in curves.curves:
-            numbers = zip(curve.env_steps, curve.centre, curve.low, curve.high, curve.seeds, strict=True)
-            for steps, *values, seeds in numbers:
+            for x, *values, seeds in zip(curve.x, curve.centre, curve.low, curve.high, curve.seeds, strict=True):
                 cells = [f"{value:.6g}" if math.isfinite(value) else "" for value in values]
-                writer.writerow((curve.quantity, *curve.key, f"{steps:.0f}", *cells, seeds))
-        for key, steps in curves.raises.items():
-            writer.writerows((_RAISE, *key, f"{step:.0f}", "", "", "", "") for step in steps)
+                writer.writerow((curve.quantity, *curve.key, f"{x:{form}}", *cells, seeds))
+        for key, raises in curves.raises.items():
+            writer.writerows((_RAISE, *key, f"{x:{form}}", "", "", "", "") for x in raises)
 
 
 def read_curves(path: str | Path) -> LearningCurves:
@@ -355,18 +371,20 @@ def read_curves(path: str | Path) -> LearningCurves:
     notes = [line[2:].rstrip("\n").partition(": ") for line in lines if line.startswith("# ")]
     head = {name: text for name, _, text in notes if name != "problem"}
     reader = csv.DictReader(line for line in lines if not line.startswith("#"))
-    if tuple(reader.fieldnames or ()) != _COLUMNS or head.keys() != {"aggregate", "window"}:
+    names = tuple(reader.fieldnames or ())
+    axis = next((name for name in AXES if names == (*_KEYS, name, *_VALUES)), None)
+    if axis is None or head.keys() != {"aggregate", "window"}:
         raise ValueError(f"{path} holds no learning curves: they are written by recipes/plot.py.")
     rows: dict[tuple[str, CurveKey], list[list[float]]] = defaultdict(list)
     for row in reader:
         key = CurveKey(row["track"], row["algorithm"], row["variant"])
-        rows[row["quantity"], key].append([float(row[name] or "nan") for name in _COLUMNS[4:]])
-    tables = {names: np.array(values).T for names, values in rows.items()}  # (5, P)
+        rows[row["quantity"], key].append([float(row[name] or "nan") for name in (axis, *_VALUES)])
+    tables = {curve: np.array(values).T for curve, values in rows.items()}  # (5, P)
     curves = [
-        Curve(key, quantity, env_steps, centre, low, high, seeds.astype(int))
-        for (quantity, key), (env_steps, centre, low, high, seeds) in tables.items()
+        Curve(key, quantity, x, centre, low, high, seeds.astype(int))
+        for (quantity, key), (x, centre, low, high, seeds) in tables.items()
         if quantity != _RAISE
     ]
     raises = {key: table[0] for (quantity, key), table in tables.items() if quantity == _RAISE}
     problems = [text for name, _, text in notes if name == "problem"]
-    return LearningCurves(curves, raises, head["aggregate"], float(head["window"]), problems)
+    return LearningCurves(curves, raises, head["aggregate"], float(head["window"]), problems, axis)

@@ -9,9 +9,9 @@ from typing import Any
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.figures.dashboard import LOOPBACK, quiet_server
 from dreamer_racing.figures.dashboard_panel import (
-    QUANTITIES,
     SHEET_COLUMNS,
     STYLE,
+    TRACES,
     ShownFlight,
     beside,
     duration,
@@ -87,14 +87,14 @@ def positions(rows: Sequence[int], share: float) -> str:
 
 
 def number_table(track: Track, flights: Sequence[ShownFlight], rows: Sequence[int]) -> str:
-    """Return lap, gate and every quantity of each flight at its row, as a table."""
+    """Return lap, gate and every trace of each flight at its row, as a table."""
     columns = []
     for (_, trajectory), paint, row in zip(flights, paints(len(flights)), rows, strict=True):
         cells = list(state_words(track, trajectory)[row])
-        for quantity in QUANTITIES:
-            values = quantity.values(trajectory)
-            cells.append("–" if values is None or row >= len(values) else f"{values[row]:.2f} {quantity.unit}")
+        for trace in TRACES:
+            values = trace.values(trajectory)
+            cells.append("–" if values is None or row >= len(values) else f"{values[row]:.2f} {trace.unit}")
         columns.append([f'<td style="color: {paint.color}">{cell}</td>' for cell in cells])
-    names = ("lap", "gate", "", *(quantity.name for quantity in QUANTITIES))
+    names = ("lap", "gate", "", *(trace.name for trace in TRACES))
     lines = (f"<tr><th>{name}</th>{''.join(cells)}</tr>" for name, *cells in zip(names, *columns, strict=True))
     return f'<table class="numbers">{"".join(lines)}</table>'

@@ -43,7 +43,7 @@ class ShownFlight(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Trace:
     """Something that is drawn over time."""
 
     name: str
@@ -60,13 +60,13 @@ def command(channel: int) -> Callable[[Trajectory], np.ndarray]:
     return lambda flight: offset + scale * flight.action[:, channel].clamp(-1.0, 1.0).numpy()
 
 
-QUANTITIES = (
-    Quantity("speed", "m/s", lambda flight: flight.speed.numpy()),
-    Quantity("thrust", "m/s²", command(0)),
-    Quantity("roll rate", "rad/s", command(1)),
-    Quantity("pitch rate", "rad/s", command(2)),
-    Quantity("yaw rate", "rad/s", command(3)),
-    Quantity("value", "return expected", lambda flight: None if flight.value is None else flight.value.numpy()),
+TRACES = (
+    Trace("speed", "m/s", lambda flight: flight.speed.numpy()),
+    Trace("thrust", "m/s²", command(0)),
+    Trace("roll rate", "rad/s", command(1)),
+    Trace("pitch rate", "rad/s", command(2)),
+    Trace("yaw rate", "rad/s", command(3)),
+    Trace("value", "return expected", lambda flight: None if flight.value is None else flight.value.numpy()),
 )
 """The curves of a page: speed, the actor's four commands, and what its critic expected."""
 
@@ -103,9 +103,9 @@ def readings(track: Track, flights: Sequence[ShownFlight]) -> dict[str, Any]:
                 "control_dt": flight.trajectory.control_dt,
                 "words": state_words(track, flight.trajectory),
                 "values": {
-                    quantity.name: [_number(value) for value in values.tolist()]
-                    for quantity in QUANTITIES
-                    if (values := quantity.values(flight.trajectory)) is not None
+                    trace.name: [_number(value) for value in values.tolist()]
+                    for trace in TRACES
+                    if (values := trace.values(flight.trajectory)) is not None
                 },
             }
             for flight in flights
@@ -189,11 +189,11 @@ def _state(track: Track, shown: Sequence[tuple[ShownFlight, Paint]]) -> str:
 
 
 def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
-    """Yield the curves of each quantity that at least one flight has, one below the other, and their time axis."""
+    """Yield the curves of each trace that at least one flight has, one below the other, and their time axis."""
     longest = duration([flight.trajectory for flight, _ in shown])
     passes = "".join(_passes(flight.trajectory, paint, longest) for flight, paint in shown)
-    for quantity in QUANTITIES:
-        series = [quantity.values(flight.trajectory) for flight, _ in shown]
+    for trace in TRACES:
+        series = [trace.values(flight.trajectory) for flight, _ in shown]
         finite = np.concatenate([values[np.isfinite(values)] for values in series if values is not None] or [[]])
         if not len(finite):
             continue
@@ -206,10 +206,10 @@ def _curves(shown: Sequence[tuple[ShownFlight, Paint]]) -> Iterator[str]:
                 stretches = _points(values, flight.trajectory.control_dt / longest, *frame)
                 lines += [f'<polyline points="{points}" stroke="{paint.color}"/>' for points in stretches]
                 now.append(
-                    f'<output data-value="{index}" data-of="{quantity.name}" style="--color: {paint.color}"></output>'
+                    f'<output data-value="{index}" data-of="{trace.name}" style="--color: {paint.color}"></output>'
                 )
         yield (
-            f'<div class="curve"><div class="name">{quantity.name} <small>{quantity.unit}</small>'
+            f'<div class="curve"><div class="name">{trace.name} <small>{trace.unit}</small>'
             f"{''.join(reversed(now))}</div>"
             f'<div class="range"><span>{high:.3g}</span><span>{low:.3g}</span></div>'
             f'<svg viewBox="0 0 {CURVE_WIDTH:g} {CURVE_HEIGHT:g}" preserveAspectRatio="none">'

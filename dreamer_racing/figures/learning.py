@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
+from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Curve, LearningCurves
 from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
-from dreamer_racing.figures.runs import CurveKey
+from dreamer_racing.figures.runs import CLOCKS, CurveKey
 
 ALGORITHMS = {"dreamer_v3": ("DreamerV3", "#1c7ed6"), "ppo": ("PPO", "#f76707"), "sac": ("SAC", "#e03131")}
 """Names and the paper's colours; another algorithm is drawn in grey under its own name."""
@@ -36,6 +36,7 @@ BANDS = {
     "mean": ("mean", "sample standard deviation (n − 1)"),
     "iqm": ("interquartile mean", "95 % bootstrap interval"),
 }
+AXIS_LABELS = {"env_steps": "env_steps", "hours": "hours", "core_hours": "hours of one core"}
 DRAWN = ("gates", "evaluation_return")  # panels of the comparison
 Styles = dict[CurveKey, dict[str, Any]]
 COUNT_ROOM = 0.12  # of an axis: right of the longest bar, for its n
@@ -86,8 +87,10 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
             _draw_raises(axes, curves, track, styles)
             if column == 0:
                 axes.set_ylabel(QUANTITIES[quantity].label.replace(" (", "\n("), color=INK)
+            if curves.axis not in CLOCKS:
+                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             if row == len(quantities) - 1:
-                axes.set_xlabel("env_steps", color=INK)
+                axes.set_xlabel(AXIS_LABELS[curves.axis], color=INK)
     handles = [Line2D([], [], label=labels[key], **styles[key]) for key in keys]
     if any(map(len, curves.raises.values())):
         tick: dict[str, Any] = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
@@ -97,25 +100,24 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
 
 
 def _end(curves: LearningCurves, track: str) -> float:
-    """Return the env_steps up to which there are values on a track, of any quantity: panels of a column share it."""
+    """Return up to where on the axis there are values on a track, of any quantity: panels of a column share it."""
     own = [curve for curve in curves.curves if curve.key.track == track and curve.seeds.any()]
-    return max((float(curve.env_steps[curve.seeds > 0].max()) for curve in own), default=0.0) or 1.0
+    return max((float(curve.x[curve.seeds > 0].max()) for curve in own), default=0.0) or 1.0
 
 
 def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float) -> None:
     for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
         line = styles[curve.key._replace(track="")]
         if curve.key.is_reference or not _crowded(curve.key, styles):
-            axes.fill_between(curve.env_steps, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
-        axes.plot(curve.env_steps, curve.centre, **line)
+            axes.fill_between(curve.x, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
+        axes.plot(curve.x, curve.centre, **line)
         drawn = np.isfinite(curve.centre)
-        if drawn.any() and np.ptp(curve.env_steps[drawn]) < SHORTEST_LINE * end:
+        if drawn.any() and np.ptp(curve.x[drawn]) < SHORTEST_LINE * end:
             last = np.flatnonzero(drawn)[-1:]
-            axes.plot(curve.env_steps[last], curve.centre[last], "o", color=line["color"], clip_on=False)
+            axes.plot(curve.x[last], curve.centre[last], "o", color=line["color"], clip_on=False)
     if not curves:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color=MUTED)
         axes.set_yticks([])
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlim(0.0, end)
     if curves:
@@ -163,8 +165,11 @@ def _caption(curves: LearningCurves, styles: Styles) -> str:
     """Say what was aggregated how, and of what the band is drawn."""
     centre, band = BANDS[curves.aggregate]
     of = " of the default alone" if any(_crowded(key, styles) for key in styles) else ""
-    window = EngFormatter(sep="")(float(f"{curves.window:.2g}"))  # 24k, 1.5M
-    return f"{centre} over seeds, and {band}{of} (none of one seed); running mean over {window} env_steps"
+    window = f"{curves.window:.2g}"
+    if curves.axis not in CLOCKS:
+        window = EngFormatter(sep="")(float(window))  # 24k, 1.5M
+    over = f"running mean over {window} {AXIS_LABELS[curves.axis]}"
+    return f"{centre} over seeds, and {band}{of} (none of one seed); {over}"
 
 
 def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
@@ -186,8 +191,8 @@ def _seed_count(curves: LearningCurves, key: CurveKey) -> str:
 
 def _seeds_at_the_end(curve: Curve) -> int:
     """Count the seeds a little before the last value, since runs do not end with the same step."""
-    end = ENDS_EARLY * curve.env_steps[curve.seeds > 0].max(initial=0.0)
-    return int(curve.seeds[np.searchsorted(curve.env_steps, end, "right") - 1])
+    end = ENDS_EARLY * curve.x[curve.seeds > 0].max(initial=0.0)
+    return int(curve.seeds[np.searchsorted(curve.x, end, "right") - 1])
 
 
 def _label(key: CurveKey) -> str:
@@ -274,9 +279,8 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
     names = [" ".join([*(result.key[:2][::-1] if several else ()), result.name]) for result in results]
     panels[0].set_yticks(np.arange(len(results)), names)
     panels[0].invert_yaxis()
-    figure.supxlabel(
-        textwrap.fill(CAPTION, int(NOTE_LETTERS * figure.get_figwidth())), x=0.01, ha="left", fontsize=8, color=MUTED
-    )
+    caption = textwrap.fill(comparison.caption, int(NOTE_LETTERS * figure.get_figwidth()))
+    figure.supxlabel(caption, x=0.01, ha="left", fontsize=8, color=MUTED)
     save(figure, path, comparison.problems)
 
 

@@ -10,11 +10,12 @@ import re
 import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import yaml
 
 from dreamer_racing.training.directory import RunDirectory
@@ -32,6 +33,10 @@ SAME_CURVE = (
 )  # fmt: skip
 """Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
 IN_KEY = ("algorithm", "track")  # settings that every key names anyway
+CLOCKS = {"hours": "wall_clock", "core_hours": "cpu_clock"}
+"""Columns of `metrics.csv`, s since a run began, by the axis that is read off them."""
+AXES = ("env_steps", *CLOCKS)
+"""Along what curves may be drawn."""
 
 
 class CurveKey(NamedTuple):
@@ -205,6 +210,35 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
                     f"seed: {first.seed} in both. Plot one of them."
                 )
     return groups
+
+
+def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]:
+    """Count what runs have measured by a clock instead of by env_steps.
+
+    Args:
+        runs: with the clock's column.
+        axis: one of `AXES`; what is called env_steps in the runs returned is hours for two of them.
+
+    Returns:
+        The runs, and a line for each that is left out, since it has not recorded that clock.
+    """
+    if axis not in CLOCKS:
+        return list(runs), []
+    kept, problems = [], []
+    for run in runs:
+        if (clock := run.metrics.columns.get(CLOCKS[axis])) is None:
+            problems.append(f"{run.name} left out: it has no {CLOCKS[axis]}, which {axis} are read off")
+            continue
+        hours = _hours(*clock)
+        columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}
+        metrics = replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))
+        kept.append(replace(run, metrics=metrics))
+    return kept, problems
+
+
+def _hours(steps: np.ndarray, seconds: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what turns env_steps into hours, between the readings of a clock."""
+    return lambda env_steps: np.interp(env_steps, steps, seconds / 3600.0)
 
 
 def first_of_each_curve(runs: Sequence[RunData]) -> list[RunData]:

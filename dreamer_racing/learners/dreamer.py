@@ -1,4 +1,4 @@
-"""The DreamerV3 learner: networks, losses, optimiser, and one update.
+"""The DreamerV3 learner: one update of networks by losses and an optimiser.
 
 Shape legend: B batch, T time, A action.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from typing import Any, cast
 
 import torch
@@ -17,96 +17,24 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep
+from dreamer_racing.learners.dreamer_config import LearnerConfig
+from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
-from dreamer_racing.losses.contract import require_keys
+from dreamer_racing.losses.contract import require_keys, set_number
+from dreamer_racing.losses.imagination import choose_starts
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.cast_weights import cast_once
-from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.few_kernels import save_kernels
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, check_settings, setting
+from dreamer_racing.settings import check_settings
 from dreamer_racing.training import parallel
-
-
-@dataclass
-class LearnerConfig:
-    """Numbers of an update, beside those of its losses.
-
-    Attributes:
-        imagination_starts: Imagine from a random subset of so many records of the batch; None from all of them.
-        imagine_recent: Imagine from the batch's newest windows only, as far as they go, so that the actor learns where
-            it flies now; the batch must say which they are (``recent``), as the replay does.
-        average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
-            None keeps none.
-        slow_critic_rate: Fraction by which the slow critic moves at each update.
-        compile: Compile the arithmetic of the recurrent cell with ``torch.compile``, instead of what ``few_kernels``
-            does there.
-        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
-            whether the run can, is False.
-        few_kernels: Round elsewhere, where that saves kernels: weights are cast once an update instead of at every use
-            (with ``mixed_precision``), gradients of gains and biases are summed after the loop over T. None: on a CUDA
-            device, where a small kernel's launch takes longer than its work.
-        mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
-            which the recipes replace by what the device does well, is False.
-        learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
-        behavior_learning_rate: Of actor and critic; None for the same. A lower one lets the world model get ahead of
-            the policy that exploits its mistakes; the 2023 code had 1e-4 and 3e-5.
-        warmup_updates: Updates over which the learning rate rises from zero.
-
-    Reference: danijar/dreamerv3, ``configs.yaml``.
-    """
-
-    imagination_starts: int | None = setting(None, COUNT)
-    imagine_recent: bool = False
-    average_rate: float | None = setting(None, POSITIVE_SHARE)
-    slow_critic_rate: float = setting(0.02, SHARE)
-    compile: bool = False
-    cuda_graph: bool | None = None
-    few_kernels: bool | None = None
-    mixed_precision: bool | None = None
-    learning_rate: float = setting(4e-5, POSITIVE)
-    behavior_learning_rate: float | None = setting(None, POSITIVE)
-    warmup_updates: int = setting(1000, NOT_NEGATIVE)
-
-
-ParameterGroups = list[dict[str, Any]]
-"""Parameters with their learning rates: ``[{"params": [...], "lr": ...}, ...]``."""
-
-
-def make_optimizer(agent: Agent, losses: Mapping[str, LossModule], config: LearnerConfig) -> torch.optim.Optimizer:
-    """Make the 2025 reference's optimiser, LaProp with adaptive gradient clipping.
-
-    Its first group is the world model, its second actor and critic, each with what their losses have of their own; an
-    actor that its loss steps is in none.
-    """
-    from torchrl.trainers.algorithms import DreamerV3Optimizer
-
-    networks = trained_parameters(agent, losses)
-    rate = config.learning_rate
-    actor = [] if getattr(losses["actor"], "optimizer", None) is not None else networks["actor"]
-    groups: ParameterGroups = [
-        {"params": networks["world_model"], "lr": rate},
-        {"params": actor + networks["critic"], "lr": config.behavior_learning_rate or rate},
-    ]
-    return DreamerV3Optimizer(groups, lr=rate, warmup_steps=config.warmup_updates)
-
-
-def trained_parameters(agent: Agent, losses: Mapping[str, LossModule]) -> dict[str, list[nn.Parameter]]:
-    """Return the parameters of each network, with those that its loss has of its own."""
-    networks = dict(agent.named_children())
-    shared = set(agent.parameters())
-    own = {name: [p for p in loss.parameters() if p not in shared] for name, loss in losses.items()}
-    return {
-        name: [p for p in (*network.parameters(), *own[name]) if p.requires_grad] for name, network in networks.items()
-    }
-
 
 ACTOR_NUMBERS = ("horizon", "discount", "continuation")
 """What is read off an actor's loss, as `ActorLoss` has it."""
@@ -273,23 +201,11 @@ class DreamerLearner:
         if kl_target is not None:
             numbers["kl_target"] = kl_target
         for name, value in numbers.items():
-            self._set_in_losses(name, value)
+            set_number(self.losses.values(), name, value)
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
             if bound is not None:
                 for agent in (self.agent, self.flying_agent):
                     agent.actor.get_buffer(name).fill_(bound)
-
-    def _set_in_losses(self, name: str, value: float) -> None:
-        """Set a number of all losses that have it: a scalar in place, a plain number or None anew."""
-        numbers = (Tensor, float, int, type(None))
-        if not (having := [loss for loss in self.losses.values() if isinstance(getattr(loss, name, ""), numbers)]):
-            losses = ", ".join(type(loss).__name__ for loss in self.losses.values())
-            raise ValueError(f"adjust({name}=...): none of {losses} has a number of that name that could move.")
-        for loss in having:
-            if isinstance(present := getattr(loss, name), Tensor):
-                present.fill_(value)
-            else:
-                setattr(loss, name, value)
 
     def check_finite(self) -> None:
         """Wait for the latest updates, so that nothing bad is saved.
@@ -316,7 +232,7 @@ class DreamerLearner:
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with timed("optimise"):
             total.backward()
-            norms = self._gradient_norms()
+            norms = gradient_norms(self._networks)
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
 
     def _weights(self) -> AbstractContextManager:
@@ -324,14 +240,6 @@ class DreamerLearner:
         return (
             cast_once(nn.ModuleList([self.agent, self.losses]), torch.bfloat16) if self._casts_once else nullcontext()
         )
-
-    def _gradient_norms(self) -> dict[str, Tensor]:
-        """Return the norm of each network's gradient by the metric's name."""
-        return {
-            f"gradient_norm/{name}": _gradient_norm(parameters)
-            for name, parameters in self._networks.items()
-            if any(parameter.grad is not None for parameter in parameters)  # none, where the actor steps alone
-        }
 
     def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
         """Turn gradients and metrics of this process's share of the batch into those of the joint batch.
@@ -343,7 +251,7 @@ class DreamerLearner:
         with timed("exchange"):
             networks = (parameter for parameters in self._networks.values() for parameter in parameters)
             metrics = parallel.average_gradients(networks, metrics)
-            return metrics | self._gradient_norms()
+            return metrics | gradient_norms(self._networks)
 
     def compute_losses(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""
@@ -360,7 +268,7 @@ class DreamerLearner:
         replay.update(context)
         if not self.imagines:
             return dict(self.losses["critic"](replay).items())
-        imagined: TensorDict = self.losses["actor"](self._choose_starts(context, batch))
+        imagined: TensorDict = self.losses["actor"](self.starts(context, batch))
         imagination = imagined.pop("imagination")
         if self.config.imagination_starts is None:
             # Every record was a start: its first imagined return is a better value than the critic's.
@@ -378,7 +286,13 @@ class DreamerLearner:
 
     def judge(self) -> Judge:
         """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
-        return getattr(self.losses["actor"], "judge", None) or judge_latents(self.flying_agent.critic)
+        return getattr(self.losses["actor"], "judge", None) or self._judge_latents
+
+    @torch.no_grad()
+    def _judge_latents(self, acted: TensorDictBase) -> Tensor:
+        """Return what the critic makes of the latents that `DreamerPolicy` has updated by what it saw, ``(N, 1)``."""
+        after = acted["next"].select("belief", "state").to(self.device)
+        return self.flying_agent.critic.value(join_features(after["belief"], after["state"]))
 
     @property
     def latent_format(self) -> LatentFormat:
@@ -422,9 +336,9 @@ class DreamerLearner:
                 changed then.
         """
         self.adopt(state_dict)
-        _restore(self.optimizer, state_dict["optimizer"])
+        restore(self.optimizer, state_dict["optimizer"])
         if self._actor_optimizer is not None:
-            _restore(self._actor_optimizer, state_dict["actor_optimizer"])
+            restore(self._actor_optimizer, state_dict["actor_optimizer"])
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> None:
@@ -441,25 +355,17 @@ class DreamerLearner:
             self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
 
     @property
-    def _groups(self) -> ParameterGroups:
+    def _groups(self) -> list[dict[str, Any]]:
+        """Parameters with their learning rates, of all optimisers."""
         own = [] if self._actor_optimizer is None else self._actor_optimizer.param_groups
         return [*self.optimizer.param_groups, *own]
 
-    def _choose_starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
-        """Return the latents ``[N]`` to imagine from, with their ``terminated``."""
-        starts = TensorDict(
-            {"belief": context.get("belief"), "state": context.get("state"), "terminated": batch.get("terminated")},
-            batch.batch_size,
-        )
-        starts = starts.detach().flatten()
-        if self.config.imagination_starts is None:
-            return starts
-        order = torch.rand(len(starts), device=self.device)
+    def starts(self, context: TensorDictBase, batch: TensorDictBase) -> TensorDict:
+        """Return the latents ``[N]`` that imagination begins from, of those of a batch, with their ``terminated``."""
         if self.config.imagine_recent:
             require_keys(self, batch, ["recent"])
-            order = order + batch.get("recent").flatten()
-        # Not randperm, which a CUDA graph cannot capture.
-        return starts[order.topk(self._number_of_starts(batch)).indices]
+        recent = batch["recent"] if self.config.imagine_recent else None
+        return choose_starts(context, batch["terminated"], self.config.imagination_starts, recent)
 
     def _number_of_starts(self, batch: TensorDictBase) -> int:
         """Return how many records of a batch ``[B, T]`` imagination begins from."""
@@ -499,27 +405,3 @@ def make_dreamer(
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std, losses.max_std).to(device)
         modules = make_losses(agent, losses, horizon)
     return DreamerLearner(agent, modules, make_optimizer(agent, modules, config), config)
-
-
-def judge_latents(critic: Critic) -> Judge:
-    """Return what a critic makes of the latents that `DreamerPolicy` has updated by what it saw."""
-
-    @torch.no_grad()
-    def value(acted: TensorDictBase) -> Tensor:
-        after = acted["next"].select("belief", "state").to(next(critic.parameters()).device)
-        return critic.value(join_features(after["belief"], after["state"]))
-
-    return value
-
-
-def _restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Restore an optimiser's state, but not its settings: a run may go on with other rates, or on another device."""
-    names = {"lr", "warmup_steps", "fused"}
-    own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
-    groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
-    optimizer.load_state_dict({**state, "param_groups": groups})
-
-
-def _gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
-    """Return the global norm of the gradients, a scalar."""
-    return nn.utils.get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 
 def require_keys(loss: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
@@ -30,3 +30,20 @@ def require_keys(loss: object, tensordict: TensorDictBase, keys: Iterable[Nested
 def scheduled(value: float) -> nn.Buffer:
     """Return a number that may change between updates, as a scalar that a captured CUDA graph reads anew each time."""
     return nn.Buffer(torch.tensor(float(value)), persistent=False)
+
+
+def set_number(losses: Collection[nn.Module], name: str, value: float) -> None:
+    """Set a number of all losses that have it, from their next use on: a scalar in place, a plain number or None anew.
+
+    Raises:
+        ValueError: If none has a number of that name.
+    """
+    numbers = (Tensor, float, int, type(None))
+    if not (having := [loss for loss in losses if isinstance(getattr(loss, name, ""), numbers)]):
+        kinds = ", ".join(type(loss).__name__ for loss in losses)
+        raise ValueError(f"adjust({name}=...): none of {kinds} has a number of that name that could move.")
+    for loss in having:
+        if isinstance(present := getattr(loss, name), Tensor):
+            present.fill_(value)
+        else:
+            setattr(loss, name, value)

@@ -1,4 +1,4 @@
-"""Rollouts inside the world model and the returns along them.
+"""Rollouts inside the world model: where they begin, how they go, and the returns along them.
 
 Shape legend: N starts, H horizon, F features, A action. Time comes first here, so that a step is one block of memory.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.modules.actor import Actor
@@ -26,6 +27,31 @@ class Imagination(NamedTuple):
 
     features: Tensor
     action: Tensor
+
+
+def choose_starts(
+    context: TensorDictBase, terminated: Tensor, number: int | None = None, recent: Tensor | None = None
+) -> TensorDict:
+    """Choose among the latents of a batch ``[B, T]`` those that imagination begins from.
+
+    Args:
+        context: ``belief``, ``state`` of its records.
+        terminated: Of its records, ``(B, T, 1)``.
+        number: Of random ones; None for all, in order.
+        recent: Records that are chosen before others, ``(B, T, 1)``; None for none.
+
+    Returns:
+        ``belief``, ``state``, ``terminated``, batch size ``[N]``, detached.
+    """
+    latents = {"belief": context.get("belief"), "state": context.get("state"), "terminated": terminated}
+    starts = TensorDict(latents, context.batch_size).detach().flatten()
+    if number is None:
+        return starts
+    order = torch.rand(len(starts), device=terminated.device)
+    if recent is not None:
+        order = order + recent.flatten()
+    # Not randperm, which a CUDA graph cannot capture.
+    return starts[order.topk(min(number, len(starts))).indices]
 
 
 def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:

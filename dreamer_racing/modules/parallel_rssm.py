@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from dreamer_racing.modules.layers import NormedLinear, linear
 from dreamer_racing.modules.linear_recurrence import linear_recurrence
-from dreamer_racing.modules.rssm import RSSM, Posterior, SplitInputCell
+from dreamer_racing.modules.recurrent_cells import SplitInputCell
+from dreamer_racing.modules.rssm import RSSM, Posterior
 
 LAYERS = 2
 """Layers of the recurrence: channels of one do not see each other's past, those of the next one read all of it."""

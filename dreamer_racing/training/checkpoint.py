@@ -14,18 +14,13 @@ have of their own is read back if they are as many as before; else the replay is
 from __future__ import annotations
 
 import contextlib
-import functools
-import json
 import logging
-import os
 import shutil
-import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torchrl.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -34,22 +29,17 @@ from torchrl.checkpoint import (
 )
 
 from dreamer_racing.training import parallel
+from dreamer_racing.training.checksums import HAS_CHECKSUMS, damage_of
 from dreamer_racing.training.directory import (
     PREFIX,
-    REPLACED,
+    PROCESS,
+    PROCESSES,
     RunDirectory,
     complete_checkpoints,
     ensure_writable,
     is_complete,
-    stepped_aside,
 )
-
-CHECKSUMS = "checksums.json"
-"""The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
-HAS_CHECKSUMS = "checksums"
-"""In the metadata of a checkpoint that was saved with that file: if it is not there, it was lost."""
-PROCESS, PROCESSES = "process-", "processes"
-"""Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
+from dreamer_racing.training.publishing import publish, remove, remove_unfinished
 
 logger = logging.getLogger(__name__)
 
@@ -74,35 +64,6 @@ class RandomState(GlobalRNGState):
             )
             del state["torch_cuda"]
         super().load_state_dict(state)
-
-
-class CollectorState:
-    """What a TorchRL collector carries from rollout to rollout: observations, and the policy's memory.
-
-    Args:
-        collector: A ``Collector``, whose environment is saved apart.
-    """
-
-    def __init__(self, collector: Any) -> None:
-        self._collector = collector
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the step that the next rollout starts from."""
-        # Trajectory numbers are counted anew in every process, and nothing reads them.
-        return self._collector._carrier.exclude("collector").clone().to_dict()
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Start the next rollout from there.
-
-        Raises:
-            ValueError: if it is of another number of environments.
-        """
-        saved, present = len(state_dict["is_init"]), self._collector._carrier.batch_size[0]
-        if saved != present:
-            raise ValueError(
-                f"The checkpoint is of {saved} environments, this run has {present}: set env.num_envs={saved}."
-            )
-        self._collector._carrier.update(TensorDict(state_dict, self._collector._carrier.batch_size))
 
 
 class RunCheckpoints:
@@ -140,7 +101,7 @@ class RunCheckpoints:
         self._last_saved: Path | None = None
         if parallel.is_first():
             ensure_writable(self.directory)
-            _remove_partial(self.directory)
+            remove_unfinished(self.directory)
 
     def save(self, env_steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
         """Saves all parts and removes the oldest checkpoints beyond ``keep_last``.
@@ -168,7 +129,7 @@ class RunCheckpoints:
         try:
             self._step(lambda: self._checkpoint.save(partial, metadata=about), of_this_process=first)
             self._step(lambda: self._save_own(partial), of_this_process=not first)
-            self._step(lambda: _complete(partial, final), of_this_process=first)
+            self._step(lambda: publish(partial, final), of_this_process=first)
         except Exception as error:
             if first:
                 shutil.rmtree(partial, ignore_errors=True)
@@ -263,11 +224,11 @@ class RunCheckpoints:
         for path in self._complete():
             if path.name > newest.name:
                 logger.warning("Removing %s: the run was resumed from before it.", path)
-                _remove(path)
+                remove(path)
 
     def _remove_oldest(self) -> None:
         for path in self._complete()[: -self._keep_last]:
-            _remove(path)
+            remove(path)
 
     def _complete(self) -> list[Path]:
         """Return the complete checkpoints, oldest first."""
@@ -352,7 +313,7 @@ def newest_sound(path: str | Path, parts: Collection[str] | None = None) -> Path
     """
     damaged: dict[str, str] = {}  # what is wrong with which
     for candidate in complete_checkpoints(path):
-        damage = _damage(candidate, parts)
+        damage = damage_of(candidate, parts)
         if damage is None:
             if damaged:
                 found = ". ".join(damaged.values())
@@ -417,118 +378,3 @@ def _restore(checkpoint: Checkpoint, source: Path, map_location: torch.device | 
         # torch advises to read what is no state without its safeguard
         reason = "A file of it holds what is no state." if "weights_only" in str(error) else error
         raise RunCheckpointError(f"The checkpoint {source} could not be restored. {reason}") from error
-
-
-def _complete(partial: Path, final: Path) -> None:
-    """Makes a checkpoint of what was written beside its place."""
-    _check_loadable(partial)
-    write_checksums(partial)
-    _sync_tree(partial)
-    _publish(partial, final)
-
-
-def _check_loadable(path: Path) -> None:
-    """Reads the state dicts back (mapped, not copied), to refuse values that only a resume would find unreadable."""
-    for file in path.rglob(StateDictCheckpointAdapter.state_torch):
-        torch.load(file, map_location="cpu", mmap=True, weights_only=True)
-
-
-def write_checksums(path: Path) -> None:
-    """Notes the checksum of every other file of a checkpoint, the manifest's too."""
-    files = sorted(file for file in path.rglob("*") if file.is_file() and file.name != CHECKSUMS)
-    sums = {file.relative_to(path).as_posix(): _checksum(file) for file in files}
-    (path / CHECKSUMS).write_text(json.dumps(sums, indent=1), encoding="utf-8")
-
-
-def _damage(path: Path, parts: Collection[str] | None) -> str | None:
-    """Says which file of some parts is not as it was saved; None if all are, or if an older version noted no sums."""
-    manifest = Checkpoint.manifest(path)
-    try:
-        sums = json.loads((path / CHECKSUMS).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        metadata = manifest.get("metadata")
-        if not isinstance(metadata, dict) or metadata.get(HAS_CHECKSUMS):
-            return f"{CHECKSUMS} is missing"
-        _warn_of_no_checksums(path)
-        return None
-    except (ValueError, OSError):
-        sums = None
-    if not isinstance(sums, dict):
-        return f"{CHECKSUMS} cannot be read"
-    for name in _files_of(path, parts):
-        if name not in sums:
-            return f"{CHECKSUMS} lacks {name}"
-        if _checksum(path / name) != sums[name]:
-            return f"{name} is not what was saved"
-    return None
-
-
-def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
-    """Names the files of some parts, of every process; a manifest comes first, to be compared before it is read."""
-    yield "manifest.json"
-    manifest = Checkpoint.manifest(path)
-    for part, record in manifest["components"].items():
-        if parts is None or part in parts:
-            yield from (f"{record['path']}/{file}" for file in record["files"])
-    for rank in range(1, (manifest.get("metadata") or {}).get(PROCESSES, 1)):
-        folder = f"{PROCESS}{rank}"
-        yield from (f"{folder}/{name}" for name in _files_of(path / folder, parts))
-
-
-@functools.cache  # once for a checkpoint, however often it is read
-def _warn_of_no_checksums(path: Path) -> None:
-    logger.warning("%s was saved by a version without checksums: whether it is damaged cannot be told.", path)
-
-
-def _checksum(file: Path) -> int | None:
-    """Returns that of a file's content; None of one that cannot be read."""
-    checksum = 0
-    try:
-        with file.open("rb") as content:
-            while part := content.read(1 << 20):
-                checksum = zlib.crc32(part, checksum)
-    except OSError:
-        return None
-    return checksum
-
-
-def _sync_tree(path: Path) -> None:
-    for entry in (*path.rglob("*"), path):
-        descriptor = os.open(entry, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def _publish(partial: Path, final: Path) -> None:
-    """Renames into place. A folder cannot be renamed onto another, so an earlier one of that name steps aside."""
-    aside = final.with_name(f".{final.name}{REPLACED}")
-    if final.exists():
-        os.replace(final, aside)
-    os.replace(partial, final)
-    shutil.rmtree(aside, ignore_errors=True)
-    descriptor = os.open(final.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _remove(path: Path) -> None:
-    """Removes a checkpoint: under another name first, so that a kill meanwhile leaves none of that name incomplete."""
-    tombstone = path.with_name(f".{path.name}.removed")
-    shutil.rmtree(tombstone, ignore_errors=True)
-    os.replace(path, tombstone)
-    shutil.rmtree(tombstone)
-
-
-def _remove_partial(directory: Path) -> None:
-    """Removes what a killed process left; puts back a checkpoint that had stepped aside for one that never came."""
-    for path in directory.glob(f".*{PREFIX}-*"):
-        final = stepped_aside(path)
-        if path.name.endswith(REPLACED) and not final.exists() and is_complete(path):
-            os.replace(path, final)
-        else:
-            logger.info("Removing the unfinished %s.", path)
-            shutil.rmtree(path, ignore_errors=True)

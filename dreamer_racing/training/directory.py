@@ -22,6 +22,8 @@ CHECKPOINTS = "checkpoints"
 PREFIX = "checkpoint"
 REPLACED = ".replaced"
 """End of the hidden name under which a checkpoint waits until another of its name is there."""
+PROCESS, PROCESSES = "process-", "processes"
+"""Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
 EVALUATION = "evaluation.json"
 """Numbers of an evaluation, in whichever folder it is written to."""
 
@@ -43,7 +45,7 @@ class RunDirectory:
     @classmethod
     def of(cls, checkpoint: Path) -> RunDirectory:
         """Return that of the run which left a checkpoint."""
-        return cls(checkpoint.parent.parent)
+        return cls(checkpoint.parents[1])
 
     @property
     def checkpoints(self) -> Path:

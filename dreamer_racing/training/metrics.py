@@ -35,7 +35,7 @@ class MetricsLog:
 
     Args:
         run_dir: folder of the run.
-        loggers: TorchRL loggers that receive every row too (`dreamer_racing.training.loggers` makes some).
+        loggers: TorchRL loggers that receive every row too (`dreamer_racing.figures.loggers` makes some).
         resume_env_steps: of the latest row of the checkpoint this run continues: rows beyond it are removed. If None,
             the run is new, and a ``metrics.csv`` already there is kept under another name.
         pending: what is in no row yet, to be saved with the run; None for a new one.

@@ -31,7 +31,7 @@ from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
 from dreamer_racing.training.journal import Interval, Schedule
 from dreamer_racing.training.lock import RunLock
-from dreamer_racing.training.loggers import log_evaluation
+from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.progress import Progress
 from dreamer_racing.training.replay_ratio import ReplayRatio
@@ -115,7 +115,7 @@ class Run:
         with self.clock.timed("save"):
             self.learner.check_finite()
             self.settle()
-            return self.checkpoints.save(self.counters["env_steps"], {"wall_clock": self.clock.total})
+            return self.checkpoints.save(self.counters["env_steps"], self.clock.total)
 
     @contextmanager
     def attempt(self, what: str) -> Iterator[None]:

@@ -23,8 +23,10 @@ from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.learners.saved_dreamer import LossState
@@ -36,14 +38,13 @@ from dreamer_racing.machine import (
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training import parallel
-from dreamer_racing.training.checkpoint import BestCheckpoint, CollectorState, RunCheckpoints
+from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
-from dreamer_racing.training.loggers import RunLogger, make_loggers
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.run import Report, Run
 
@@ -301,7 +302,7 @@ def assemble(
     clock = RunClock(counters)
     if config.resume:
         saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
-        clock.total = saved.get("wall_clock", 0.0)
+        clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         if curriculum:
             env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too

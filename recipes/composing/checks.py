@@ -26,6 +26,7 @@ from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, find_loss
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
@@ -33,7 +34,6 @@ from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.loggers import check_loggers
 from dreamer_racing.training.schedule import RampClock
 
 RACE_ONLY = (

@@ -79,7 +79,7 @@ def check_plot(config: PlotConfig) -> None:
     ):
         if value not in allowed:
             raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")
-    wanted_columns(config.quantities)
+    wanted_columns(config.quantities, config.axis)
 
 
 def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> None:
@@ -121,7 +121,7 @@ def warn(problems: list[str]) -> None:
 
 def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `learning_curves.png` and `.csv`."""
-    curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems)
+    curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems, config.axis)
     write_curves(output / "learning_curves.csv", curves)
     draw_curves(curves, output)
     return Drawn(["learning_curves.png", "learning_curves.csv"], curves.problems)
@@ -219,7 +219,7 @@ def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], probl
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
         return Drawn([], [])
-    comparison = compare_variants(runs, problems)
+    comparison = compare_variants(runs, problems, config.axis)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")
     plot_comparison(comparison, output / "comparison.png")
     return Drawn(["comparison.md", "comparison.png"], comparison.problems)
@@ -240,7 +240,7 @@ class Entry(NamedTuple):
 
 
 FIGURES = {
-    "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities)),
+    "learning_curves": Entry(draw_learning_curves, lambda config: wanted_columns(config.quantities, config.axis)),
     "imagined": Entry(draw_imagined, no_columns),
     "trajectories": Entry(draw_trajectories, no_columns),
     "comparison": Entry(draw_comparison, lambda config: COLUMNS),

@@ -11,7 +11,14 @@ DRAWN = ("return", "success_rate", "gates", "lap_time")
 
 
 class DrawFigures(Callback):
-    """Draws what `recipes/plot.py` draws, into `figures/` of the experiment, also when a run of it has failed."""
+    """Draws what `recipes/plot.py` draws, into `figures/` of the experiment, also when a run of it has failed.
+
+    Args:
+        axis: of curves and comparison, as of `recipes/plot.py`.
+    """
+
+    def __init__(self, axis: str = "env_steps") -> None:
+        self._axis = axis
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Draw everything for which there is something to draw; end with status 1 if a run has failed."""
@@ -22,7 +29,7 @@ class DrawFigures(Callback):
         place = Path(config.hydra.sweep.dir)
         print(f"figures: {place}/figures")
         try:
-            draw(PlotConfig(runs=str(place), output=f"{place}/figures", quantities=list(DRAWN)))
+            draw(PlotConfig(str(place), output=f"{place}/figures", quantities=list(DRAWN), axis=self._axis))
         except ValueError as error:
             print(f"figures: none, {error}")
         notes = sorted((place / FAILURES).glob("*.txt"))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 from enum import Enum
+from functools import cache
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -10,7 +11,7 @@ from omegaconf import MISSING
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.learners import PPOConfig, SACConfig
-from dreamer_racing.learners.dreamer import LearnerConfig
+from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, setting
 from dreamer_racing.training.replay_ratio import ReplayRatio
@@ -354,7 +355,8 @@ class PlotConfig:
     output: str = "figures"  # folder
     quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
     aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
-    # of the curves' running mean, env_steps; null: 2 % of the longest run
+    axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
+    # of the curves' running mean, in units of their axis; null: 2 % of the longest run
     window: float | None = setting(None, NOT_NEGATIVE)
     flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
     flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
@@ -373,8 +375,9 @@ def is_race(config: RunConfig) -> bool:
     return config.env.suite == "race"
 
 
+@cache
 def register() -> None:
-    """Make the schemas known to hydra."""
+    """Make the schemas known to hydra, which keeps them."""
     store = ConfigStore.instance()
     for algorithm, schema in RECIPES.items():
         store.store(name=f"{algorithm}_schema", node=schema)

@@ -237,25 +237,32 @@ def test_the_files_hold_no_paths_of_this_machine(exported: Path) -> None:
 # --- refusal ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def written(agent: Agent, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both files of the agent's step, and of one with an altered weight."""
+    folder, altered = tmp_path_factory.mktemp("written"), ActorStep(copy.deepcopy(agent))
+    next(altered.rssm.cell.parameters()).add_(0.5)
+    for name, step in (("own", ActorStep(agent)), ("altered", altered)):
+        export.write_step(step, folder / f"{name}.onnx", folder / f"{name}.pt2")
+    return folder
+
+
 @pytest.mark.parametrize(("kind", "name"), [("onnx", "onnxruntime"), ("program", "torch.export")])
 def test_an_altered_weight_is_refused(
-    kind: str, name: str, agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, name: str, agent: Agent, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = export.write_step
+    weights = {"onnx": "own", "program": "own"}
+
+    def write(step: ActorStep, onnx: Path, program: Path) -> None:
+        shutil.copy(written / f"{weights['onnx']}.onnx", onnx)
+        shutil.copy(written / f"{weights['program']}.pt2", program)
+
+    monkeypatch.setattr(export, "write_step", write)
     step = ActorStep(agent)
     output = tmp_path / "actor.onnx"
     export_actor(step, contract_of(step), make_flight(agent), output)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def write_altered(step: ActorStep, onnx: Path, program: Path) -> None:
-        original(step, onnx, program)
-        altered = copy.deepcopy(step)
-        next(altered.rssm.cell.parameters()).add_(0.5)
-        target, elsewhere = {"onnx": onnx, "program": program}[kind], tmp_path / "elsewhere"
-        original(altered, *(path if path == target else elsewhere for path in (onnx, program)))
-        elsewhere.unlink()
-
-    monkeypatch.setattr(export, "write_step", write_altered)
+    weights[kind] = "altered"
     with pytest.raises(ParityError, match=rf"^{name} does not fly as torch does: at step \d+ of 200 .* deviates by \d"):
         export_actor(step, contract_of(step), make_flight(agent), output)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before, "the earlier export stays"

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamer_racing.figures.comparison import CAPTION, compare_variants, comparison_table
+from dreamer_racing.figures.comparison import compare_variants, comparison_table
 from dreamer_racing.figures.runs import RunData
 from dreamer_racing.training.metrics import MetricsTable
 
-NAMES = {"gates": "evaluation/gates_per_episode", "clock": "wall_clock"}
+NAMES = {"gates": "evaluation/gates_per_episode", "clock": "wall_clock", "cpu": "cpu_clock"}
 
 
 def make_run(variant: str, seed: int, every: int = 100, **columns: list[float]) -> RunData:
@@ -68,13 +68,14 @@ def test_the_return_is_that_of_evaluations() -> None:
 
 
 def test_the_table_has_a_row_a_variant_and_no_column_without_values() -> None:
-    head, _, reference, late, empty, caption = comparison_table(compare_variants(RUNS)).strip().split("\n")
+    comparison = compare_variants(RUNS)
+    head, _, reference, late, empty, caption = comparison_table(comparison).strip().split("\n")
     assert head == (
         "| algorithm | track | variant | seeds | env_steps | Gates per episode (deterministic) | wall clock |"
     )
     assert reference == "| dreamer_v3 | circle | default | 2 | 800–1,000 | 3 ± 1.41 |  |"
     assert late == "| dreamer_v3 | circle | late | 1 | 800–1,000 | 0 | 1.0 min |"
-    assert empty == "" and caption == CAPTION and "b₂ = 0" in caption
+    assert empty == "" and caption == comparison.caption and "b₂ = 0" in caption
 
 
 def test_the_table_says_which_cells_have_fewer_seeds_and_what_was_left_out() -> None:
@@ -88,3 +89,19 @@ def test_the_table_says_which_cells_have_fewer_seeds_and_what_was_left_out() -> 
 def test_nothing_to_compare() -> None:
     with pytest.raises(ValueError, match="no run to compare"):
         compare_variants([])
+
+
+def test_variants_are_compared_at_equal_cpu_time() -> None:
+    """The slow one makes as many env_steps in twice the time: of its gates those up to the other's end count."""
+    rising = [float(value) for value in range(1, 11)]
+    fast = make_run("default", 0, gates=rising, cpu=[360.0 * value for value in rising])
+    slow = make_run("slow", 0, gates=rising, cpu=[720.0 * value for value in rising])
+    untimed = make_run("old", 0, gates=rising)
+    comparison = compare_variants([fast, slow, untimed], axis="core_hours")
+    default, late = comparison.results
+    assert default.window == late.window == (pytest.approx(0.8), 1.0)
+    assert default.values["gates"].tolist() == [9.0]  # of 0.8, 0.9 and 1 hours
+    assert late.values["gates"].tolist() == [4.5]  # of 0.8 and 1 hours
+    assert comparison.problems == [f"{untimed.name} left out: it has no cpu_clock, which core_hours are read off"]
+    table = comparison_table(comparison)
+    assert "| seeds | core_hours |" in table and "| 0.80–1.00 |" in table and "core_hours that every variant" in table

@@ -49,7 +49,7 @@ def curves_of(folder: Path, **options):
 
 
 def at(curve, env_steps: float) -> tuple[float, float, float, int]:
-    index = int(np.abs(curve.env_steps - env_steps).argmin())
+    index = int(np.abs(curve.x - env_steps).argmin())
     return curve.centre[index], curve.low[index], curve.high[index], curve.seeds[index]
 
 
@@ -207,11 +207,50 @@ def test_curves_survive_their_file(tmp_path, window):
     for old, new in zip(before.curves, after.curves, strict=True):
         assert (old.key, old.quantity) == (new.key, new.quantity)
         np.testing.assert_array_equal(old.seeds, new.seeds)
-        np.testing.assert_allclose(new.env_steps, old.env_steps, atol=0.5)
+        np.testing.assert_allclose(new.x, old.x, atol=0.5)
         for name in ("centre", "low", "high"):
             np.testing.assert_allclose(getattr(new, name), getattr(old, name), rtol=1e-5)
     with pytest.raises(ValueError, match="no learning curves"):
         read_curves(tmp_path / "runs" / "dreamer_v3_circle_seed0" / "metrics.csv")
+
+
+# --- along a clock ---
+
+
+def write_timed_run(folder: Path, name: str, values, seconds, **settings) -> Path:
+    """A run whose return has these values after 1000, 2000 ... env_steps, and its clock these readings."""
+    run = write_run(folder, name, values, **settings)
+    rows = zip(values, seconds, strict=True)
+    lines = [f"{1000 * (i + 1)},{value},{clock},{clock / 2}\n" for i, (value, clock) in enumerate(rows)]
+    (run / "metrics.csv").write_text("env_steps,episode/return,wall_clock,cpu_clock\n" + "".join(lines))
+    return run
+
+
+@pytest.mark.parametrize(("axis", "longest"), [("hours", 4.0), ("core_hours", 2.0)])
+def test_runs_of_different_speed_are_compared_at_the_same_hour(tmp_path, axis, longest):
+    """The second run makes its env_steps in half the time: its values come at half the hour."""
+    write_timed_run(tmp_path, "ppo_circle_seed0", [1.0, 3.0], [7200.0, 14400.0], algorithm="ppo")
+    write_timed_run(tmp_path, "sac_circle_seed0", [1.0, 3.0], [3600.0, 7200.0], algorithm="sac")
+    drawn = curves_of(tmp_path, axis=axis)
+    slow, fast = drawn.curves
+    assert (drawn.axis, slow.x[-1], slow.key.algorithm) == (axis, longest, "ppo")
+    for curve, hours, value in ((slow, 0.75, 2.0), (fast, 0.375, 2.0), (fast, 0.5, 3.0)):
+        assert np.interp(hours * longest, curve.x, curve.centre) == pytest.approx(value, abs=0.1)
+    assert np.isnan(fast.centre[fast.x > 0.51 * longest]).all()
+    write_curves(tmp_path / "curves.csv", drawn)
+    again = read_curves(tmp_path / "curves.csv")
+    assert again.axis == axis
+    np.testing.assert_allclose(again.curves[0].x, slow.x, rtol=1e-5)
+
+
+def test_a_run_without_the_clock_is_left_out_by_name(tmp_path):
+    write_timed_run(tmp_path, "ppo_circle_seed0", [1.0, 3.0], [3600.0, 7200.0], algorithm="ppo")
+    write_run(tmp_path, "sac_circle_seed0", algorithm="sac")
+    drawn = curves_of(tmp_path, axis="core_hours")
+    assert [curve.key.algorithm for curve in drawn.curves] == ["ppo"]
+    assert "sac_circle_seed0 left out: it has no cpu_clock, which core_hours are read off" in drawn.problems
+    with pytest.raises(ValueError, match=r"axis=minutes: there are env_steps, hours, core_hours"):
+        curves_of(tmp_path, axis="minutes")
 
 
 # --- which runs make a curve ---

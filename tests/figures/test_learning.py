@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 
-from dreamer_racing.figures.comparison import CAPTION, Comparison, VariantResult
+from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import Curve, LearningCurves, learning_curves
 from dreamer_racing.figures.learning import (
     OTHER_COLOR,
@@ -167,7 +167,7 @@ def test_the_picture_says_how_and_what_was_left_out(tmp_path, figures):
     plot_comparison(COMPARISON, tmp_path / "comparison.png")
     assert (tmp_path / "comparison_left_out.txt").read_text() == "late left out\n"
     assert figures[0].get_suptitle() == ""
-    assert " ".join(figures[0].get_supxlabel().split()) == CAPTION
+    assert " ".join(figures[0].get_supxlabel().split()) == COMPARISON.caption
 
 
 def test_several_algorithms_are_named_and_have_no_common_reference(tmp_path, figures):

@@ -403,7 +403,7 @@ def test_a_discount_of_zero_leaves_only_the_next_reward():
     torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
     learner.adjust(discount=0.0)
     context = learner.losses["world_model"](make_batch()).pop("replay_context")
-    imagined = learner.losses["actor"](learner._choose_starts(context, make_batch()))
+    imagined = learner.losses["actor"](learner.starts(context, make_batch()))
     returns = imagined["imagination"]["lambda_return"]
     assert returns.mean().item() == pytest.approx(imagined["imagined_reward"].item(), abs=1e-5)
 
@@ -455,9 +455,9 @@ def test_imagination_begins_in_the_newest_windows_where_it_is_told_to():
     latents = TensorDict({"belief": torch.zeros(4, 6, 32), "state": torch.zeros(4, 6, 16)}, [4, 6])
     latents["belief"][2:] = 1.0
     for _ in range(10):
-        assert learner._choose_starts(latents, batch)["belief"].min() == 1.0
+        assert learner.starts(latents, batch)["belief"].min() == 1.0
     learner.config = replace(learner.config, imagination_starts=20)  # more than the 12 there are: the others fill up
-    assert learner._choose_starts(latents, batch)["belief"][:, 0].sum() == 12
+    assert learner.starts(latents, batch)["belief"][:, 0].sum() == 12
 
 
 def test_the_smallest_deviation_is_scheduled_saved_and_flown():

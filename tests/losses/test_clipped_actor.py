@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dreamer_racing.launches import launches
 from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import clipped_actor
 from dreamer_racing.losses.clipped_actor import ClippedActorLoss
 from tests.losses import test_asymmetric_ppo_actor as asymmetric

@@ -13,6 +13,7 @@ import torch
 
 from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossConfig, find_loss, kl_losses
+from dreamer_racing.losses.contract import set_number
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
 
@@ -91,7 +92,7 @@ def test_the_number_of_a_custom_actor_comes_from_the_configuration_and_moves(exa
     actor = learner.losses["actor"]
     assert (actor.horizon, float(actor.price)) == (5, 2.5)
     assert learner.update(example["batch"])["loss_actor"].isfinite()
-    learner._set_in_losses("price", 1.5)
+    set_number(learner.losses.values(), "price", 1.5)
     assert float(actor.price) == 1.5
 
 

@@ -1,7 +1,9 @@
 import torch
+from tensordict import TensorDict
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from dreamer_racing.losses import imagine, lambda_return
+from dreamer_racing.losses.imagination import choose_starts
 from dreamer_racing.modules import SIZES
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface
@@ -40,3 +42,21 @@ def test_imagination_starts_where_told():
     assert action.shape == (3, 5, 4)
     assert torch.equal(features[0], torch.cat((belief, state), -1))
     assert features.requires_grad
+
+
+def test_imagination_begins_from_all_latents_or_from_recent_ones_first():
+    belief = torch.arange(6.0).view(2, 3, 1)  # [B, T], D = 1: each tells its place
+    context = TensorDict({"belief": belief.requires_grad_(), "state": 10 * belief}, [2, 3])
+    terminated = (belief == 4).detach()
+    starts = choose_starts(context, terminated)
+    assert starts["belief"].flatten().tolist() == [0, 1, 2, 3, 4, 5] and not starts["belief"].requires_grad
+    assert starts["terminated"].flatten().tolist() == [False, False, False, False, True, False]
+    recent = torch.tensor([False, True]).view(2, 1, 1).expand(2, 3, 1)
+    for number, allowed in ((2, {3, 4, 5}), (3, {3, 4, 5}), (5, {0, 1, 2, 3, 4, 5})):
+        chosen = choose_starts(context, terminated, number, recent)
+        places = chosen["belief"].flatten().tolist()
+        assert len(set(places)) == number and set(places) <= allowed
+        assert len({3, 4, 5} & set(places)) == min(number, 3), "recent ones first"
+        assert chosen["state"].flatten().tolist() == [10 * place for place in places]
+        assert chosen["terminated"].flatten().tolist() == [place == 4 for place in places]
+    assert len(choose_starts(context, terminated, 99)) == 6, "no more than there are"

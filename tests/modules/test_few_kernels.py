@@ -9,13 +9,14 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from dreamer_racing.launches import launches
 from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.modules import ModelSize, get_size
 from dreamer_racing.modules.cast_weights import cast_once
 from dreamer_racing.modules.few_kernels import GatedUpdate, gate_shift
 from dreamer_racing.modules.layers import LayerNorm, RMSNorm, autocast
-from dreamer_racing.modules.rssm import _gated_update, sample_one_hot
+from dreamer_racing.modules.recurrent_cells import gated_update
+from dreamer_racing.modules.rssm import sample_one_hot
 from tests.dreamers import learner_of
 from tests.learners.test_dreamer import make_batch
 from tests.losses.test_asymmetric_ppo_actor import STATE, make_seen_batch
@@ -112,7 +113,7 @@ def test_the_update_by_hand_has_the_gradients_of_autograd() -> None:
     belief = torch.rand(3, 8, generator=generator, dtype=torch.float64, requires_grad=True)
     shift = gate_shift().double()
     parts = [part.flatten(1) for part in gates.unbind(2)]
-    torch.testing.assert_close(GatedUpdate.apply(gates, shift, belief), _gated_update(*parts, belief))
+    torch.testing.assert_close(GatedUpdate.apply(gates, shift, belief), gated_update(*parts, belief))
     assert torch.autograd.gradcheck(lambda *inputs: GatedUpdate.apply(inputs[0], shift, inputs[1]), (gates, belief))
 
 

@@ -15,7 +15,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, is_agent
-from dreamer_racing.training.checkpoint import write_checksums
+from dreamer_racing.training.checksums import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
 

@@ -13,7 +13,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import RampClock
-from tests.running_recipes import CONFIG, build, compose, recipe_module
+from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, recipe_module
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
@@ -22,6 +22,20 @@ def test_every_group_composes(path: Path) -> None:
     append = "+" if group == "decoys" else ""  # not among the defaults
     config = compose({"network": "ppo"}.get(group, "dreamer_v3"), f"{append}{group}={path.stem}")
     assert OmegaConf.select(config, group) is not None
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_variant_of_an_experiment_is_a_run_that_differs_from_the_others(experiment: str) -> None:
+    checks, recipe = recipe_module("composing.checks"), recipe_module("dreamer_v3")
+    variants, overrides = (compose(experiment)[name] for name in ("variants", "overrides"))
+    settings = set()
+    for changes in variants.values():
+        resolved = recipe.resolve(compose("dreamer_v3", "device=cpu", "run_dir=run", *changes, *overrides))
+        checks.check_dreamer(OmegaConf.to_object(resolved))
+        settings.add(OmegaConf.to_yaml(resolved))
+    assert len(settings) == len(variants)
+    swept = OmegaConf.load(CONFIG / f"{experiment}.yaml").hydra.sweeper.params.variant
+    assert swept.split(",") == list(variants)
 
 
 def test_every_model_config_names_a_known_size() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -13,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.lock import RunLock
-from tests.running_recipes import ROOT, compose, recipe_module, rows
+from tests.running_recipes import ROOT, compose, recipe, recipe_module, rows, started
 
 
 def settings(directory: Path, *overrides: str) -> DictConfig:
@@ -119,13 +117,9 @@ def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) ->
 @pytest.mark.slow
 def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     algorithms = tuple(recipe_module("composing.schema").RECIPES)
-    command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), "--multirun", "budget=smoke", "name=smoke",
-               f"algorithm={','.join(algorithms)}", "track=circle", "seed=0", "device=cpu", "env.image_size=48",
-               "evaluation.video_steps=10"]  # fmt: skip
-    first, second = (
-        subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
-        for _ in range(2)
-    )
+    command = ["--multirun", "budget=smoke", "name=smoke", f"algorithm={','.join(algorithms)}", "track=circle",
+               "seed=0", "device=cpu", "env.image_size=48", "evaluation.video_steps=10"]  # fmt: skip
+    first, second = (recipe("experiment", *command, cwd=tmp_path, timeout=600) for _ in range(2))
     assert first.returncode == 0 and second.returncode == 0, first.stderr + second.stderr
     for algorithm in algorithms:
         run_dir = tmp_path / "runs" / "smoke" / f"{algorithm}_circle_default_seed0"
@@ -139,6 +133,7 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
             "evaluation/success_rate",
             "curriculum/body_rate_weight",
             "wall_clock",
+            "cpu_clock",
         ):
             assert any(row[column] for row in table), f"{algorithm}: {column}"
         assert list((run_dir / "videos").glob("*.mp4")) and list((run_dir / "plots").glob("*.png"))
@@ -151,12 +146,6 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
 STATES = ["--multirun", "budget=smoke", "name=few", "algorithm=ppo", "variant=state", "track=circle", "device=cpu"]
 
 
-def experiment(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
-    """Start an experiment, as a user does."""
-    command = [sys.executable, str(ROOT / "recipes" / "experiment.py"), *STATES, *overrides]
-    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
 @pytest.mark.slow
 def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Path) -> None:
     runs = tmp_path / "runs" / "few"
@@ -164,10 +153,10 @@ def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Pat
         (runs / f"ppo_circle_state_seed{seed}").mkdir(parents=True)
     (runs / "ppo_circle_state_seed0" / "checkpoints").write_text("in the way")
     lock = RunLock(runs / "ppo_circle_state_seed1")
-    process = experiment("seed=0,1,2", cwd=tmp_path)
-    output, _ = process.communicate(timeout=300)
+    done = recipe("experiment", *STATES, "seed=0,1,2", cwd=tmp_path, timeout=300)
     lock.release()
-    assert process.returncode == 1, output
+    output = done.stdout + done.stderr
+    assert done.returncode == 1, output
     assert "failed: ppo_circle_state_seed0: ppo ended with status 2" in output
     assert "failed: ppo_circle_state_seed1:" in output and "in use by a live run" in output
     assert not (runs / "ppo_circle_state_seed1" / "log.txt").exists(), "a live run's log is its own"
@@ -176,21 +165,25 @@ def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
-def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(tmp_path: Path) -> None:
     runs = tmp_path / "runs" / "few"
     length = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
-    process = experiment(*length, "total_env_steps=100000000", cwd=tmp_path)
-    metrics = runs / "ppo_circle_state_seed0" / "metrics.csv"
-    deadline = time.monotonic() + 200
-    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.2)
-    process.send_signal(number)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 128 + number, output
-    assert "interrupted" in output and "seed1" not in output and "done" not in output
+    metrics, lines = runs / "ppo_circle_state_seed0" / "metrics.csv", 1
+    for number in (signal.SIGTERM, signal.SIGINT):
+        launcher = started("experiment", *STATES, *length, "total_env_steps=100000000", cwd=tmp_path)
+        deadline = time.monotonic() + 200
+        while not (metrics.exists() and len(metrics.read_text().splitlines()) > lines):
+            assert launcher.process.is_alive() and time.monotonic() < deadline
+            time.sleep(0.2)
+        launcher.send_signal(number)
+        done = launcher.communicate(timeout=120)
+        output = done.stdout + done.stderr
+        assert done.returncode == 128 + number, output
+        assert "interrupted" in output and "seed1" not in output and "done" not in output
+        assert ("seed0: resumed" in output) == (number == signal.SIGINT), output
+        lines = len(metrics.read_text().splitlines())
     reached = int(latest_checkpoint(runs / "ppo_circle_state_seed0").name.rpartition("-")[2])
-    process = experiment(*length, f"total_env_steps={reached + 500}", "seed=0", cwd=tmp_path)
-    output, _ = process.communicate(timeout=200)
-    assert process.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output
+    last = [f"total_env_steps={reached + 500}", "seed=0"]
+    done = recipe("experiment", *STATES, *length, *last, cwd=tmp_path)
+    output = done.stdout + done.stderr
+    assert done.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output

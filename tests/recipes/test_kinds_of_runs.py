@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,18 +18,15 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
-from tests.running_recipes import AT_THE_END, ROOT, SMALL, TINY, build, compose, recipe, recipe_module, rows
+from tests.running_recipes import AT_THE_END, SMALL, TINY, build, compose, recipe, recipe_module, rows, started
 
 SLOW_DISK = """
-import runpy, sys, time
-sys.path.insert(0, {folder!r})
+import pathlib, time
 import dreamer_racing.training.checkpoint as checkpoint
 def save(*_):
-    print("saving slowly", flush=True)
+    pathlib.Path("saving slowly").touch()
     time.sleep(100)
 checkpoint.RunCheckpoints.save = save
-sys.argv[0] = {path!r}
-runpy.run_path({path!r}, run_name="__main__")
 """
 
 
@@ -43,27 +38,21 @@ runpy.run_path({path!r}, run_name="__main__")
 def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
     number: signal.Signals, times: int, tmp_path: Path
 ) -> None:
-    path = ROOT / "recipes" / "dreamer_v3.py"
-    program = [str(path)] if times == 1 else ["-c", SLOW_DISK.format(folder=str(path.parent), path=str(path))]
-    command = [sys.executable, *program, *SMALL, "total_env_steps=1000000", "evaluation.every=0",
-               "checkpoint.every=1000000", "run_dir=run"]  # fmt: skip
-    with (
-        (tmp_path / "said").open("w") as said,
-        subprocess.Popen(command, cwd=tmp_path, stdout=said, stderr=subprocess.STDOUT) as process,
-    ):
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline:
-            if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):
-                break
-            time.sleep(0.2)
-        process.send_signal(number)
-        while times == 2 and "saving slowly" not in (tmp_path / "said").read_text() and time.monotonic() < deadline:
+    settings = [*TINY, "env.from_pixels=false", "total_env_steps=1000000", "logger.every=64"]
+    run = started("dreamer_v3", *settings, "run_dir=run", cwd=tmp_path, before=SLOW_DISK if times == 2 else "")
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and run.process.is_alive():
+        if (tmp_path / "run" / "metrics.csv").exists() and rows(tmp_path / "run"):
+            break
+        time.sleep(0.2)
+    run.send_signal(number)
+    if times == 2:
+        while not (tmp_path / "saving slowly").exists() and time.monotonic() < deadline:
             time.sleep(0.1)
-        if times == 2:
-            process.send_signal(number)
-        process.wait(timeout=120)
-    output = (tmp_path / "said").read_text()
-    assert process.returncode == 128 + number, output
+        run.send_signal(number)
+    done = run.communicate(timeout=120)
+    output = done.stdout + done.stderr
+    assert done.returncode == 128 + number, output
     assert f"{number.name}: saving; again: abandons" in output and "Traceback" not in output
     saved = list((tmp_path / "run" / "checkpoints").glob("checkpoint-*"))
     if times == 1:
@@ -73,14 +62,14 @@ def test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save(
 
 
 FULL_DISK = """
-import dreamer_racing.training.checkpoint as checkpoint
-sync, calls = checkpoint._sync_tree, []
+import dreamer_racing.training.publishing as publishing
+sync, calls = publishing._sync_tree, []
 def full(path):
     calls.append(path)
     if len(calls) <= {times}:
         raise OSError(28, "No space left on device")
     sync(path)
-checkpoint._sync_tree = full
+publishing._sync_tree = full
 """
 
 

@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.settings import check_settings, shortened
-from tests.running_recipes import CONFIG, recipe_module
+from tests.running_recipes import CONFIG, EXPERIMENTS, recipe_module
 
-RECIPES = sorted(path.stem for path in CONFIG.glob("*.yaml") if path.stem != "ablation")
+RECIPES = sorted(path.stem for path in CONFIG.glob("*.yaml") if path.stem not in EXPERIMENTS)
 TRAINING = {"dreamer_v3": "check_dreamer", "ppo": "check_ppo", "sac": "check_sac"}
 UNTYPED = ("fly", "tracks")  # their checks take what hydra composed
 NEEDED = {

@@ -16,20 +16,11 @@ from tests.running_recipes import build, compose, recipe, recipe_module
         (["total_env_steps=abc"], ["total_env_steps", "abc"]),
         (["track=monza"], ["monza", "kidney"]),
         (["run_dir=/dev/null/run"], ["/dev/null/run"]),
-        (["env.preset=esay"], ["env.preset=esay", "did you mean easy?", "faithful"]),
-        (["env.renderer=directx"], ["directx", "egl"]),
-        (["device=cuda:7"], ["cuda:7", "cpu"]),
-        (["env.device=gpu"], ["env.device=gpu", "cpu", "cuda"]),
-        (["env.device=cuda:7"], ["cuda:7", "finds no CUDA device", "cpu"]),
-        (["env.device=cuda", "collection=overlapped"], ["overlapped", "env.device=cpu"]),
-        (["env.looks=pretty"], ["pretty", "nominal", "randomised"]),
-        (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
-        (["loss.actor=magic"], ["magic", "reinforce"]),
         (["resume=/nowhere"], ["/nowhere"]),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_bad_input_gets_a_plain_error(overrides: list[str], words: list[str], tmp_path: Path) -> None:
+def test_a_person_gets_a_plain_error(overrides: list[str], words: list[str], tmp_path: Path) -> None:
     done = recipe("dreamer_v3", "model=debug", *overrides, cwd=tmp_path)
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
@@ -38,6 +29,15 @@ def test_bad_input_gets_a_plain_error(overrides: list[str], words: list[str], tm
 
 
 REFUSED = [
+    (["env.preset=esay"], ["env.preset=esay", "did you mean easy?", "faithful"]),
+    (["env.renderer=directx", "env.from_pixels=true"], ["directx", "egl"]),
+    (["device=cuda:7"], ["cuda:7", "cpu"]),
+    (["env.device=gpu"], ["env.device=gpu", "cpu", "cuda"]),
+    (["env.device=cuda:7"], ["cuda:7", "finds no CUDA device", "cpu"]),
+    (["env.device=cuda", "collection=overlapped"], ["overlapped", "env.device=cpu"]),
+    (["env.looks=pretty", "env.from_pixels=true"], ["pretty", "nominal", "randomised"]),
+    (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
+    (["loss.actor=magic"], ["magic", "reinforce"]),
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import os
 import random
 import shutil
@@ -22,18 +21,20 @@ from torchrl.checkpoint import CheckpointError
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.replay import StreamReplay, make_replay
-from dreamer_racing.training import checkpoint as checkpoint_module
+from dreamer_racing.training import publishing
 from dreamer_racing.training.checkpoint import (
-    CHECKSUMS,
     BestCheckpoint,
+    RandomState,
     RunCheckpointError,
     RunCheckpoints,
     load_components,
     load_state,
     newest_sound,
 )
+from dreamer_racing.training.checksums import CHECKSUMS, HAS_CHECKSUMS, write_checksums
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.signals import GracefulExit
+from tests.forked import SERVER
 
 
 class Run:
@@ -230,11 +231,11 @@ def test_a_failed_save_leaves_the_earlier_ones(saved):
 
 
 def test_random_state_of_absent_devices_is_skipped(caplog):
-    state = checkpoint_module.RandomState().state_dict()
+    state = RandomState().state_dict()
     state["torch_cuda"] = [torch.zeros(16, dtype=torch.uint8)] * 99
     torch.rand(3)
     with caplog.at_level(logging.WARNING):
-        checkpoint_module.RandomState().load_state_dict(state)
+        RandomState().load_state_dict(state)
     assert "99 CUDA devices" in caplog.text
     assert torch.equal(torch.get_rng_state(), state["torch_cpu"])
 
@@ -284,21 +285,11 @@ def die_inside(run_dir: Path, function: str, call: int) -> None:
     run.save()
 
 
-@pytest.fixture(scope="module")
-def processes():
-    """Children fork from a clean server, which has imported torch once."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        ["dreamer_racing.training.checkpoint", "dreamer_racing.experience.replay", "torchrl.collectors"]
-    )
-    return context
-
-
-def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path, processes):
-    announced = processes.Value("q", 0)
+def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path):
+    announced = SERVER.Value("q", 0)
     leftovers = 0
     for delay in (0.002, 0.008, 0.014, 0.02, 0.026, 0.032):
-        process = processes.Process(target=save_forever, args=(tmp_path, announced))
+        process = SERVER.Process(target=save_forever, args=(tmp_path, announced))
         before = announced.value
         process.start()
         deadline = time.monotonic() + 30
@@ -321,8 +312,8 @@ def test_kill_during_a_save_leaves_a_loadable_checkpoint(tmp_path, processes):
     ("function", "call"),
     [("os.replace", call) for call in range(3)] + [("os.fsync", 0), ("os.fsync", 5), ("shutil.rmtree", 0)],
 )
-def test_kill_at_each_step_of_publishing(saved, processes, function, call):
-    process = processes.Process(target=die_inside, args=(saved, function, call))
+def test_kill_at_each_step_of_publishing(saved, function, call):
+    process = SERVER.Process(target=die_inside, args=(saved, function, call))
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
@@ -439,7 +430,7 @@ def forget_checksums(checkpoint: Path) -> None:
     """Make a checkpoint as those before there were checksums."""
     (checkpoint / CHECKSUMS).unlink()
     manifest = json.loads((checkpoint / "manifest.json").read_text())
-    del manifest["metadata"][checkpoint_module.HAS_CHECKSUMS]
+    del manifest["metadata"][HAS_CHECKSUMS]
     (checkpoint / "manifest.json").write_text(json.dumps(manifest))
 
 
@@ -504,7 +495,7 @@ def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved, checksums)
     file = next(newest.rglob("*-learner/*.pt"))
     torch.save({"weight": Payload(witness)}, file)
     if checksums == "of the lie":  # whoever can write a file can write its sum
-        checkpoint_module.write_checksums(newest)
+        write_checksums(newest)
     else:
         forget_checksums(newest)
     for read in (Run(saved).checkpoints.load, lambda: load_state(newest, "learner")):
@@ -524,7 +515,7 @@ def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(checkpoint_module, "_sync_tree", full)
+    monkeypatch.setattr(publishing, "_sync_tree", full)
     with pytest.raises(RunCheckpointError, match="No space left"):
         best.offer(2.0, 20)
     monkeypatch.undo()

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from dreamer_racing.figures.loggers import make_loggers
 from dreamer_racing.training import metrics as metrics_module
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.loggers import make_loggers
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 
 

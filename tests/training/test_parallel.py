@@ -14,7 +14,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dreamer_racing.experience.replay import StreamReplay, make_replay
-from dreamer_racing.learners.dreamer import DreamerLearner, LearnerConfig
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.losses import ActorPPOConfig, LossConfig, make_losses
 from dreamer_racing.modules import Agent, Interface, get_size

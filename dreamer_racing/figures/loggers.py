@@ -1,7 +1,7 @@
 """Loggers beside `metrics.csv`: TorchRL's own, that also take a run's configuration, pictures and films.
 
-Each is a `torchrl.record.loggers.Logger` and a `MediaLogger`; `make_loggers` chooses them by name. Nothing leaves the
-machine unless ``wandb="online"``.
+Each is a `torchrl.record.loggers.Logger` and a `training.media.MediaLogger`; `make_loggers` chooses them by name.
+Nothing leaves the machine unless ``wandb="online"``.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 import importlib.util
 import json
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import imageio.v2 as imageio
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
-from torchrl.record.loggers import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
@@ -28,23 +27,6 @@ GIF_FRAMES = 100  # of a film in TensorBoard, at most
 GIF_WIDTH = 320  # pixels, at most
 OUTCOMES = ("evaluation/success_rate", "evaluation/gates_per_episode", "evaluation/return_mean", "episode/return")
 """Metrics by which TensorBoard's table of hyperparameters compares runs."""
-
-
-@runtime_checkable
-class MediaLogger(Protocol):
-    """What a run asks of a logger beside scalars."""
-
-    def log_configuration(self, settings: Mapping[str, Any], text: str) -> None:
-        """Take a run's settings by dotted name, and the same as YAML."""
-        ...
-
-    def log_picture(self, name: str, file: Path, env_steps: int) -> None:
-        """Take a PNG file."""
-        ...
-
-    def log_film(self, name: str, file: Path, env_steps: int) -> None:
-        """Take an mp4 file."""
-        ...
 
 
 def make_loggers(
@@ -185,23 +167,6 @@ class WandbRunLogger(WandbLogger):
 
 
 RunLogger = TensorboardRunLogger | WandbRunLogger
-
-
-def log_evaluation(loggers: Sequence[Logger], directory: RunDirectory, env_steps: int) -> None:
-    """Give loggers what evaluations at these env_steps have left to look at.
-
-    Args:
-        loggers: those among them that are no `MediaLogger` are left out.
-        directory: of the run.
-        env_steps: of the evaluation.
-    """
-    stem = f"{env_steps:09d}"
-    for sink in loggers:
-        if isinstance(sink, MediaLogger):
-            for file in sorted(directory.plots.glob(f"{stem}*.png")):
-                sink.log_picture(f"evaluation{file.stem.removeprefix(stem)}/plot", file, env_steps)
-            for file in sorted(directory.videos.glob(f"{stem}*.mp4")):
-                sink.log_film(f"evaluation{file.stem.removeprefix(stem)}/film", file, env_steps)
 
 
 def read_film(file: Path, max_frames: int, max_width: int) -> tuple[np.ndarray, float]:

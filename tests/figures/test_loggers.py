@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 
 from dreamer_racing.figures.film import write_video
+from dreamer_racing.figures.loggers import make_loggers, read_film
 from dreamer_racing.training.directory import RunDirectory
-from dreamer_racing.training.loggers import log_evaluation, make_loggers, read_film
+from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 
 SETTINGS = {"seed": 3, "track": "circle", "env.decoys": None, "curriculum.relabel": True, "model.size": "cpu_small"}

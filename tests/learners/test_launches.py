@@ -12,8 +12,8 @@ from tensordict import TensorDict
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
-from dreamer_racing.launches import launches
 from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, clipped_actor
 from dreamer_racing.modules import Interface, get_size
 from tests.dreamers import learner_of
@@ -76,7 +76,7 @@ def test_kernels_waits_and_devices_are_told_apart() -> None:
     ):
         assert len(launches(waits).waits) == 1
     seen = launches(lambda: values.to("meta") + torch.ones(()))
-    assert len(seen.mixed) == 1 and seen.mixed[0].startswith("_to_copy at tests/test_launches.py:")
+    assert len(seen.mixed) == 1 and seen.mixed[0].startswith("_to_copy at learners/test_launches.py:")
     assert len(launches(lambda: torch.ones(3, device="meta").mul_(torch.ones(3))).mixed) == 1
     assert not launches(lambda: values * torch.ones(())).mixed, "a number goes with every device"
 
