@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/faults.py --kills 50 --json results/faults.json
 
-Every case is a short training by `recipes/dreamer_v3.py` in a process of its own, disturbed in one way and continued
+Every case is a short training by `recipes/dreamer_v3.py` in processes of its own, disturbed in one way and continued
 to its end: by the same command as long as it has no checkpoint, then by `resume=`. It *survived* if the last checkpoint
 then holds what that of an undisturbed run holds, bit for bit, the rows of metrics.csv, wall clock aside, are the same,
 no process left a traceback or another exit status than it should, and what was lost was said. Kinds of faults:
@@ -12,7 +12,8 @@ no process left a traceback or another exit status than it should, and what was 
 * `kill early`: SIGKILL just after the n-th file was opened for writing, for every n before the first checkpoint; once a
   checkpoint is there, the same command is to name it and how to go on;
 * `kill at open`, `kill at rename`, `kill at fsync`: SIGKILL at each of them in the second half of a run, which saves,
-  replaces checkpoints, evaluates, and finishes: just after an opening, just before a rename or an fsync;
+  replaces checkpoints and the best, evaluates, and finishes: just after an opening, just before a rename or an fsync,
+  in a random order, so that of a benchmark that is stopped a fair sample is left;
 * `SIGTERM`: at a random time, which is to end the process with the status 143;
 * `damage`: each file of the newest checkpoint in turn, with 16 bytes in its middle turned, with its second half cut
   off, removed;
@@ -43,20 +44,24 @@ from typing import Any
 import torch
 from measuring import print_table, write_json
 
+sys.path.append(str(Path(__file__).parents[1]))
 from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from tests.running_recipes import recipe
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
 SETTINGS = [
-    "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4",
+    "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=1",
     "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=600",
     "evaluation.every=400", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=200",
-    "checkpoint.keep=2", "logger.every=200", "logger=csv", "device=cpu", "total_env_steps=1200",
+    "checkpoint.keep=2", "logger.every=200", "logger=csv", "device=cpu", "seed=3",
+    "total_env_steps=1200",
 ]  # fmt: skip
 TO_THE_END = SETTINGS[-1]
 HALF_WAY = "total_env_steps=800"  # at an evaluation, so that this end leaves no row that a longer run has not
 CLOCKS = ("time/", "rate/", "wall_clock", "cpu_clock")  # columns that clocks write
 REFUSED = 2
+HUNG = 124  # as of `timeout`
 COUNT_CALLS = """
 import atexit, io, os, signal
 from dreamer_racing.training import checkpoint
@@ -128,8 +133,9 @@ def main() -> None:
     parser.add_argument("--sigterms", type=int, default=10, help="at random times")
     parser.add_argument("--most", type=int, help="of the cases of the other kinds, spread evenly; all if left out")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", help="written after each kind")
+    parser.add_argument("--json", help="written after each case")
     arguments = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"  # of every process to come, so that all compute the same
     draw, most = random.Random(arguments.seed), arguments.most
     with tempfile.TemporaryDirectory() as folder:
         arena = Arena(Path(folder))
@@ -139,19 +145,20 @@ def main() -> None:
                 "kill by the clock", max(1, arguments.kills // 5), draw, "checkpoint.minutes=1e-6"
             ),
             "early": lambda: arena.early_kills(most),
-            "open": lambda: arena.kills_at_calls("open", most),
-            "rename": lambda: arena.kills_at_calls("rename", most),
-            "fsync": lambda: arena.kills_at_calls("fsync", most),
+            "open": lambda: arena.kills_at_calls("open", most, draw),
+            "rename": lambda: arena.kills_at_calls("rename", most, draw),
+            "fsync": lambda: arena.kills_at_calls("fsync", most, draw),
             "sigterm": lambda: arena.terminations(arguments.sigterms, draw),
             "damage": lambda: arena.damages(most),
             "disk": arena.full_disks,
             "clock": arena.clocks,
             "not_finite": arena.not_finite,
         }
-        cases = []
+        cases: list[Case] = []
         for kind in arguments.faults:
-            cases += list(ways[kind]())
-            write_json([{"benchmark": "faults", **case} for case in cases], arguments.json)
+            for case in ways[kind]():
+                cases.append({"benchmark": "faults", **case})
+                write_json(cases, arguments.json)
     all_cases = Counter(case["fault"] for case in cases)
     survived = Counter(case["fault"] for case in cases if case["survived"])
     counts = [{"fault": kind, "cases": number, "survived": survived[kind]} for kind, number in all_cases.items()]
@@ -166,13 +173,16 @@ class Arena:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._number = 0
-        self._limit: float | None = None
         begun = time.monotonic()
-        if problem := self._to_its_end("whole"):
+        with self._start(*self._arguments("whole")) as process:
+            _, said = process.communicate()
+        if problem := trouble(process.returncode, said):
             raise SystemExit(f"the undisturbed run: {problem}")
         self._seconds = time.monotonic() - begun
         self._limit = 10 * self._seconds + 60
         self._whole = folder / "whole"
+        if latest_checkpoint(RunDirectory(self._whole).best.path).name != latest_checkpoint(self._whole).name:
+            raise SystemExit("the undisturbed run replaces no best at its end: another seed in SETTINGS is needed")
         print(f"an undisturbed run takes {self._seconds:.0f} s", flush=True)
 
     def kills(self, fault: str, number: int, draw: random.Random, *settings: str) -> Iterator[Case]:
@@ -216,12 +226,13 @@ class Arena:
         problem = problem or self._to_its_end(name)
         yield self._verdict("kill early", "the same command where a checkpoint is", name, problem)
 
-    def kills_at_calls(self, function: str, most: int | None) -> Iterator[Case]:
-        """Kill at calls of a function in the second half of a run."""
+    def kills_at_calls(self, function: str, most: int | None, draw: random.Random) -> Iterator[Case]:
+        """Kill at calls of a function in the second half of a run, in a random order."""
         name = self._half_way()
         done = self._run(f"resume={name}", TO_THE_END, before=COUNT_CALLS.format(name=function, last=0))
         total = int(done.stdout.rpartition("calls ")[2].split()[-1])
-        for call in spread(range(1, total + 1), most):
+        calls = spread(range(1, total + 1), most)
+        for call in draw.sample(calls, len(calls)):
             name = self._half_way()
             before = COUNT_CALLS.format(name=function, last=call)
             killed = self._run(f"resume={name}", TO_THE_END, before=before)
@@ -314,27 +325,20 @@ class Arena:
             return [f"resume={name}", TO_THE_END]
         return [f"run_dir={name}", *SETTINGS, *settings]
 
-    def _start(self, *overrides: str, before: str = "") -> subprocess.Popen[str]:
-        program = [str(RECIPE)]
-        if before:
-            start = f"import runpy, sys\nsys.path.insert(0, {str(RECIPE.parent)!r})\nsys.argv[0] = {str(RECIPE)!r}\n"
-            program = ["-c", f"{start}{before}\nrunpy.run_path({str(RECIPE)!r}, run_name='__main__')"]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    def _start(self, *overrides: str) -> subprocess.Popen[str]:
+        """Start a process that is disturbed by the clock, which is to find it while it imports, too."""
         return subprocess.Popen(
-            [sys.executable, *program, *overrides],
-            cwd=self._folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, str(RECIPE), *overrides],
+            cwd=self._folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
 
     def _run(self, *overrides: str, before: str = "") -> subprocess.CompletedProcess[str]:
-        """Run until it ends; one that hangs is killed, and has the status of that."""
-        with self._start(*overrides, before=before) as process:
-            try:
-                printed = process.communicate(timeout=self._limit)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                printed = process.communicate()
-                printed = (printed[0], f"{printed[1]}\nit hung for {self._limit:.0f} s")
-        return subprocess.CompletedProcess(overrides, process.returncode, *printed)
+        """Run until it ends, forked off one that has imported; what hangs is ended, with a status of its own."""
+        try:
+            return recipe(RECIPE.stem, *overrides, cwd=self._folder, timeout=self._limit, before=before)
+        except subprocess.TimeoutExpired as late:
+            said = f"it hung for {self._limit:.0f} s: {late.stderr!r}"
+            return subprocess.CompletedProcess(overrides, HUNG, "", said)
 
     def _to_its_end(self, name: str, *settings: str) -> str:
         """Begin or continue a run and let it be; return what is wrong with how it ends, or nothing."""

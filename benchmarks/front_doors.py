@@ -27,7 +27,7 @@ from measuring import print_table, write_json
 EXAMPLES = {"cleanrl": "CleanRL-style", "ppo": "TorchRL", "sb3": "Stable-Baselines3"}
 CURVE = ("env_steps", "seconds", "return", "gates")
 PROGRESS = re.compile(r"(\d+) steps: return (-?[\d.]+), ([\d.]+) gates an episode")
-RACES = re.compile(r"three laps from (\d+) of (\d+) noisy starts, (nan|[\d.]+) s a lap")
+RACES = re.compile(r"(sampled|mean) actions: three laps from (\d+) of (\d+) noisy starts, (nan|[\d.]+) s a lap")
 
 
 def main() -> None:
@@ -51,24 +51,34 @@ def run(name: str, env_steps: int) -> tuple[list[tuple[float, ...]], dict[str, A
     """Run an example; return its learning curve and what its races came to."""
     command = ["python", f"examples/{name}.py", "--env-steps", str(env_steps)]
     curve: list[tuple[float, ...]] = []
-    races, begun = None, time.monotonic()
+    races: dict[str, re.Match[str]] = {}
+    begun = time.monotonic()
     with subprocess.Popen([sys.executable, *command[1:]], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if row := PROGRESS.match(line):
                 curve.append((int(row[1]), round(time.monotonic() - begun, 1), float(row[2]), float(row[3])))
-            races = RACES.match(line) or races
-    if process.returncode or races is None:
+            if flown := RACES.match(line):
+                races[flown[1]] = flown
+    if process.returncode or len(races) != 2:
         raise SystemExit(f"{' '.join(command)}: exit status {process.returncode}")
-    lap = float(races[3])
     return curve, {
         "example": name,
         "command": " ".join(command),
         "env_steps": curve[-1][0],
         "training_s": curve[-1][1],
-        "finished": int(races[1]),
-        "starts": int(races[2]),
-        "lap_s": None if math.isnan(lap) else lap,
+        **{key: value for actions, flown in races.items() for key, value in _outcome(actions, flown).items()},
+    }
+
+
+def _outcome(actions: str, flown: re.Match[str]) -> dict[str, Any]:
+    """Return what flights by sampled or by mean actions came to; the first under plain names."""
+    prefix = "" if actions == "sampled" else f"{actions}_"
+    lap = float(flown[4])
+    return {
+        f"{prefix}finished": int(flown[2]),
+        f"{prefix}starts": int(flown[3]),
+        f"{prefix}lap_s": None if math.isnan(lap) else lap,
     }
 
 

@@ -35,6 +35,8 @@ ATTACKS = {
     "a checkpoint from elsewhere": ("checkpoints",),
 }  # fmt: skip
 """Kinds of attacks by the fault that a row is about."""
+CALLS = re.compile(r"(?:call|after opening) \d+ of (\d+)")
+"""Where a case was killed that is one of so many."""
 
 
 def main() -> None:
@@ -57,7 +59,9 @@ def read_results(folder: Path) -> dict[str, str]:
     for kind in dict.fromkeys(record["fault"] for record in faults):
         cases = [record for record in faults if record["fault"] == kind]
         survived = sum(record["survived"] for record in cases)
-        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived ({cases[0]['commit']})"
+        there = max((int(calls[1]) for case in cases if (calls := CALLS.fullmatch(case.get("where", "")))), default=0)
+        among = f", among {there}" if there > len(cases) else ""
+        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived{among} ({cases[0]['commit']})"
     for record in _read(folder / "fuzz.json"):
         phrases[record["kind"]] = (
             f"{record['kind']}: {record['failed']} of {record['cases']:,} failed ({record['commit']})"

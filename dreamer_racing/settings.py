@@ -27,8 +27,12 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         """Say it in words."""
-        below = f"above {self.low:g}" if self.open_below else f"at least {self.low:g}"
-        return below if self.high == math.inf else f"{below} and at most {self.high:g}"
+        below = f"{'above' if self.open_below else 'at least'} {_in_digits(self.low)}"
+        return below if self.high == math.inf else f"{below} and at most {_in_digits(self.high)}"
+
+
+def _in_digits(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:g}"
 
 
 POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)

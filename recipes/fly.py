@@ -29,7 +29,7 @@ from composing.schema import EvaluateConfig
 from hydra.core.config_store import ConfigStore
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import tensor
+from torch import set_num_threads, tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
@@ -93,6 +93,7 @@ PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted":
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
     start_logging()
+    set_num_threads(1)  # a single drone: further threads would wait, and keep cores busy with it
     with plain_errors():
         check(config)
     if config.viewer:

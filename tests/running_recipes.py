@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Self
 
 import hydra
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from tests.forked import Forked
 
@@ -79,7 +79,7 @@ def module_of(folder: str, name: str) -> ModuleType:
         sys.path.pop(0)
 
 
-def compose(recipe_name: str, *overrides: str) -> OmegaConf:
+def compose(recipe_name: str, *overrides: str) -> DictConfig:
     recipe_module("composing.schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         return hydra.compose(recipe_name, overrides=list(overrides))
@@ -137,4 +137,5 @@ class Process:
     def __exit__(self, *error: object) -> None:
         self.running.kill()
         self.running.wait()
-        self.running.stdout.close()
+        if self.running.stdout is not None:
+            self.running.stdout.close()

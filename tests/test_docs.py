@@ -169,9 +169,13 @@ def test_every_attack_of_the_benchmarks_is_in_a_row_and_what_was_not_measured_sa
 ) -> None:
     page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
     records = [{"fault": "damage", "survived": index != 1, "commit": "abc"} for index in range(3)]
+    records += [
+        {"fault": "kill at fsync", "where": f"call {call} of 9", "survived": True, "commit": "d"} for call in (2, 7)
+    ]
     (tmp_path / "faults.json").write_text(json.dumps(records))
     filled = reliability.fill(page, reliability.read_results(tmp_path))
     assert "damage: 2 of 3 survived (abc); checkpoints: not measured |" in filled
+    assert "kill at rename: not measured; kill at fsync: 2 of 2 survived, among 9 (d) |" in filled
     attacks = {kind for kinds in reliability.ATTACKS.values() for kind in kinds}
     faults, fuzz = ((ROOT / "benchmarks" / f"{name}.py").read_text(encoding="utf-8") for name in ("faults", "fuzz"))
     named = set(re.findall(r'(?:_verdict|arena\.kills)\(\s*f?"([^"]+)"', faults))

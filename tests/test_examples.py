@@ -66,16 +66,18 @@ def test_ppo_of_others(
 ) -> None:
     if name == "sb3":
         pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
-    *curve, last = run(name, *arguments, cwd=tmp_path).splitlines()
+    *curve, sampled, mean = run(name, *arguments, cwd=tmp_path).splitlines()
     rows = [row for row in map(benchmark.PROGRESS.fullmatch, curve) if row]
     assert int(rows[-1][1]) == steps and -30.0 < float(rows[-1][2]) < 30.0 and float(rows[-1][3]) < 3.0
-    races = benchmark.RACES.fullmatch(last)
-    assert races and races.groups() == ("0", "100", "nan"), "nobody has learnt yet"
+    races = {actions: benchmark.RACES.fullmatch(line) for actions, line in (("sampled", sampled), ("mean", mean))}
+    for actions, race in races.items():
+        assert race and race.groups() == (actions, "0", "100", "nan"), "nobody has learnt yet"
 
 
 def test_curves_are_read_off_what_examples_print(benchmark: ModuleType, tmp_path: Path, monkeypatch) -> None:
     said = ["128 steps: return -3.5, 0.1 gates an episode", "256 steps: return 210.0, 17.5 gates an episode"]
-    said.append("three laps from 93 of 100 noisy starts, 2.61 s a lap")
+    said.append("sampled actions: three laps from 93 of 100 noisy starts, 2.61 s a lap")
+    said.append("mean actions: three laps from 0 of 100 noisy starts, nan s a lap")
     (tmp_path / "examples").mkdir()
     (tmp_path / "examples" / "ppo.py").write_text("".join(f"print({line!r})\n" for line in said))
     monkeypatch.chdir(tmp_path)
@@ -84,6 +86,7 @@ def test_curves_are_read_off_what_examples_print(benchmark: ModuleType, tmp_path
     (record,) = json.loads((tmp_path / "out" / "ppo.json").read_text())
     assert record["command"] == "python examples/ppo.py --env-steps 200"
     assert (record["env_steps"], record["finished"], record["starts"], record["lap_s"]) == (256, 93, 100, 2.61)
+    assert (record["mean_finished"], record["mean_starts"], record["mean_lap_s"]) == (0, 100, None)
     rows = [line.split(",") for line in (tmp_path / "out" / "ppo.csv").read_text().splitlines()]
     assert rows[0] == list(benchmark.CURVE) and [rows[2][0], *rows[2][2:]] == ["256", "210.0", "17.5"]
     assert (tmp_path / "out" / "curves.png").stat().st_size > 5_000

@@ -292,9 +292,12 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
 class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     """N drones racing at once in one process, much faster than N single environments.
 
-    Episodes begin by themselves in Gymnasium's mode NEXT_STEP: the step in which an episode ends returns its last
+    Episodes begin anew in one of Gymnasium's modes. NEXT_STEP: the step in which an episode ends returns its last
     observation, and the step after it ignores that environment's action and returns the first observation of the next
-    episode with reward 0. Every entry of `info` is there for every environment (`info["_" + name]` is all true).
+    episode with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the
+    last one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: whoever steps begins them, by
+    `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. Every entry of `info` but these two is there
+    for every environment (`info["_" + name]` is all true).
 
     Args:
         num_envs: N.
@@ -305,6 +308,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`) or parameters.
         max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
+        autoreset_mode: `NextStep`, `SameStep` or `Disabled`.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
@@ -334,12 +338,15 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
         max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **worlds: Unpack[WorldOptions],
     ) -> None:
+        self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
             worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps") or max_episode_steps)
         self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
-        self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
+        own = {"render_fps": self.race.frames_per_second, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**self.metadata, **own}
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_action_space = self.race.action_space()
@@ -351,19 +358,24 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode everywhere; a seed makes all that follow reproducible. There are no options.
+        """Begin an episode everywhere, or where it is asked for; a seed makes all that follow reproducible.
+
+        Args:
+            seed: of all environments together.
+            options: `reset_mask`, (N,) bool: where an episode begins; the others fly on.
 
         Raises:
-            ValueError: the seed is a list: all environments draw from one generator.
+            ValueError: the seed is a list, for all environments draw from one generator; or the mask is none.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise ValueError(f"seed={seed!r}: one number seeds all {self.num_envs} environments together.")
+        mask = self._reset_mask(options)
         super().reset(seed=seed)
         if seed is not None:
             self.race.worlds.seed(int(seed))
-        self.race.begin()
-        self._ended[:] = False
-        return self.race.observe(), self._masked(self.race.info(None))
+        self.race.begin(None if mask.all() else mask)
+        self._ended &= ~mask
+        return self.race.observe(), self._masked(self.race.info(None), mask)
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one control step, or begin an episode where the last one has ended.
@@ -372,17 +384,28 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             actions: (N, 4); values beyond [-1, 1] are clipped, and one that is not finite is a crash of its drone.
 
         Raises:
+            ResetNeeded: in mode DISABLED, an episode has ended and none has begun since.
             ValueError: wrong shape.
         """
         begun = self._ended
+        if begun.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            where = begun.nonzero()[0].tolist()
+            raise gymnasium.error.ResetNeeded(f"step() where episodes have ended, {where}: reset them by a reset_mask.")
         outcome, reward = self.race.step(actions)
         if begun.any():
             self.race.begin(begun)
         terminated = outcome.terminated.numpy() & ~begun
         truncated = outcome.truncated.numpy() & ~begun
-        self._ended = terminated | truncated
+        ended = terminated | truncated
         info = self._masked(self.race.info(outcome, begun))
-        return self.race.observe(), np.where(begun, 0.0, reward), terminated, truncated, info
+        observation = self.race.observe()
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            info |= {**self._final(observation, ended), "final_info": dict(info), "_final_info": ended}
+            self.race.begin(ended)
+            info |= self._masked(self.race.info(outcome, ended))
+            observation, ended = self.race.observe(), np.zeros_like(ended)
+        self._ended = ended
+        return observation, np.where(begun, 0.0, reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
@@ -392,7 +415,31 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """Free rendering contexts and threads."""
         self.race.close()
 
-    def _masked(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Add Gymnasium's masks of which environments an entry is there for: all of them."""
-        entries = {name: self._masked(value) if isinstance(value, dict) else value for name, value in info.items()}
-        return entries | {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in info}
+    def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        if getattr(mask, "dtype", None) != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"reset_mask={mask!r}: an array of {self.num_envs} bool, one of them true at least.")
+        return mask
+
+    def _final(self, observation: Observation, ended: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the last observation of each episode that ended, None elsewhere, as Gymnasium has them."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for index in ended.nonzero()[0]:
+            final[index] = row_of(observation, int(index))
+        return {"final_obs": final, "_final_obs": ended}
+
+    def _masked(self, info: dict[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
+        """Add Gymnasium's masks of which environments an entry is there for: all of them, unless masked (N,) bool."""
+        there = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        entries = {
+            name: self._masked(value, mask) if isinstance(value, dict) else value for name, value in info.items()
+        }
+        return entries | {f"_{name}": there.copy() for name in info}
+
+
+def _mode(mode: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        known = ", ".join(repr(known.value) for known in AutoresetMode)
+        raise ValueError(f"autoreset_mode={mode!r}: choose one of {known}.") from error

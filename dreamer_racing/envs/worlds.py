@@ -79,7 +79,8 @@ class RaceWorlds:
         device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and of the randomisation of physics and looks.
-        start_beyond_gate: share of training episodes that begin behind a gate; see `StartSampler`.
+        start_beyond_gate: share of training episodes, but for those on the line, that begin behind a gate; see
+            `StartSampler`.
         start_at_gate: share of the others, but for those on the line, that begin before a gate instead of at the start.
         start_on_line: share of training episodes that begin on a planned racing line, which takes some seconds to plan.
         start_noise: of evaluation starts, as a multiple of the noise of training starts.

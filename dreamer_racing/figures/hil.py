@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.trajectory import Trajectory, read_trajectory
@@ -30,7 +32,7 @@ from dreamer_racing.hil.progress import GatePass
 
 REPORT, LATENCY, TRAJECTORY, TRACKING = "report.json", "report_latency.png", "report_flight.png", "report_tracking.png"
 SHORTEST = 0.01
-"""ms, where the axis of latencies begins [choice]."""
+"""ms, as which a latency below it, or none at all, is drawn: the axis is logarithmic [choice]."""
 ASKED_COLOR, MEASURED_COLOR = INK, "#f2711c"
 LABELS = {
     "collective_thrust": "thrust (m/s²)",
@@ -179,12 +181,20 @@ def _draw_latencies(latency: dict[str, Any], rate: float | None, path: Path) -> 
     if rate:
         axes.axvline(1e3 / rate, color=MUTED, linestyle=(0, (4, 3)), linewidth=1.0, label=f"period, {1e3 / rate:g} ms")
     axes.set_yticks(rows, [name.replace("_", " ") for name in stages])
-    axes.set(xscale="log", xlabel=f"ms, of {latency['of']}", ylim=(len(stages) - 0.4, -0.6))
-    axes.set_xlim(left=SHORTEST)
+    axes.set(xscale="log", xlabel=f"ms, of {latency['of']} (n = {latency['ticks']:,})", ylim=(len(stages) - 0.4, -0.6))
+    axes.set_xlim(*_decades([value for column in values.values() for value in column] + ([1e3 / rate] if rate else [])))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.set_title(f"latencies; deadlines missed: {latency['missed_deadlines']}", loc="left", fontsize=10, color=INK)
     dress(axes)
+    axes.tick_params(which="minor", length=0)
     figure.legend(loc="outside lower left", ncols=4, frameon=False, fontsize=8)
     save(figure, path)
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    """Return the powers of ten around positive values, so that none lies on the edge; one decade if there is none."""
+    low, high = min(values, default=1.0), max(values, default=1.0)
+    return 10.0 ** math.floor(math.log10(0.8 * low)), 10.0 ** math.ceil(math.log10(1.25 * high))
 
 
 def _draw_tracking(
@@ -199,6 +209,7 @@ def _draw_tracking(
         axes.set_ylabel(LABELS[name], fontsize=8)
         axes.set_title(_error_in_words(name, errors[name]), loc="left", fontsize=8, color=MUTED)
         dress(axes)
+    figure.align_ylabels(panels)
     panels[-1].set_xlabel("time since arming (s); thrust is measured from velocities, less drag")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=2, frameon=False, fontsize=8)

@@ -160,7 +160,8 @@ def latencies(flight: FlownFlight) -> dict[str, Any]:
     }
     table = {name: percentiles(values[np.isfinite(values)].tolist()) for name, values in stages.items()}
     missed = int(flight.overrun.sum())
-    return {"of": "armed ticks" if armed else "all ticks", "stages": table, "missed_deadlines": missed}
+    of = "armed ticks" if armed else "all ticks"
+    return {"of": of, "ticks": int(ticks.sum()), "stages": table, "missed_deadlines": missed}
 
 
 def gate_passes(flight: FlownFlight) -> list[GatePass]:

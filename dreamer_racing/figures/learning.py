@@ -295,7 +295,7 @@ def _draw_bar(axes: Axes, place: int, result: VariantResult, name: str) -> None:
         axes.barh(place, values.mean(), xerr=error, color=color, error_kw=ERROR, height=0.65)
     else:  # a bar from zero would make the worst of what is negative look the largest
         axes.errorbar(values.mean(), place, xerr=error, fmt="D", markersize=8, color=color, **ERROR)
-    axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4)
+    axes.plot(values, np.full(len(values), place), "o", color="white", markeredgecolor=INK, markersize=4, clip_on=False)
     right = max(values.max(), values.mean() + (error or 0.0))
     count = f"n = {len(values)}"
-    axes.annotate(count, (right, place), xytext=(6, 0), textcoords="offset points", va="center", **SMALL)
+    axes.annotate(count, (right, place), xytext=(9, 0), textcoords="offset points", va="center", **SMALL)

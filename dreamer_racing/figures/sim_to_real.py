@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from dreamer_racing.figures.drawing import dress, save
+from dreamer_racing.figures.drawing import INK, MUTED, dress, from_zero, save
+from dreamer_racing.figures.protocol import Bar, mean_bar, share_bar
 
 LABELS = {
     "delay": ("command delay (ms)", 1e3),
@@ -24,58 +25,89 @@ LABELS = {
 """Label of each sweep's axis, and by what its values are multiplied there."""
 
 COLORS = ("#2f5fb3", "#e8590c", "#1fa2a6", "#7950f2")
+APART = 0.16
+"""Between two studies at one value, in steps from value to value: what lies over each other cannot be told apart."""
+NOTE = "Lines: 95 % interval over n flights (Wilson's of success, the normal one of mean laps). Values not to scale."
 
 
 def plot_study(results: Sequence[Mapping[str, Any]], path: str | Path) -> None:
-    """Draw studies over each other: above the share of flights that finished, below the mean lap.
+    """Draw studies beside each other: above the share of flights that finished, below the mean lap of those with one.
 
     Args:
         results: As recipes/sim_to_real.py writes them, one for each flyer.
         path: The file to write.
 
     Raises:
-        ValueError: They hold no flight.
+        ValueError: They hold no flight, or there are more than can be told apart.
     """
     sweeps = [name for name in LABELS if any(flight["sweep"] == name for r in results for flight in r["flights"])]
     if not sweeps:
         raise ValueError("These studies hold no flight: there is nothing to draw.")
-    figure = Figure(figsize=(max(7.0, 2.6 * len(sweeps) + 0.6), 5.0), layout="constrained")
+    if len(results) > len(COLORS):
+        raise ValueError(f"{len(results)} studies: no more than {len(COLORS)} go into one picture.")
+    figure = Figure(figsize=(max(7.0, 2.6 * len(sweeps) + 0.6), 5.6), layout="constrained")
     panels: np.ndarray = figure.subplots(2, len(sweeps), sharex="col", sharey="row", squeeze=False)
-    for result, color in zip(results, COLORS, strict=False):
-        made = result["provenance"]
-        label = f"{made['actor']} on {made['track']}, {made['preset']}, n = {made['flights']}"
-        for column, sweep in zip(panels.T, sweeps, strict=True):
-            _draw(column, sweep, [flight for flight in result["flights"] if flight["sweep"] == sweep], color, label)
     for column, sweep in zip(panels.T, sweeps, strict=True):
-        column[1].set_xlabel(LABELS[sweep][0])
-        for axes in column:
-            dress(axes)
-    panels[0, 0].set_ylabel("flights that finished")
-    panels[0, 0].set_ylim(-0.03, 1.05)
-    panels[0, 0].yaxis.set_major_formatter(PercentFormatter(1.0))
-    panels[1, 0].set_ylabel("lap (s)")
+        _draw_sweep(column, sweep, results)
+    _dress_rows(panels)
+    figure.align_ylabels(panels[:, 0])
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, fontsize=8, ncols=len(labels))
+    figure.supxlabel(NOTE, x=0.01, ha="left", fontsize=8, color=MUTED)
     save(figure, path)
 
 
-def _draw(column: np.ndarray, sweep: str, flights: Sequence[Mapping[str, Any]], color: str, label: str) -> None:
-    """Draw one sweep of one study into its two panels."""
-    values = sorted({flight["value"] for flight in flights})
-    by_value = [[flight for flight in flights if flight["value"] == value] for value in values]
-    at = LABELS[sweep][1] * np.array(values)
-    success = [np.mean([flight["finished"] for flight in group]) for group in by_value]
-    laps = [_mean([flight["lap_time"] for flight in group]) for group in by_value]
-    above, below = column
-    _line(above, at, np.array(success), color, label)
-    _line(below, at, np.array(laps), color, label)
+def _draw_sweep(column: np.ndarray, sweep: str, results: Sequence[Mapping[str, Any]]) -> None:
+    """Draw one sweep of all studies into its two panels, value beside value."""
+    flown = [[flight for flight in result["flights"] if flight["sweep"] == sweep] for result in results]
+    values = sorted({flight["value"] for flights in flown for flight in flights})
+    for number, (result, flights, color) in enumerate(zip(results, flown, COLORS, strict=False)):
+        made = result["provenance"]
+        label = f"{made['actor']} on {made['track']}, {made['preset']}"
+        by_value = [[flight for flight in flights if flight["value"] == value] for value in values]
+        shift = APART * (number - 0.5 * (len(results) - 1))
+        for axes, bar_of in zip(column, (_success, _laps), strict=True):
+            _draw_bars(axes, shift, [bar_of(group) for group in by_value], color, label)
+    label, unit = LABELS[sweep]
+    column[1].set_xlabel(label)
+    column[1].set_xticks(range(len(values)), [f"{unit * value:g}" for value in values])
+    column[1].set_xlim(-0.6, len(values) - 0.4)
 
 
-def _line(axes: Axes, at: np.ndarray, values: np.ndarray, color: str, label: str) -> None:
-    axes.plot(at, values, "o-", color=color, label=label, markersize=4, linewidth=1.5, clip_on=False)
+def _success(flights: Sequence[Mapping[str, Any]]) -> Bar | None:
+    return share_bar([flight["finished"] for flight in flights]) if flights else None
 
 
-def _mean(values: Sequence[float | None]) -> float:
-    """Mean of what is there; not a number if nothing is."""
-    there = [value for value in values if value is not None]
-    return float(np.mean(there)) if there else np.nan
+def _laps(flights: Sequence[Mapping[str, Any]]) -> Bar | None:
+    laps = [flight["lap_time"] for flight in flights if flight["lap_time"] is not None]
+    return mean_bar(laps) if laps else None
+
+
+def _draw_bars(axes: Axes, shift: float, bars: Sequence[Bar | None], color: str, label: str) -> None:
+    """Draw means with their intervals and n above; a value without any is a gap."""
+    heights = [np.nan if bar is None else bar.height for bar in bars]
+    ends = np.array([(0.0, 0.0) if bar is None else (bar.height - bar.low, bar.high - bar.height) for bar in bars]).T
+    at = np.arange(len(bars)) + shift
+    axes.plot(at, heights, color=color, linewidth=1.0, alpha=0.5)
+    style: dict[str, Any] = {"fmt": "o", "markersize": 4, "elinewidth": 1.2, "capsize": 2.5}
+    axes.errorbar(at, heights, yerr=ends.clip(0.0), color=color, label=label, **style)
+    for place, bar in zip(at, bars, strict=True):
+        if bar is not None:
+            above: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 6}
+            axes.annotate(f"{bar.n}", (place, bar.high), (0, 3), color=color, **above)
+
+
+def _dress_rows(panels: np.ndarray) -> None:
+    success, laps = panels[:, 0]
+    for axes in panels.flat:
+        dress(axes)
+    success.set_ylabel("flights that finished")
+    success.set_ylim(-0.04, 1.16)
+    success.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
+    success.yaxis.set_major_formatter(PercentFormatter(1.0))
+    laps.set_ylabel("lap (s)")
+    laps_flown = [line.get_ydata() for axes in panels[1] for line in axes.lines]
+    if not any(np.isfinite(np.asarray(heights, float)).any() for heights in laps_flown):
+        from_zero(laps)
+        for axes in panels[1]:
+            axes.text(0.5, 0.5, "no lap", transform=axes.transAxes, ha="center", va="center", color=INK, fontsize=9)

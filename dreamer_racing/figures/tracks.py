@@ -39,5 +39,5 @@ def plot_tracks(tracks: Sequence[Track], path: str | Path) -> None:
         above.set_xlabel("")
         draw_track_side(side, track)
         title = f"{track.name}: {track.num_gates} gates, {sum(track.gate_distances):.1f} m"
-        above.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
+        cell.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)  # of the cell: a map's own height moves it
     save(figure, path)

@@ -9,16 +9,16 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import TextIO
 
-from tqdm import tqdm
+from dreamer_racing.training.live_table import LiveTable
 
 SHOWN = {"return": "episode/return", "gates": "episode/gates_passed", "loss": "loss", "updates/s": "rate/updates"}
-"""Metrics that are shown, by the word they are shown under."""
+"""Metrics of a line, by the word they are shown under."""
 KEPT = {"success": "evaluation/success_rate"}
 """Those that are shown until there are newer ones."""
 
 
 class Progress:
-    """A bar in a terminal; elsewhere, where carriage returns would pile up in a log, a line now and then.
+    """A bar and a table in a terminal; elsewhere, where carriage returns would pile up in a log, a line now and then.
 
     Args:
         total: env_steps at the end.
@@ -37,42 +37,42 @@ class Progress:
         self._env_steps = env_steps
         self._kept: dict[str, str] = {}
         self._since, self._from = time.monotonic(), env_steps  # of the latest line
-        terminal = shown and sys.stderr.isatty()
-        self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True) if terminal else None
+        self._table = LiveTable(total, env_steps) if shown and sys.stderr.isatty() else None
 
     def advance(self, env_steps: int) -> None:
         """Take note of how far the run is."""
         self._env_steps = env_steps
-        if self._bar is not None:
-            self._bar.update(env_steps - self._bar.n)
+        if self._table is not None:
+            self._table.advance(env_steps)
 
     def show(self, metrics: Mapping[str, float], unsaved: Mapping[str, int] | None = None) -> None:
         """Show the latest numbers, and what cannot be written since which env_steps."""
+        failing = "; ".join(f"{what} since {env_steps:,}" for what, env_steps in (unsaved or {}).items())
+        if self._table is not None:
+            self._table.show(metrics, failing)
+            return
         self._kept |= {word: f"{metrics[name]:.0%}" for word, name in KEPT.items() if name in metrics}
         numbers = {word: f"{metrics[name]:.2f}" for word, name in SHOWN.items() if name in metrics}
-        failing = "; ".join(f"{what} since {env_steps:,}" for what, env_steps in (unsaved or {}).items())
-        numbers = ({"NOT SAVED": failing} if failing else {}) | numbers | self._kept
-        if self._bar is not None:
-            self._bar.set_postfix(numbers)
-        elif time.monotonic() - self._since >= self._seconds:
+        if self._shown and time.monotonic() - self._since >= self._seconds:
+            numbers = ({"NOT SAVED": failing} if failing else {}) | numbers | self._kept
             self._write_line(", ".join(f"{word} {number}" for word, number in numbers.items()))
 
     def evaluating(self, episodes: int, total: int) -> None:
         """Show how far an evaluation is, until there are numbers to show; a log has no use for it."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(f"evaluating: {episodes} of {total} episodes")
+        if self._table is not None:
+            self._table.evaluating(episodes, total)
 
     def say(self, text: str) -> None:
         """Say something in a line of its own."""
-        if self._bar is not None:
-            self._bar.write(text)
+        if self._table is not None:
+            self._table.say(text)
         elif self._shown:
             _write(text, sys.stdout)
 
     def close(self) -> None:
-        """Leave the bar as it stands."""
-        if self._bar is not None:
-            self._bar.close()
+        """Leave bar and table as they stand."""
+        if self._table is not None:
+            self._table.close()
 
     def __enter__(self) -> Progress:
         return self

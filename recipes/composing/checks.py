@@ -129,6 +129,12 @@ def check_race(config: RunConfig) -> None:
             raise
         except ValueError as error:
             raise ValueError(f"{group}.{error}") from error
+    moves = isinstance(config, DreamerConfig) and config.schedule.start_on_line.to is not None
+    if config.env.start_on_line == 1 and config.env.start_beyond_gate and not moves:
+        raise ValueError(
+            f"env.start_beyond_gate={config.env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
+            "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
+        )
 
 
 def check_replay(config: ReplayRunConfig) -> None:

@@ -1,6 +1,5 @@
 """Launching a recipe: from what hydra composed to a run that trains, begun or continued."""
 
-import os
 import shlex
 import signal
 import sys
@@ -162,12 +161,25 @@ def is_finished(config: DictConfig) -> bool:
 
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
-    """Say what a finished run left, and which commands go on from there."""
-    place, longer = shlex.quote(os.path.relpath(directory.path)), 2 * config.total_env_steps
-    lines = [
-        f"{place}: {', '.join(sorted(path.name for path in directory.path.iterdir() if path.name[0] != '.'))}",
-        f"evaluate it:  {command('evaluate')} checkpoint={place} episodes=100",
-        f"watch it fly: {command('fly')} agent={place}" if is_race(config) else "",
-        f"go on:        {command(config.algorithm)} resume={place} total_env_steps={longer}",
-    ]
-    return "\n".join(filter(None, lines))
+    """Say where best policy, latest film and latest plot of a finished run are, and which commands go on from there."""
+    left = {
+        "run": directory.path,
+        "best policy": directory.best.path,
+        "film": max(directory.videos.glob("*.mp4"), default=None),
+        "plot": max(directory.plots.glob("*.png"), default=None),
+    }
+    place, longer = shlex.quote(_from_here(directory.path)), 2 * config.total_env_steps
+    commands = {
+        "evaluate it": f"{command('evaluate')} checkpoint={place} episodes=100",
+        "watch it fly": f"{command('fly')} agent={place}" if is_race(config) else "",
+        "draw it": f"{command('plot')} runs={place} output=figures",
+        "go on": f"{command(config.algorithm)} resume={place} total_env_steps={longer}",
+    }
+    files = {what: _from_here(path) for what, path in left.items() if path is not None and path.exists()}
+    return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)
+
+
+def _from_here(path: Path) -> str:
+    """Return a path as one would type it: relative where it lies below."""
+    path, here = path.absolute(), Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)

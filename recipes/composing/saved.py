@@ -34,11 +34,12 @@ def trained_config(run_dir: Path) -> RunConfig:
     Raises:
         ValueError: by an unknown algorithm.
     """
-    saved = read_yaml(RunDirectory(run_dir).config, DictConfig)
-    algorithm = saved.get("algorithm", DreamerConfig.algorithm)
+    path = RunDirectory(run_dir).config
+    saved = read_yaml(path, DictConfig)
+    algorithm = str(saved.get("algorithm", DreamerConfig.algorithm))
     if algorithm not in RECIPES:
-        raise ValueError(f"{RunDirectory(run_dir).config}: algorithm={algorithm}; there are {', '.join(RECIPES)}.")
-    return cast(RunConfig, OmegaConf.to_object(with_schema(saved, algorithm)))
+        raise ValueError(f"{path}: algorithm={shortened(algorithm)}; there are {', '.join(RECIPES)}.")
+    return cast(RunConfig, OmegaConf.to_object(whole(with_schema(saved, algorithm), path)))
 
 
 def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
@@ -51,6 +52,17 @@ def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
     except OmegaConfBaseException as error:
         reason = str(error).replace("\n", " ")
         raise ValueError(f"The configuration of a saved run does not fit: {shortened(reason, 300)}") from error
+
+
+def whole(config: DictConfig, path: Path) -> DictConfig:
+    """Return a configuration that was read from a path, if it says all that has no default.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if missing := sorted(OmegaConf.missing_keys(config)):
+        raise ValueError(f"{path} is damaged: it does not say {shortened(', '.join(missing))}.")
+    return config
 
 
 def read_yaml(path: Path, kind: type[Config]) -> Config:
@@ -126,11 +138,12 @@ def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
     Raises:
         ValueError: it is another algorithm's run.
     """
-    saved = read_yaml(RunDirectory(run_dir).config, DictConfig)
+    path = RunDirectory(run_dir).config
+    saved = read_yaml(path, DictConfig)
     trained_by = saved.get("algorithm", algorithm)
     if trained_by != algorithm:
         raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    config = with_schema(saved, algorithm)
+    config = whole(with_schema(saved, algorithm), path)
     if "tuned" in config and "tuned" not in saved:
         config.tuned = "none"  # begun before there was a choice
     return config

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from torchrl.envs import GymEnv
+from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing
@@ -23,6 +23,7 @@ from dreamer_racing.envs.worlds import RaceWorlds
 
 IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
 HOVER = np.array([QuadrotorParameters().hover_action, 0.0, 0.0, 0.0], np.float32)
+CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
 INFO = {"gates_passed", "gate_offset", "lap_time", "crash", "finished", "reward_base", "body_rate_norm"}
 
 
@@ -313,6 +314,73 @@ def test_every_mode_of_make_vec(mode: str | None, kind: type) -> None:
     assert observations.shape == (2, 21) and rewards.shape == terminated.shape == truncated.shape == (2,)
     assert list(info["crash"]) == ["none", "none"]
     envs.close()
+
+
+def poisoned(num_envs: int, index: int) -> np.ndarray:
+    """Hovering, but for one, which crashes by an action that is not finite."""
+    actions = np.tile(HOVER, (num_envs, 1))
+    actions[index] = np.nan
+    return actions
+
+
+@pytest.mark.parametrize("observation", ["vector", "both"])
+def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> None:
+    envs = make_vec(observation=observation, autoreset_mode="SameStep", evaluation=True)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    start, _ = envs.reset(seed=0)
+    last, rewards, terminated, truncated, info = make_and_poison(envs)
+    assert list(terminated) == [False, True, False] and not truncated.any() and rewards[1] == -4.0
+    assert list(info["_final_obs"]) == list(info["_final_info"]) == [False, True, False]
+    assert info["final_info"]["crash"][1] == "invalid_action" and info["crash"][1] == "none"
+    assert info["final_obs"][0] is None and info["final_obs"][2] is None
+    of = (lambda seen: seen) if observation == "vector" else (lambda seen: seen["position"])
+    assert not np.allclose(of(last)[0], of(start)[0])  # flies on
+    np.testing.assert_allclose(of(last)[1], of(start)[1], atol=1e-6)  # at the start again: evaluation
+    assert not np.allclose(of(info["final_obs"][1]), of(start)[1], atol=1e-6)
+    assert "final_obs" not in envs.step(np.tile(HOVER, (3, 1)))[-1]
+    envs.close()
+
+
+def make_and_poison(envs: DroneRaceVectorEnv) -> tuple:
+    """Fly a little, then let the second one crash."""
+    for _ in range(3):
+        envs.step(np.tile(HOVER + CLIMB, (3, 1)))
+    return envs.step(poisoned(3, 1))
+
+
+def test_in_mode_disabled_episodes_begin_where_they_are_reset() -> None:
+    envs = make_vec(observation="vector", autoreset_mode=AutoresetMode.DISABLED, evaluation=True)
+    start, _ = envs.reset(seed=0)
+    last, _, terminated, _, _ = make_and_poison(envs)
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"ended, \[1\]"):
+        envs.step(np.tile(HOVER, (3, 1)))
+    observation, info = envs.reset(options={"reset_mask": terminated})
+    np.testing.assert_allclose(observation[1], start[1], atol=1e-6)
+    np.testing.assert_array_equal(observation[[0, 2]], last[[0, 2]])  # they did not notice
+    assert list(info["_crash"]) == [False, True, False]
+    assert not envs.step(np.tile(HOVER, (3, 1)))[2].any()
+    for mask in (np.zeros(3, bool), np.ones(2, bool), [True, True, True]):
+        with pytest.raises(ValueError, match="reset_mask="):
+            envs.reset(options={"reset_mask": mask})
+    envs.close()
+
+
+def test_an_unknown_autoreset_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="autoreset_mode='never': choose one of 'NextStep', 'SameStep', 'Disabled'"):
+        make_vec(autoreset_mode="never")
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_torchrl_takes_the_vector_environment(observation: str) -> None:
+    envs = make_vec(observation=observation, autoreset_mode="Disabled", max_episode_steps=4)
+    env = GymWrapper(envs)
+    check_env_specs(env)
+    flown = env.rollout(10, break_when_any_done=False)
+    assert flown.batch_size == (3, 10)
+    assert flown["next", "truncated"][..., 0].nonzero()[:, 1].tolist() == [3, 7] * 3  # and flies on from new starts
+    key = "observation" if observation in ("pixels", "vector") else "position"
+    assert (flown[key][:, 4] != flown["next", key][:, 3]).flatten(1).any(1).all()
+    env.close()
 
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)

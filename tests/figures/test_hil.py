@@ -238,7 +238,9 @@ def test_the_flight_beside_a_simulated_one(tmp_path, flown, figures):
     titles = [axes.get_title(loc="left") for axes in beside.axes[0:6:3]]
     assert titles[0] == "flown\ncircle: 8 gates in 6.46 s (finished)"
     assert titles[1] == "simulated (straight)\ncircle: 0 gates in 1.00 s (timeout)"
-    assert latency.axes[0].get_xlabel() == "ms, of armed ticks"
+    ticks = json.loads((flown / REPORT).read_text())["latency"]["ticks"]
+    assert latency.axes[0].get_xlabel() == f"ms, of armed ticks (n = {ticks})" and ticks > 300
+    assert latency.axes[0].get_xlim() == pytest.approx((0.1, 100.0))  # jitter of 0.5 ms, a period of 20
     assert [label.get_text() for label in latency.axes[0].get_yticklabels()][-1] == "end to end"
     assert tracking.axes[0].get_ylabel() == "thrust (m/s²)"
     assert tracking.axes[-1].get_xlabel().startswith("time since arming (s)")

@@ -77,6 +77,9 @@ def test_resuming_a_finished_run_does_nothing_but_say_so(run_dir: Path) -> None:
     done = recipe("dreamer_v3", f"resume='{run_dir}'", f"total_env_steps={env_steps}", cwd=run_dir.parent)
     assert done.returncode == 0, done.stderr
     assert f"complete already, at {env_steps:,} env_steps" in done.stdout and "go on:" in done.stdout
+    said = dict(line.split(":", 1) for line in done.stdout.splitlines() if ":" in line)
+    left = [run_dir.parent / said[what].strip() for what in ("run", "best policy", "film", "plot")]
+    assert all(path.exists() for path in left) and left[2].stem == left[3].stem == f"{env_steps:09d}"
     assert everything_in(run_dir) == before
 
 
@@ -319,11 +322,22 @@ def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) ->
         assert resumed("dreamer_v3", str(best), [])[0].track == "circle"
     copied = shutil.copytree(run_dir, tmp_path / "run")
     whole = (copied / "config.yaml").read_text()
-    for damage in (whole[: len(whole) // 3] + "]: {", "a: !!python/object:os.system x", "- 1", "\x00", "env: 3", ""):
+    for damage in (
+        whole[: len(whole) // 3] + "]: {",
+        "a: !!python/object:os.system x",
+        "- 1",
+        "\x00",
+        "env: 3",
+        "",
+        "garbage",
+    ):
         (copied / "config.yaml").write_text(damage)
         with pytest.raises(ValueError, match=r"config\.yaml is damaged|does not fit") as refusal:
             resumed("dreamer_v3", str(copied), [])
         assert "\n" not in str(refusal.value)
+    (copied / "config.yaml").write_text("algorithm: [1]")
+    with pytest.raises(ValueError, match=r"config\.yaml: algorithm=\[1\]; there are dreamer_v3"):
+        recipe_module("composing.saved").trained_config(copied)
     (copied / "config.yaml").write_text(whole)
     (copied / "overrides.yaml").unlink()
     with pytest.raises(ValueError, match=r"run cannot be continued: it lacks overrides.yaml"):

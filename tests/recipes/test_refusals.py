@@ -63,6 +63,10 @@ REFUSED = [
     (["env.control_rate=inf"], ["env.control_rate=inf Hz: must be a finite number"]),
     (["env.control_rate=60"], ["env.control_rate=60", "whole number of physics steps of 2 ms"]),
     (["env.start_on_line=1.5"], ["env.start_on_line=1.5", "at least 0 and at most 1"]),
+    (["env.start_at_gate=1.5"], ["env.start_at_gate=1.5", "at least 0 and at most 1"]),
+    (["env.start_beyond_gate=-0.1"], ["env.start_beyond_gate=-0.1", "at least 0 and at most 1"]),
+    (["env.start_on_line=1", "env.start_beyond_gate=0.5"], ["env.start_beyond_gate=0.5", "env.start_on_line=1 leaves"]),
+    (["env.start_on_line=0.5", "schedule.start_on_line.to=2"], ["schedule.start_on_line.to=2.0: must be at least 0"]),
     (["schedule.discount.begin=0.6", "schedule.discount.end=0.5"], ["schedule.discount: begin=0.6 and end=0.5"]),
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
@@ -93,6 +97,8 @@ REFUSED = [
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
+    (["env=dmc", "env.start_at_gate=0"], ["env.start_at_gate=0", "for races", "leave it at 0.5"]),
+    (["env=dmc", "schedule.start_on_line.to=0"], ["schedule.start_on_line is for races", "leave it out"]),
     (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
 ]
 

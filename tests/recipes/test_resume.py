@@ -107,6 +107,7 @@ RACE = [
     "tuned=race", "evaluation.start_noise=0", "model.imagination_starts=8",
     "evaluation.stochastic=false", "loss.ppo.updates=7", "loss.ppo.flown=200", "loss.ppo.kl_target=1e-9",
     "schedule.wait_for_model=1.1", "schedule.wait_every=300", "model.mixed_precision=false",
+    "schedule.start_on_line.by=run", "schedule.start_on_line.begin=0",
 ]  # fmt: skip
 """What races on a CPU."""
 

@@ -45,10 +45,10 @@ sys.modules["torch"] = None
 """
 
 
-@pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_help_loads_no_torch(flag: str, tmp_path: Path) -> None:
-    done = recipe("export", flag, cwd=tmp_path, before=WITHOUT_TORCH)
-    assert done.returncode == 0 and done.stdout.startswith("usage: python recipes/export.py"), done.stderr
+@pytest.mark.parametrize(("name", "flag"), [*((name, "--help") for name in RECIPES), ("export", "-h")])
+def test_help_loads_no_torch(name: str, flag: str, tmp_path: Path) -> None:
+    done = recipe(name, flag, cwd=tmp_path, before=WITHOUT_TORCH)
+    assert done.returncode == 0 and done.stdout.startswith(f"usage: python recipes/{name}.py"), done.stderr
 
 
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:

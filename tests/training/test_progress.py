@@ -1,20 +1,13 @@
-"""What a run says of itself: a bar in a terminal, lines in a log."""
+"""What a run says of itself in a log; `test_live_table.py` is what it shows in a terminal."""
 
 from __future__ import annotations
 
-import io
 import sys
 from pathlib import Path
 
 import pytest
 
 from dreamer_racing.training.progress import Progress
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
 
 METRICS = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
 
@@ -63,23 +56,15 @@ def test_a_log_that_takes_no_more_ends_nothing(monkeypatch: pytest.MonkeyPatch) 
         full.close()
 
 
-def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Progress(total=100) as progress:
-        progress.advance(50)
-        progress.show(METRICS | {"evaluation/success_rate": 1.0})
-    assert (
-        "50/100" in terminal.getvalue()
-        and "gates=3.00" in terminal.getvalue()
-        and "success=100%" in terminal.getvalue()
-    )
+def test_of_several_processes_one_alone_speaks(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(total=10, seconds=0.0, shown=False) as progress:
+        progress.show(METRICS)
+        progress.evaluating(12, 60)
+        progress.say("evaluation")
+    assert capsys.readouterr() == ("", "")
 
 
-def test_a_terminal_shows_how_far_an_evaluation_is_and_a_log_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal, log = Terminal(), io.StringIO()
-    for stream in (terminal, log):
-        monkeypatch.setattr(sys, "stderr", stream)
-        with Progress(total=100) as progress:
-            progress.evaluating(12, 60)
-    assert "evaluating: 12 of 60 episodes" in terminal.getvalue() and log.getvalue() == ""
+def test_a_log_has_no_use_for_how_far_an_evaluation_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(total=100, seconds=0.0) as progress:
+        progress.evaluating(12, 60)
+    assert capsys.readouterr() == ("", "")
