@@ -67,18 +67,28 @@ def test_gradients_are_the_same_in_float32(size: str, actor: str) -> None:
 
 
 @pytest.mark.usefixtures("same_noise")
-@pytest.mark.parametrize("size", [name for name in SIZES if name != "sampled"])
-def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(size: str) -> None:
-    """As near to those of float32 as they are without."""
-    exact = gradients(make_pair(SIZES[size])[0])
-    plain, few = (gradients(learner) for learner in make_pair(SIZES[size], mixed_precision=True))
+@pytest.mark.parametrize(
+    ("size", "world_model"), [("block", "reconstruction"), ("dense", "decoder_free"), ("ssm", "decoder_free")]
+)
+def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(size: str, world_model: str) -> None:
+    """As near to those of float32 as they are without, network by network.
 
-    def error(found: dict[str, Tensor]) -> float:
-        both = [torch.cat([of[name].flatten() for name in exact if name != "loss"]) for of in (found, exact)]
-        assert all(value.dtype == torch.float32 for value in found.values())
-        return float((both[0] - both[1]).norm() / both[1].norm())
+    Where the others do not decode images, it is because bfloat16 by itself leaves little of that gradient there: half
+    of it is rounding, in a network so small.
+    """
+    exact = gradients(make_pair(SIZES[size], world_model=world_model)[0])
+    plain, few = (gradients(of) for of in make_pair(SIZES[size], world_model=world_model, mixed_precision=True))
+    assert all(value.dtype == torch.float32 for value in few.values())
+    for part in sorted({".".join(name.split(".")[:2]) for name in exact if name != "loss"}):
+        as_usual, with_few = (relative_error(found, exact, part) for found in (plain, few))
+        assert as_usual < 0.1, f"{part}: of what rounds so coarsely nothing can be said"
+        assert with_few < 1.5 * as_usual + 0.005, part
 
-    assert error(few) < 1.5 * error(plain) < 0.9
+
+def relative_error(found: dict[str, Tensor], exact: dict[str, Tensor], part: str) -> float:
+    """Of the gradient of a part of the networks."""
+    one, other = (torch.cat([of[name].flatten() for name in exact if name.startswith(part)]) for of in (found, exact))
+    return float((one - other).norm() / other.norm())
 
 
 def test_samples_are_drawn_by_the_same_noise() -> None:
