@@ -6,19 +6,18 @@ Shapes: S seeds of a variant.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dreamer_racing.figures.curves import ENDS_EARLY, QUANTITIES
-from dreamer_racing.figures.runs import CLOCKS, REFERENCE, CurveKey, RunData, along, group_runs
+from dreamer_racing.figures.runs import AXES, REFERENCE, CurveKey, RunData, along, axis_of, group_runs
+from dreamer_racing.training.clock import WALL_CLOCK
 
 LAST_SHARE = 0.2  # of the longest run of an algorithm on a track: where its variants are compared
 COMPARED = ("gates", "success_rate", "evaluation_return", "image_error")  # names out of `QUANTITIES`
-WALL_CLOCK = "wall_clock"  # column: s since the run began
-COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), *CLOCKS.values())  # of `metrics.csv`
-FORMS = {"env_steps": ",.0f", "hours": ".2f", "core_hours": ".2f"}  # of places on an axis
+COLUMNS = (*(QUANTITIES[name].column for name in COMPARED), *filter(None, (axis.clock for axis in AXES.values())))
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Comparison:
     @property
     def caption(self) -> str:
         """What the numbers are."""
-        of = f"{self.axis} that every variant has had" if self.axis in CLOCKS else "longest run's env_steps"
+        of = f"{self.axis} that every variant has had" if axis_of(self.axis).clock else "longest run's env_steps"
         return (
             "Mean ± sample standard deviation (n − 1) over seeds, each the mean of what it logged within the last "
             f"{100 * LAST_SHARE:.0f} % of the {of}. Evaluations are paid at b₂ = 0."
@@ -89,10 +88,10 @@ def compare_variants(runs: Sequence[RunData], problems: Sequence[str] = (), axis
     ends: dict[tuple[str, str], list[float]] = defaultdict(list)  # of the longest run of each variant
     for key, group in groups.items():
         ends[key[:2]].append(max(map(_end, group)))
-    found = [*problems, *without_clock]
+    found = [*problems, *without_clock, *_short_windows(ends, axis)]
     results = []
     for key, group in groups.items():
-        last = min(ends[key[:2]]) if axis in CLOCKS else max(ends[key[:2]])
+        last = min(ends[key[:2]]) if axis_of(axis).clock else max(ends[key[:2]])
         first = (1 - LAST_SHARE) * last
         found += [_ends_early(run, first, last, axis) for run in group if _end(run) < ENDS_EARLY * last]
         results.append(_result(key, [run for run in group if _end(run) >= first], (first, last)))
@@ -104,8 +103,21 @@ def _end(run: RunData) -> float:
     return float(run.metrics.env_steps.max(initial=0.0))
 
 
+def _short_windows(ends: Mapping[tuple[str, str], Sequence[float]], axis: str) -> list[str]:
+    """Mention where variants are compared long before the longest of them ends, since one of them has had no more."""
+    if not axis_of(axis).clock:
+        return []
+    form = axis_of(axis).form
+    return [
+        f"{algorithm} {track}: compared up to {min(last):{form}} {axis}, where the first variant ends, "
+        f"of {max(last):{form}}"
+        for (track, algorithm), last in ends.items()
+        if min(last) < ENDS_EARLY * max(last)
+    ]
+
+
 def _ends_early(run: RunData, first: float, last: float, axis: str) -> str:
-    form = FORMS[axis]
+    form = axis_of(axis).form
     what = "left out" if _end(run) < first else "it counts as far as it goes"
     return f"{run.name} ends at {_end(run):{form}} {axis}, compared are {first:{form}} to {last:{form}}: {what}"
 
@@ -130,9 +142,10 @@ def comparison_table(comparison: Comparison) -> str:
     labels = [QUANTITIES[name].label for name in shown]
     headings = ["algorithm", "track", "variant", "seeds", comparison.axis, *labels, "wall clock"]
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    form = axis_of(comparison.axis).form
     for result in results:
         clock = "" if result.wall_clock is None else f"{result.wall_clock / 60:.1f} min"
-        window = "–".join(f"{place:{FORMS[comparison.axis]}}" for place in result.window)
+        window = "–".join(f"{place:{form}}" for place in result.window)
         cells = [result.key.algorithm, result.key.track, result.name, str(result.seeds), window]
         cells += [_cell(result.values.get(name, np.empty(0)), result.seeds) for name in shown]
         lines.append(f"| {' | '.join([*cells, clock])} |")

@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dreamer_racing.figures.runs import AXES, CLOCKS, CurveKey, RunData, along, group_runs
+from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs
 
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
-SMALLEST_WINDOW = (1.0, 1e-6)  # env_steps, hours
 GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
 ENDS_EARLY = 0.98  # of the longest run of a curve: one that ends before is mentioned
 WEIGHT = "curriculum/body_rate_weight"
@@ -100,14 +99,13 @@ def wanted_columns(quantities: Sequence[str], axis: str = "env_steps") -> list[s
     Raises:
         ValueError: unknown quantity or axis.
     """
-    if axis not in AXES:
-        raise ValueError(f"axis={axis}: there are {', '.join(AXES)}.")
+    clock = axis_of(axis).clock
     for name in quantities:
         if name not in QUANTITIES:
             raise ValueError(f"quantities={name}: there are {', '.join(QUANTITIES)}.")
     columns = [QUANTITIES[name].column for name in quantities]
-    clock = [CLOCKS[axis]] if axis in CLOCKS else []
-    return [*dict.fromkeys([*columns, *(name for column in columns for name in _presence(column)), WEIGHT, *clock])]
+    beside = [name for column in columns for name in _presence(column)]
+    return [*dict.fromkeys([*columns, *beside, WEIGHT, *([clock] if clock else [])])]
 
 
 def _presence(column: str) -> list[str]:
@@ -147,7 +145,7 @@ def learning_curves(
         raise ValueError(f"axis={axis}: {'; '.join(without_clock)}.")
     groups = group_runs(runs)
     longest = max(run.metrics.env_steps.max(initial=0) for run in runs)
-    width = float(max(window if window is not None else WINDOW_SHARE * longest, SMALLEST_WINDOW[axis in CLOCKS]))
+    width = float(max(window if window is not None else WINDOW_SHARE * longest, axis_of(axis).smallest_window))
     grid = np.linspace(0.0, longest, POINTS)
     missing, curves = [*problems, *without_clock, *_short_runs(groups, axis)], []
     for name in quantities:
@@ -324,7 +322,7 @@ def _pool(sampled: dict[CurveKey, Sampled]) -> dict[CurveKey, list[Sampled]]:
 
 def _short_runs(groups: dict[CurveKey, list[RunData]], axis: str) -> list[str]:
     """Mention the runs that end before the others of their curve do."""
-    lines, form = [], ",.2f" if axis in CLOCKS else ",.0f"
+    lines, form = [], axis_of(axis).form
     for group in groups.values():
         ends = [run.metrics.env_steps.max(initial=0) for run in group]
         lines += [
@@ -345,7 +343,7 @@ def write_curves(path: str | Path, curves: LearningCurves) -> None:
 
     Columns: `quantity`, `track`, `algorithm`, `variant`, one named as the axis, `centre`, `low`, `high`, `seeds`.
     """
-    form = ".6g" if curves.axis in CLOCKS else ".0f"
+    form = ".6g" if axis_of(curves.axis).clock else ".0f"
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         file.write(f"# aggregate: {curves.aggregate}\n# window: {curves.window!r}\n")

@@ -22,7 +22,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from dreamer_racing.figures.comparison import Comparison, VariantResult
 from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Curve, LearningCurves
 from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
-from dreamer_racing.figures.runs import CLOCKS, CurveKey
+from dreamer_racing.figures.runs import CurveKey, axis_of
 
 ALGORITHMS = {"dreamer_v3": ("DreamerV3", "#1c7ed6"), "ppo": ("PPO", "#f76707"), "sac": ("SAC", "#e03131")}
 """Names and the paper's colours; another algorithm is drawn in grey under its own name."""
@@ -36,7 +36,6 @@ BANDS = {
     "mean": ("mean", "sample standard deviation (n − 1)"),
     "iqm": ("interquartile mean", "95 % bootstrap interval"),
 }
-AXIS_LABELS = {"env_steps": "env_steps", "hours": "hours", "core_hours": "hours of one core"}
 DRAWN = ("gates", "evaluation_return")  # panels of the comparison
 Styles = dict[CurveKey, dict[str, Any]]
 COUNT_ROOM = 0.12  # of an axis: right of the longest bar, for its n
@@ -87,10 +86,10 @@ def plot_learning_curves(curves: LearningCurves, path: str | Path) -> None:
             _draw_raises(axes, curves, track, styles)
             if column == 0:
                 axes.set_ylabel(QUANTITIES[quantity].label.replace(" (", "\n("), color=INK)
-            if curves.axis not in CLOCKS:
+            if not axis_of(curves.axis).clock:
                 axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             if row == len(quantities) - 1:
-                axes.set_xlabel(AXIS_LABELS[curves.axis], color=INK)
+                axes.set_xlabel(axis_of(curves.axis).label, color=INK)
     handles = [Line2D([], [], label=labels[key], **styles[key]) for key in keys]
     if any(map(len, curves.raises.values())):
         tick: dict[str, Any] = {"marker": "|", "markersize": 8, "linestyle": "", "color": MUTED}
@@ -166,9 +165,9 @@ def _caption(curves: LearningCurves, styles: Styles) -> str:
     centre, band = BANDS[curves.aggregate]
     of = " of the default alone" if any(_crowded(key, styles) for key in styles) else ""
     window = f"{curves.window:.2g}"
-    if curves.axis not in CLOCKS:
+    if not axis_of(curves.axis).clock:
         window = EngFormatter(sep="")(float(window))  # 24k, 1.5M
-    over = f"running mean over {window} {AXIS_LABELS[curves.axis]}"
+    over = f"running mean over {window} {axis_of(curves.axis).label}"
     return f"{centre} over seeds, and {band}{of} (none of one seed); {over}"
 
 

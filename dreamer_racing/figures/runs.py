@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import yaml
 
+from dreamer_racing.training.clock import CPU_CLOCK, WALL_CLOCK
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
@@ -33,10 +34,35 @@ SAME_CURVE = (
 )  # fmt: skip
 """Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
 IN_KEY = ("algorithm", "track")  # settings that every key names anyway
-CLOCKS = {"hours": "wall_clock", "core_hours": "cpu_clock"}
-"""Columns of `metrics.csv`, s since a run began, by the axis that is read off them."""
-AXES = ("env_steps", *CLOCKS)
-"""Along what curves may be drawn."""
+
+
+class Axis(NamedTuple):
+    """Along what curves are drawn and runs compared."""
+
+    label: str
+    clock: str | None
+    """Column of `metrics.csv`, s since the run began, that hours are read off; None: env_steps."""
+    form: str
+    """Of numbers on it."""
+    smallest_window: float
+
+
+AXES = {
+    "env_steps": Axis("env_steps", None, ",.0f", 1.0),
+    "hours": Axis("hours", WALL_CLOCK, ".2f", 1e-6),
+    "core_hours": Axis("hours of one core", CPU_CLOCK, ".2f", 1e-6),
+}
+
+
+def axis_of(name: str) -> Axis:
+    """Look up an axis.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    if name not in AXES:
+        raise ValueError(f"axis={name}: there are {', '.join(AXES)}.")
+    return AXES[name]
 
 
 class CurveKey(NamedTuple):
@@ -213,26 +239,27 @@ def group_runs(runs: Sequence[RunData]) -> dict[CurveKey, list[RunData]]:
 
 
 def along(runs: Sequence[RunData], axis: str) -> tuple[list[RunData], list[str]]:
-    """Count what runs have measured by a clock instead of by env_steps.
+    """Put what runs have measured on another axis than that of env_steps.
 
     Args:
-        runs: with the clock's column.
-        axis: one of `AXES`; what is called env_steps in the runs returned is hours for two of them.
+        runs: with the column of its clock.
+        axis: a name in `AXES`.
 
     Returns:
-        The runs, and a line for each that is left out, since it has not recorded that clock.
+        The runs, whose tables hold places on that axis where they held env_steps, and a line for each that is left out,
+        since it has not recorded the clock.
     """
-    if axis not in CLOCKS:
+    clock = axis_of(axis).clock
+    if clock is None:
         return list(runs), []
     kept, problems = [], []
     for run in runs:
-        if (clock := run.metrics.columns.get(CLOCKS[axis])) is None:
-            problems.append(f"{run.name} left out: it has no {CLOCKS[axis]}, which {axis} are read off")
+        if clock not in run.metrics.columns:
+            problems.append(f"{run.name} left out: it has no {clock}, which {axis} are read off")
             continue
-        hours = _hours(*clock)
+        hours = _hours(*run.metrics.columns[clock])
         columns = {name: (hours(steps), values) for name, (steps, values) in run.metrics.columns.items()}
-        metrics = replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))
-        kept.append(replace(run, metrics=metrics))
+        kept.append(replace(run, metrics=replace(run.metrics, columns=columns, env_steps=hours(run.metrics.env_steps))))
     return kept, problems
 
 

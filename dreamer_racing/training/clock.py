@@ -1,19 +1,23 @@
 """Where the time of a run goes."""
 
+import os
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
+WALL_CLOCK, CPU_CLOCK = "wall_clock", "cpu_clock"
+
 
 class RunClock:
     """Shares of wall-clock time by activity, and rates of counters, since the last reading; and what the run has taken.
 
-    CPU time is that of all threads of this process, so that runs which shared their cores with other work can be
-    compared by it.
+    CPU time is that of all threads of this process and of children that have ended, so that runs which shared their
+    cores with other work can be compared by it.
 
     Args:
         counters: growing numbers, read and never written here.
+        alone: whether this process is all of the run; else its CPU time is not the run's, and is not read.
 
     Example:
         >>> counters = {"updates": 0}
@@ -24,19 +28,24 @@ class RunClock:
         ['cpu_clock', 'rate/updates', 'time/update', 'wall_clock']
     """
 
-    def __init__(self, counters: Mapping[str, int]) -> None:
+    def __init__(self, counters: Mapping[str, int], alone: bool = True) -> None:
         self._counters = counters
-        self._born = _now()
+        self._born = {name: now for name, now in _now().items() if alone or name != CPU_CLOCK}
         self._restart()
 
     @property
     def total(self) -> dict[str, float]:
-        """`wall_clock` and `cpu_clock`, s, since the run began; settable, to go on where a continued run was."""
-        return {name: now - self._born[name] for name, now in _now().items()}
+        """`wall_clock` and `cpu_clock`, s, since the run began, as far as known; settable, to go on with a run's.
+
+        Of a run that was continued from before there was a clock, that clock stays unknown.
+        """
+        return {name: now - self._born[name] for name, now in _now().items() if name in self._born}
 
     @total.setter
     def total(self, seconds: Mapping[str, float]) -> None:
-        self._born = {name: now - seconds.get(name, 0.0) for name, now in _now().items()}
+        self._born = {
+            name: now - seconds[name] for name, now in _now().items() if name in self._born and name in seconds
+        }
 
     def _restart(self) -> None:
         self._since = time.perf_counter()
@@ -63,4 +72,4 @@ class RunClock:
 
 
 def _now() -> dict[str, float]:
-    return {"wall_clock": time.perf_counter(), "cpu_clock": time.process_time()}
+    return {WALL_CLOCK: time.perf_counter(), CPU_CLOCK: sum(os.times()[:4])}

@@ -299,7 +299,7 @@ def assemble(
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
     parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
-    clock = RunClock(counters)
+    clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
         saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
         clock.total = saved

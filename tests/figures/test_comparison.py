@@ -102,6 +102,14 @@ def test_variants_are_compared_at_equal_cpu_time() -> None:
     assert default.window == late.window == (pytest.approx(0.8), 1.0)
     assert default.values["gates"].tolist() == [9.0]  # of 0.8, 0.9 and 1 hours
     assert late.values["gates"].tolist() == [4.5]  # of 0.8 and 1 hours
-    assert comparison.problems == [f"{untimed.name} left out: it has no cpu_clock, which core_hours are read off"]
+    assert comparison.problems == [
+        f"{untimed.name} left out: it has no cpu_clock, which core_hours are read off",
+        "dreamer_v3 circle: compared up to 1.00 core_hours, where the first variant ends, of 2.00",
+    ]
     table = comparison_table(comparison)
     assert "| seeds | core_hours |" in table and "| 0.80–1.00 |" in table and "core_hours that every variant" in table
+
+
+def test_an_axis_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ValueError, match="axis=minutes: there are env_steps, hours, core_hours"):
+        compare_variants(RUNS, axis="minutes")
