@@ -70,7 +70,7 @@ def measure(checkpoint: Path, mode: str, improvements: int, every: int) -> Itera
     """Yield a record for each evaluation."""
     config = trained_config(RunDirectory.of(checkpoint).path)
     assert isinstance(config, DreamerConfig), "a run of recipes/dreamer_v3.py"
-    config.device, config.replay.device = "cpu", "auto"
+    config.device, config.env.device, config.replay.device = "cpu", "cpu", "auto"
     learner, counters = restore(config, checkpoint)
     torch.manual_seed(0)
     size, interface = learner.size, learner.agent.interface

@@ -6,6 +6,7 @@
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
     python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
     python benchmarks/learner.py --in-turns --sizes cpu_small ssm_cpu_small --json results/learner_in_turns.json
+    python benchmarks/learner.py --launches --sizes paper_large size12m --batch 64 16 --horizon 16
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
 Columns: `s` is the median of one whole update (losses, gradients, optimiser, slow critic) on a synthetic batch;
@@ -13,6 +14,11 @@ Columns: `s` is the median of one whole update (losses, gradients, optimiser, sl
 GFLOP / s over the speed of a large matrix product measured in the same run at the same precision; `sample_share` is the
 time of sampling and moving a replay batch over that of the update; `memory` is the peak of the process on a CPU
 (resident) or of the device, GiB.
+
+With `--launches` nothing is timed: the kernels that an update would launch on a CUDA device under bfloat16 are counted
+on a CPU that stands in for it (`learners/launches.py`), with `few_kernels` and without, windows beginning warm. Their
+number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms, which a
+CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
 
 With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
 all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
@@ -27,10 +33,11 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from measuring import print_table, write_json
@@ -42,15 +49,18 @@ from torch.utils.flop_counter import FlopCounterMode
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
 from dreamer_racing.learners.dreamer_config import LearnerConfig
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import LossConfig
 from dreamer_racing.machine import keep_freed_memory
-from dreamer_racing.modules import SIZES, Interface
+from dreamer_racing.modules import SIZES, Interface, get_size, layers
 
 PRIVILEGED_DIM = 21
 WARM_UP = 3  # updates that are not counted
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
+LAUNCHES = ("size", "loss", "actor", "batch", "horizon", "few_kernels", "launches", "casts")
+NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
 IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
             "world_model_ratio", "observe", "observe_ratio", "steps")  # fmt: skip
 
@@ -71,6 +81,8 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20, help="timed, after those of warm-up")
     parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="timed as they are, and tuned")
     parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
+    parser.add_argument("--few-kernels", action="store_true", help="as on a CUDA device by default")
+    parser.add_argument("--launches", action="store_true", help="count what a CUDA device would launch instead")
     parser.add_argument("--in-turns", action="store_true", help="compare the sizes, eager, in one process")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
@@ -80,9 +92,21 @@ def main() -> None:
         return
     if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
         parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
+    if arguments.launches:
+        counted = [
+            count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
+            for size in arguments.sizes
+            for loss in arguments.losses
+            for actor in arguments.actor_losses
+            for few in (False, True)
+        ]
+        print_table(counted, LAUNCHES)
+        write_json(counted, arguments.json)
+        return
     shared = (tuple(arguments.batch), arguments.horizon, arguments.device, arguments.threads, arguments.updates)
+    few_kernels = True if arguments.few_kernels else None
     settings = [
-        Setting(loss, actor, arguments.mixed_precision, arguments.image_size, *shared)
+        Setting(loss, actor, arguments.mixed_precision, arguments.image_size, *shared, few_kernels)
         for loss in arguments.losses
         for actor in arguments.actor_losses
     ]
@@ -132,13 +156,17 @@ class Setting:
     device: str
     threads: int
     updates: int  # timed, after WARM_UP
+    few_kernels: bool | None = None  # None: on a CUDA device
 
     def learner(self, size: str, backend: str = "eager") -> DreamerLearner:
         """Make the learner of a size."""
         torch.set_num_threads(self.threads)
         torch.set_float32_matmul_precision("high")
         config = LearnerConfig(
-            mixed_precision=self.mixed_precision, compile="compile" in backend, cuda_graph="graph" in backend
+            mixed_precision=self.mixed_precision,
+            compile="compile" in backend,
+            cuda_graph="graph" in backend,
+            few_kernels=self.few_kernels,
         )
         losses, interface = LossConfig(world_model=self.loss, actor=self.actor), interface_of(self.image_size)
         return make_dreamer(size, interface, losses, config, horizon=self.horizon, device=self.device, seed=0)
@@ -314,6 +342,57 @@ def count_calls(learner: DreamerLearner, data: Any) -> int:
     with profile(activities=[ProfilerActivity.CPU]) as profiler:
         learner.update(data)
     return sum(event.count for event in profiler.key_averages() if event.key.startswith("aten::"))
+
+
+def count_launches(
+    size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, few_kernels: bool, mixed: bool = True
+) -> dict[str, Any]:
+    """Count the kernels of an update on a CUDA device; return one record."""
+    full = get_size(size)
+    narrow = replace(full, **NARROW, cnn_depth=full.blocks, name=size)  # the decoder's channels divide among the blocks
+    config = LearnerConfig(mixed_precision=mixed, few_kernels=few_kernels)
+    losses = LossConfig(world_model=loss, actor=actor)
+    learner = make_dreamer(narrow, interface_of(64), losses, config, horizon=horizon, seed=0)
+    data = filled_replay((2, batch[1]), "cpu").sample()
+    before = (torch.zeros(*data.batch_size, width) for width in (narrow.belief, narrow.state))
+    data["context"] = learner.latent_format.pack(*before)  # windows begin warm
+    with patch.object(layers.F, "rms_norm", lambda x, shape, weight, eps: fused_rms_norm(x, weight, eps)):
+        learner.update(data)  # the optimiser makes its moments
+        learner.update(data)
+        seen = launches(lambda: learner.update(data))
+    return {
+        "benchmark": "learner_launches", "size": size, "loss": loss, "actor": actor,
+        "batch": "x".join(map(str, batch)), "horizon": horizon, "few_kernels": few_kernels,
+        "launches": seen.count, "casts": seen.kernels["_to_copy"], "waits": len(seen.waits),
+    }  # fmt: skip
+
+
+@torch.library.custom_op("dreamer_racing::fused_rms_norm", mutates_args=())
+def fused_rms_norm(inputs: Tensor, weight: Tensor, eps: float) -> Tensor:
+    """Stand for CUDA's kernel: one operation to whoever counts."""
+    normed = inputs.float() * torch.rsqrt(inputs.float().square().mean(-1, keepdim=True) + eps)
+    return (normed * weight.float()).to(inputs.dtype)
+
+
+@torch.library.custom_op("dreamer_racing::fused_rms_norm_backward", mutates_args=())
+def fused_rms_norm_backward(gradient: Tensor, inputs: Tensor, weight: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Stand for CUDA's kernel on the way back."""
+    values, passed = inputs.float(), gradient.float()
+    scale = torch.rsqrt(values.square().mean(-1, keepdim=True) + eps)
+    normed, weighted = values * scale, passed * weight.float()
+    of_inputs = scale * (weighted - normed * (weighted * normed).mean(-1, keepdim=True))
+    return of_inputs.to(inputs.dtype), (passed * normed).flatten(0, -2).sum(0).to(weight.dtype)
+
+
+def _keep_for_backward(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:2])
+    ctx.eps = inputs[2]
+
+
+fused_rms_norm.register_autograd(
+    lambda ctx, gradient: (*fused_rms_norm_backward(gradient, *ctx.saved_tensors, ctx.eps), None),
+    setup_context=_keep_for_backward,
+)
 
 
 def matmul_speed(device: str, dtype: torch.dtype) -> float:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
 
+import torch
 from composing.arena import make_env
 from composing.building import (
     assemble,
@@ -30,7 +31,7 @@ from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import Collection, DreamerConfig, register
-from composing.sharing import share_of
+from composing.sharing import imagines, share_of
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -51,6 +52,7 @@ from dreamer_racing.training.schedule import RampClock
 from dreamer_racing.training.signals import GracefulExit
 
 NUM_ENVS = 32
+SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=none: DreamerV3 as published):
   the world model decodes the simulator's state in training; whoever flies sees images only
@@ -193,6 +195,7 @@ def resolve(config: DictConfig) -> DictConfig:
         size = MODEL_OF_BUDGET.get(config.budget, by_device)
         print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
     config.model.size = size
+    shorten_windows(config, device)
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):
@@ -201,6 +204,10 @@ def resolve(config: DictConfig) -> DictConfig:
         config.model.mixed_precision = computes_bfloat16(device)
         state, ability = ("on", "computes") if config.model.mixed_precision else ("off", "does not compute")
         print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
+    if config.model.cuda_graph is None:
+        config.model.cuda_graph = captures(config, device)
+        if config.model.cuda_graph:
+            print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
     if config.tuned == "race":
         hours = config.total_env_steps / RACE_SPEED / 3600
         print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
@@ -208,6 +215,31 @@ def resolve(config: DictConfig) -> DictConfig:
         print("held out: nothing, because there is a single world (replay.held_out=0, schedule.wait_for_model=null)")
         config.replay.held_out, config.schedule.wait_for_model = 0, None
     return config
+
+
+def shorten_windows(config: DictConfig, device: torch.device) -> None:
+    """On a CUDA device, take the records of a batch in more and shorter windows where their number is left open.
+
+    A record of a window waits for the one before it, and every wait is a kernel's launch; windows begin warm then, or
+    the first records of short ones would teach forgetting.
+    """
+    open_numbers = all(OmegaConf.is_missing(config.model, name) for name in ("batch_size", "batch_length"))
+    shortened = device.type == "cuda" and open_numbers and config.replay.context is not False
+    if shortened:
+        numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{config.model.size}.yaml")
+        shortened = numbers.batch_length > SHORT_WINDOW
+    if shortened:
+        config.model.batch_length = SHORT_WINDOW
+        config.model.batch_size = numbers.batch_size * numbers.batch_length // SHORT_WINDOW
+        print(f"batch: {config.model.batch_size} windows of {SHORT_WINDOW} records that begin warm, on a CUDA device")
+    if config.replay.context is None:
+        config.replay.context = shortened
+
+
+def captures(config: DictConfig, device: torch.device) -> bool:
+    """Whether updates can be captured as a CUDA graph: not beside what acts meanwhile, or exchanges on the way."""
+    alone = parallel.asked_for() == 1 or not imagines(config)
+    return device.type == "cuda" and config.collection is Collection.sync and alone
 
 
 def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:

@@ -115,7 +115,7 @@ def prepare(
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         num_threads=1,
-        **worlds_of(trained) | {"renderer": config.renderer},
+        **worlds_of(trained) | {"renderer": config.renderer, "device": "cpu"},
     )
     try:
         if is_agent(checkpoint):

@@ -249,12 +249,12 @@ def write(directory: Path, named: str | Track, result: Evaluation) -> None:
         return
     words = race_words(track, trajectory)
     film = caption(enlarge_to_watch(trajectory.pixels.numpy()), words)
-    write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
+    filmed = write_video(directory / "onboard.mp4", film, fps=1 / trajectory.control_dt, scale=1)
     first, last = second_lap(trajectory)
     frames = onboard_beside_map(track, trajectory.part(first, last), GIF_SIZE)[::GIF_STRIDE]
     gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
     size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
-    print(f"{'files':<18} {files}, onboard.mp4, onboard.gif ({size / 1e6:.2f} MB)")
+    print(f"{'files':<18} {files}, {'onboard.mp4, ' if filmed else ''}onboard.gif ({size / 1e6:.2f} MB)")
 
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:

@@ -23,13 +23,13 @@ def with_memory(env: EnvBase, policy: Policy) -> TransformedEnv:
 
 
 def act(policy: Policy, tensordict: TensorDictBase) -> TensorDictBase:
-    """Act wherever the policy lives, with an environment on the CPU."""
+    """Act wherever the policy lives, with worlds that live where their data are: on the CPU, if those do not say."""
     weight = next(cast(torch.nn.Module, policy).parameters(), torch.zeros(()))
-    return policy(tensordict.to(weight.device)).to("cpu")
+    return policy(tensordict.to(weight.device)).to(tensordict.device or "cpu")
 
 
 class Course:
-    """Worlds on the CPU to evaluate a policy in, as often as wanted.
+    """Worlds to evaluate a policy in, as often as wanted.
 
     Each time it meets the same starts, drones and looks in the first episode of every world; in later ones, where
     episodes are more than worlds, they depend on how the episodes before went. What a policy samples comes from torch's
@@ -37,7 +37,8 @@ class Course:
 
     Args:
         policy: what is flown, on whichever device it is.
-        worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (0 if they do not say) ...
+        worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (0 if they do not say), device
+            (the CPU if they do not say) ...
         num_envs: N, episodes flown side by side.
     """
 

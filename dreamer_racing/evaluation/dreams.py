@@ -110,7 +110,7 @@ class BelievedView:
         poses = [self._worlds.race_vector.pose(vector, (gate + offset) % count) for offset in self.NEIGHBOURS]
         position, attitude, misfit = (torch.stack(parts) for parts in zip(*poses, strict=True))
         misfit[1:] += self.PREFERENCE
-        best, rows = misfit.argmin(0), torch.arange(len(vector))
+        best, rows = misfit.argmin(0), torch.arange(len(vector), device=vector.device)
         images = self._worlds.picture(position[best, rows], attitude[best, rows])
         return images.unflatten(0, belief.shape[:2])
 

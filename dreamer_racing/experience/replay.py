@@ -90,11 +90,8 @@ class StreamReplay(TensorDictReplayBuffer):
         """
         assert self.latents is not None, "made without latents: there is no context to refresh"
         packed = self.latents.pack(belief[:, :-1], state[:, :-1]).flatten()
-        # Windows may overlap: of each slot the last, so that belief and state are of the same window.
-        unique, place = slots[:, 1:].cpu().flatten().unique(return_inverse=True)
-        last = torch.zeros_like(unique).scatter_reduce_(0, place, torch.arange(len(place)), "amax")
-        packed = packed[last.to(packed.device)]
-        self._storage.overwrite(unique, TensorDict({CONTEXT: packed}, packed.batch_size))
+        # Windows may overlap: belief and state are then of the same one.
+        self._storage.overwrite(slots[:, 1:].flatten(), TensorDict({CONTEXT: packed}, packed.batch_size))
 
     def held_out(self, num_windows: int, length: int, recent: int | None = None) -> TensorDictBase | None:
         """Returns windows ``[num_windows, length]`` of records that are never sampled, delivered as samples are.

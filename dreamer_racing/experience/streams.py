@@ -44,8 +44,17 @@ def check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
         raise ValueError(f"The replay stores {key!r} as {expected}, got {layout}.")
 
 
+def send(tensor: Tensor, device: torch.device) -> Tensor:
+    """Return a tensor on a device; what goes to a CUDA device goes from pinned memory, and the CPU does not wait."""
+    if device.type == "cuda" and tensor.device.type == "cpu":
+        return tensor.pin_memory().to(device, non_blocking=True)
+    return tensor.to(device)
+
+
 class RecordStorage(TensorStorage):
     """Indexed copies of whole records, over slots of which any may be filled; its length is how many are."""
+
+    _named: Tensor | None = None  # int64 (N·L,), −1 between calls of `_last_of`
 
     def fields(self) -> Iterator[tuple[NestedKey, Tensor]]:
         """Yields what a record has: key and values of all slots ``(N·L, ...)``. Nothing before the first write."""
@@ -63,24 +72,35 @@ class RecordStorage(TensorStorage):
         self._write(cursor, data, dict(self.fields()))
 
     def overwrite(self, slots: Tensor, data: TensorDictBase) -> None:
-        """Replaces some fields, data ``[M]``, of the records in slots ``(M,)``, none of them twice."""
+        """Replaces some fields, data ``[M]``, of the records in slots ``(M,)``; of a slot named twice, by the last."""
+        slots = send(slots, self.device)
+        data = data[send(self._last_of(slots), data.device or self.device)]
         self._write(slots, data, {key: stored for key, stored in self.fields() if key in data.keys(True, True)})
+
+    def _last_of(self, slots: Tensor) -> Tensor:
+        """Return where each of the slots ``(M,)`` is named for the last time, int64 ``(M,)``, without waiting."""
+        if self._named is None:
+            self._named = torch.full((self.max_size,), -1, device=slots.device)
+        place = torch.arange(len(slots), device=slots.device)
+        last = self._named.scatter_reduce_(0, slots, place, "amax")[slots]
+        self._named.index_fill_(0, slots, -1)
+        return last
 
     def _write(self, slots: Tensor | slice, data: TensorDictBase, fields: dict[NestedKey, Tensor]) -> None:
         for key, stored in fields.items():
-            new = data.get(key).to(self.device, non_blocking=self.device.type == "cuda")
+            new = send(data.get(key), self.device)
             check_layout(key, new, stored)
             if isinstance(slots, slice):
                 stored[slots] = new
             else:
-                _rows(stored).index_copy_(0, slots.to(self.device), _rows(new))
+                _rows(stored).index_copy_(0, send(slots, self.device), _rows(new))
         self._bump_mutation_revision()
 
     def get(self, index: Tensor | slice) -> TensorDictBase:
         """Returns copies of the records in slots of any shape, or those of a slice themselves."""
         if not isinstance(index, Tensor):
             return self._storage[index]
-        index = index.to(self.device)
+        index = send(index, self.device)
         out = TensorDict({}, batch_size=index.shape, device=self.device)
         for key, stored in self.fields():
             rows = _rows(stored).index_select(0, index.flatten())

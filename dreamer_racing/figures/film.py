@@ -5,8 +5,10 @@ Shapes: T frames of H × W pixels, RGB, uint8.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +30,13 @@ WHITE = (255, 255, 255)
 MAP_MARGIN = 1.6  # m around the gates of a moving map
 MIN_DELAY = 0.02  # s; browsers show shorter GIF frames much longer
 
+logger = logging.getLogger(__name__)
+
 
 def write_video(
     path: str | Path, frames: np.ndarray | torch.Tensor, fps: float = 50, scale: int | None = None, quality: int = 8
-) -> None:
-    """Write an H.264 (yuv420p) mp4 file that plays everywhere.
+) -> bool:
+    """Write an H.264 (yuv420p) mp4 file that plays everywhere; without ffmpeg, write nothing and warn of it once.
 
     Args:
         path: the file; missing folders are made.
@@ -42,12 +46,17 @@ def write_video(
             256 pixels high. Odd sizes then grow by one pixel, because H.264 wants even ones.
         quality: from 1 to 10.
 
+    Returns:
+        Whether it was written.
+
     Raises:
         ValueError: frames of another shape or type, or none.
     """
+    array = _as_frames(frames, "frames")
+    if not _finds_ffmpeg():
+        return False
     import imageio.v2 as imageio  # starts slowly
 
-    array = _as_frames(frames, "frames")
     scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     writer: Any = imageio.get_writer(
@@ -56,6 +65,20 @@ def write_video(
     with writer:
         for frame in array:
             writer.append_data(_make_even(enlarge(frame, scale)))
+    return True
+
+
+@cache
+def _finds_ffmpeg() -> bool:
+    """Tell whether there is what makes videos; warn the first time if there is not."""
+    try:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        logger.warning("no videos are written: %s pip install imageio-ffmpeg brings one.", error)
+        return False
+    return True
 
 
 def write_gif(

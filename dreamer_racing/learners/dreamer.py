@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, fields
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.dreamer_config import LearnerConfig
-from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, trained_parameters
+from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_saved, own_state
@@ -27,6 +28,8 @@ from dreamer_racing.losses.contract import require_keys, set_number
 from dreamer_racing.losses.imagination import choose_starts
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.cast_weights import cast_once
+from dreamer_racing.modules.few_kernels import save_kernels
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
@@ -74,6 +77,10 @@ class DreamerLearner:
         self.losses = nn.ModuleDict(losses)
         self.optimizer = optimizer
         self.device = next(agent.parameters()).device
+        few = self.device.type == "cuda" if self.config.few_kernels is None else self.config.few_kernels
+        self._casts_once = few and bool(self.config.mixed_precision)
+        if few:
+            save_kernels(nn.ModuleList([agent, self.losses]))
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
         self.actor_waits = False
@@ -82,7 +89,8 @@ class DreamerLearner:
         self._actor_optimizer: torch.optim.Optimizer | None = getattr(losses["actor"], "optimizer", None)
         self._rates = [group["lr"] for group in self._groups]
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-        self._compiled = torch.compile(self.compute_losses, dynamic=False) if self.config.compile else None
+        if self.config.compile:
+            agent.world_model.rssm.compile_steps()
         self._graph = self._make_graph() if self.config.cuda_graph else None
 
     @property
@@ -112,8 +120,7 @@ class DreamerLearner:
             batch: Replay records, batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``,
                 ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
             timed: Context manager by activity (``world_model``, ``imagine``, of actor and critic whether they imagine
-                or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU and without
-                ``compile``.
+                or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU.
 
         Returns:
             Scalar tensors on the device: every loss and metric of those that were computed, ``gradient_norm/<network>``
@@ -220,14 +227,19 @@ class DreamerLearner:
 
     def _backward(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Compute losses and gradients of a batch; return detached scalars."""
-        with self.autocast():
-            # Without a clock where it is compiled, which would break the graph in pieces.
-            metrics = self.compute_losses(batch, timed) if self._compiled is None else self._compiled(batch)
+        with self.autocast(), self._weights():
+            metrics = self.compute_losses(batch, timed)
         total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
         with timed("optimise"):
             total.backward()
             norms = gradient_norms(self._networks)
         return {key: value.detach() for key, value in (metrics | norms | {"loss": total}).items()}
+
+    def _weights(self) -> AbstractContextManager:
+        """Return the context in which the losses' layers have their weights in the type that autocast computes in."""
+        return (
+            cast_once(nn.ModuleList([self.agent, self.losses]), torch.bfloat16) if self._casts_once else nullcontext()
+        )
 
     def _of_all_processes(self, metrics: dict[str, Tensor], timed: Timer) -> dict[str, Tensor]:
         """Turn gradients and metrics of this process's share of the batch into those of the joint batch.
@@ -324,14 +336,9 @@ class DreamerLearner:
                 changed then.
         """
         self.adopt(state_dict)
-        # Rates are settings of this learner, not state: a run may be continued with others.
-        names = {"lr", "warmup_steps"}
-        own = [{name: value for name, value in group.items() if name in names} for group in self._groups]
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        restore(self.optimizer, state_dict["optimizer"])
         if self._actor_optimizer is not None:
-            self._actor_optimizer.load_state_dict(state_dict["actor_optimizer"])
-        for group, settings in zip(self._groups, own, strict=True):
-            group.update(settings)
+            restore(self._actor_optimizer, state_dict["actor_optimizer"])
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> None:

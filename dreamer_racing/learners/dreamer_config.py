@@ -18,8 +18,13 @@ class LearnerConfig:
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         slow_critic_rate: Fraction by which the slow critic moves at each update.
-        compile: Compile the losses with ``torch.compile``; minutes at the first update.
-        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph.
+        compile: Compile the arithmetic of the recurrent cell with ``torch.compile``, instead of what ``few_kernels``
+            does there.
+        cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
+            whether the run can, is False.
+        few_kernels: Round elsewhere, where that saves kernels: weights are cast once an update instead of at every use
+            (with ``mixed_precision``), gradients of gains and biases are summed after the loop over T. None: on a CUDA
+            device, where a small kernel's launch takes longer than its work.
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
             which the recipes replace by what the device does well, is False.
         learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.
@@ -35,7 +40,8 @@ class LearnerConfig:
     average_rate: float | None = setting(None, POSITIVE_SHARE)
     slow_critic_rate: float = setting(0.02, SHARE)
     compile: bool = False
-    cuda_graph: bool = False
+    cuda_graph: bool | None = None
+    few_kernels: bool | None = None
     mixed_precision: bool | None = None
     learning_rate: float = setting(4e-5, POSITIVE)
     behavior_learning_rate: float | None = setting(None, POSITIVE)

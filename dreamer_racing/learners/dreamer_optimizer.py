@@ -53,3 +53,11 @@ def gradient_norms(networks: Mapping[str, list[nn.Parameter]]) -> dict[str, Tens
     gradients = {name: [p.grad for p in parameters if p.grad is not None] for name, parameters in networks.items()}
     # A network has none where its loss steps it alone.
     return {f"gradient_norm/{name}": nn.utils.get_total_norm(found) for name, found in gradients.items() if found}
+
+
+def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Restore an optimiser's state, but not its settings: a run may go on with other rates, or on another device."""
+    names = {"lr", "warmup_steps", "fused"}
+    own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
+    groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
+    optimizer.load_state_dict({**state, "param_groups": groups})

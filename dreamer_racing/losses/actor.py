@@ -245,12 +245,18 @@ class DynamicsActorLoss(ActorLoss):
 
 @contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Let gradient flow through modules but not into their parameters."""
-    parameters = [p for module in modules for p in module.parameters() if p.requires_grad]
-    for parameter in parameters:
-        parameter.requires_grad_(False)
+    """Let gradient flow through modules but not into their parameters, nor what stands for these (``cast_once``)."""
+    layers = {layer: None for module in modules for layer in module.modules()}
+    held = [
+        (layer, name, parameter)
+        for layer in layers
+        for name, parameter in layer._parameters.items()
+        if parameter is not None and parameter.requires_grad
+    ]
+    for layer, name, parameter in held:
+        layer._parameters[name] = parameter.detach()  # type: ignore[assignment]  # no parameter, but in its place
     try:
         yield
     finally:
-        for parameter in parameters:
-            parameter.requires_grad_(True)
+        for layer, name, parameter in held:
+            layer._parameters[name] = parameter

@@ -5,6 +5,9 @@ it a full step however noisy it is. Here rollouts are kept, the actor does not m
 minibatches use them up; the clipped ratio bounds how far it moves for that much experience. Where that comes from is a
 subclass's: ``PPOActorLoss`` imagines it, ``FlownPPOActorLoss`` takes what the collector flew.
 
+Nothing here waits for a CUDA device. Whether a gradient step is to be made is known there alone: it is made with a mask
+that may leave everything as it was, and after too large a divergence the remaining steps of an improvement are such.
+
 Shape legend: M records of a minibatch, F features, A action.
 """
 
@@ -28,6 +31,12 @@ KL_TOLERANCE = 1.5
 """Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
 PACE_CHANGE, SLOWEST_PACE = 1.25, 0.01
 """Factor by which the learning rate then changes, and its smallest share [choice]."""
+
+
+def masks_steps(device: torch.device) -> bool:
+    """Tell whether steps are masked on a device, rather than left out, for which the CPU would have to wait."""
+    return device.type == "cuda"
+
 
 LogProb = Callable[[ActionDistribution, Tensor], Tensor]
 """Log-probability ``(..., 1)`` of an action ``(..., A)``."""
@@ -74,7 +83,11 @@ class ClippedActorLoss(ActorLoss):
         self.ppo = ppo or ActorPPOConfig()
         self.kl_target = self.ppo.kl_target  # may be on a schedule, `DreamerLearner.adjust`
         self.register_buffer("pace", torch.ones(1))  # share of the learning rate
-        self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5)
+        self._masked = masks_steps(next(self.actor.parameters()).device)
+        # The fused one takes a mask, and a rate that is a tensor.
+        self.optimizer = torch.optim.Adam(
+            self.actor.parameters(), lr=self.ppo.learning_rate, eps=1e-5, fused=True if self._masked else None
+        )
 
     @classmethod
     def from_config(cls, agent: Agent, config: LossConfig, horizon: int = HORIZON, **own: Any) -> Self:
@@ -121,20 +134,23 @@ class ClippedActorLoss(ActorLoss):
     def _make_epochs(self, records: Minibatch) -> dict[str, Tensor]:
         """Make epochs of gradient steps, until one comes upon too large a divergence."""
         number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
-        done: list[dict[str, Tensor]] = []
+        going = records.features.new_ones((), dtype=torch.bool)
+        done, made = list[dict[str, Tensor]](), list[Tensor]()
         for _ in range(self.ppo.epochs):
             order = torch.randperm(number, device=records.features.device)
             for chosen in order.split(size):
-                metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)))
+                metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)), going)
                 done.append(metrics)
-                if not metrics["ppo/kl"] <= self.ppo.kl_stop:  # waits for the device, some times an improvement
-                    return _summary(done, math.ceil(number / size))
-        return _summary(done, math.ceil(number / size))
+                made.append(going)
+                going = going & (metrics["ppo/kl"] <= self.ppo.kl_stop)
+                if not self._masked and not going:
+                    return _summary(done, made, math.ceil(number / size))
+        return _summary(done, made, math.ceil(number / size))
 
     @contextmanager
     def _paced(self) -> Iterator[None]:
         """Take the present share of the learning rates."""
-        pace, groups = float(self.pace), self.optimizer.param_groups
+        pace, groups = self.pace if self._masked else float(self.pace), self.optimizer.param_groups
         rates = [group["lr"] for group in groups]
         for group, rate in zip(groups, rates, strict=True):
             group["lr"] = rate * pace
@@ -149,36 +165,48 @@ class ClippedActorLoss(ActorLoss):
         target = self.kl_target
         if target is None:
             return
-        if not kl <= KL_TOLERANCE * target:
-            self.pace.div_(PACE_CHANGE).clamp_(min=SLOWEST_PACE)
-        elif kl < target / KL_TOLERANCE:
-            self.pace.mul_(PACE_CHANGE).clamp_(max=1.0)
+        slower, faster = (self.pace / PACE_CHANGE).clamp(min=SLOWEST_PACE), (self.pace * PACE_CHANGE).clamp(max=1.0)
+        pace = torch.where(kl < target / KL_TOLERANCE, faster, self.pace)
+        self.pace.copy_(torch.where(kl <= KL_TOLERANCE * target, pace, slower))  # the latter also where it is no number
 
-    def _minibatch(self, batch: Minibatch) -> dict[str, Tensor]:
-        """Make one gradient step; the divergence is that from before it."""
+    def _minibatch(self, batch: Minibatch, going: Tensor) -> dict[str, Tensor]:
+        """Make one gradient step if ``going``, bool, a scalar; the divergence is that from before it."""
         policy = self.actor(batch.features)
         loss, metrics = clipped_objective(policy, batch, self.ppo.clip_epsilon, self.entropy_scale, self.log_prob)
-        norm = self._descend(loss, self.actor)
+        norm = self._descend(loss, self.actor, going)
         return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
 
-    def _descend(self, loss: Tensor, network: nn.Module) -> Tensor:
-        """Make one gradient step of a network, unless its gradient is not finite; return the norm before clipping."""
+    def _descend(self, loss: Tensor, network: nn.Module, going: Tensor | None = None) -> Tensor:
+        """Make one gradient step of a network, unless its gradient is not finite; return the norm before clipping.
+
+        Args:
+            loss: A scalar.
+            network: Whose gradient is clipped.
+            going: Whether to make the step at all, bool, a scalar; None: yes.
+        """
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if parallel.count() > 1:
             parallel.average_gradients(network.parameters())
         norm = nn.utils.clip_grad_norm_(network.parameters(), self.ppo.gradient_clip)
-        if norm.isfinite():
+        good = norm.isfinite() if going is None else norm.isfinite() & going
+        if self._masked:
+            self.optimizer.found_inf = (~good).float()  # type: ignore[attr-defined]  # what a `GradScaler` tells it
+            self.optimizer.step()
+        elif good:
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         return norm
 
 
-def _summary(done: list[dict[str, Tensor]], minibatches: int) -> dict[str, Tensor]:
-    """Average over the gradient steps; the divergence is the last."""
-    means = {name: torch.stack([metrics[name] for metrics in done]).mean() for name in done[0]}
-    kl = done[-1]["ppo/kl"]
-    return means | {"ppo/kl": kl, "ppo/epochs": torch.full_like(kl, len(done) / minibatches)}
+def _summary(done: list[dict[str, Tensor]], made: list[Tensor], minibatches: int) -> dict[str, Tensor]:
+    """Average over the gradient steps that were ``made``, bool, scalars; the divergence is that of the last of them."""
+    mask = torch.stack(made)
+    number = mask.sum()
+    values = {name: torch.stack([metrics[name] for metrics in done]) for name in done[0]}
+    means = {name: value.where(mask, 0.0).sum() / number for name, value in values.items()}
+    kl = values["ppo/kl"].gather(0, number.unsqueeze(0) - 1).squeeze(0)
+    return means | {"ppo/kl": kl, "ppo/epochs": number.to(kl.dtype) / minibatches}
 
 
 def normalised(advantage: Tensor, weight: Tensor) -> Tensor:

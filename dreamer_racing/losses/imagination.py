@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.modules.actor import Actor
+from dreamer_racing.modules.deferred import autocast_type
 from dreamer_racing.modules.rssm import RSSM
 from dreamer_racing.modules.world_model import join_features
 
@@ -68,6 +69,8 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
     Returns:
         The rollout.
     """
+    if rssm.few_kernels and not torch.is_grad_enabled():
+        return _imagine_low(rssm, actor, belief, state, horizon)
     features, actions = [join_features(belief, state)], []
     for _ in range(horizon):
         action = actor(features[-1]).sample()
@@ -75,6 +78,24 @@ def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: in
         actions.append(action)
         features.append(join_features(belief, state))
     return Imagination(torch.stack(features), torch.stack(actions))
+
+
+def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
+    """Let the policy act in the world model, with fewer kernels.
+
+    Noise is drawn ahead. Features are in the type in which autocast computes, to which every head casts them first.
+    """
+    shape = (horizon + 1, len(belief), belief.shape[-1] + state.shape[-1])
+    features = belief.new_zeros(shape, dtype=autocast_type(belief.device.type) or belief.dtype)
+    features[0].copy_(join_features(belief, state))
+    actions = []
+    noises = torch.randn(horizon, len(belief), actor.action_dim, device=belief.device)
+    draws = zip(noises, rssm.draw_noise(horizon, len(belief)), features[:-1], features[1:], strict=True)
+    for of_action, of_state, here, following in draws:
+        action = actor(here).sample(of_action)
+        belief = rssm.imagine_low(belief, here, action, of_state, following)
+        actions.append(action)
+    return Imagination(features, torch.stack(actions))
 
 
 def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:

@@ -42,6 +42,7 @@ class PPOActorLoss(ClippedActorLoss):
             self.register_buffer(name, torch.empty(0))
         self.register_buffer("cursor", torch.zeros(1, dtype=torch.int64))  # the place that is written next
         self.register_buffer("kept", torch.zeros(1, dtype=torch.int64))  # places written so far, at most K
+        self._full = False  # whether those are known to be K, so that the device need not be asked
 
     def prepare(self, starts: int) -> None:
         """Make room for K rollouts from so many starts each; what was kept of another shape is forgotten.
@@ -56,6 +57,7 @@ class PPOActorLoss(ClippedActorLoss):
             self.register_buffer(name, torch.zeros(*shape, width, device=self.cursor.device))
         self.cursor.zero_()
         self.kept.zero_()
+        self._full = False
 
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         self.prepare(len(belief))
@@ -76,6 +78,7 @@ class PPOActorLoss(ClippedActorLoss):
         else:
             for name in (*Minibatch._fields, "cursor", "kept"):
                 state_dict.pop(prefix + name, None)
+        self._full = False
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def improve(self, updates: int) -> dict[str, Tensor]:
@@ -87,6 +90,9 @@ class PPOActorLoss(ClippedActorLoss):
         Returns:
             Nothing, or what ``_improve_on`` does.
         """
-        if updates % self.ppo.updates or int(self.kept) < self.ppo.updates:
+        if updates % self.ppo.updates:
+            return {}
+        self._full = self._full or int(self.kept) >= self.ppo.updates  # waits for the device in the first round alone
+        if not self._full:
             return {}
         return self._improve_on(Minibatch(*(self.get_buffer(name).flatten(0, 2) for name in Minibatch._fields)))

@@ -9,7 +9,8 @@ from dreamer_racing.modules.heads import MLP, ContinueHead, TwoHot, TwoHotHead, 
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.parallel_rssm import DiagonalSSM, ParallelRSSM
 from dreamer_racing.modules.policy import DreamerPolicy
-from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, DenseGRUCell, Posterior
+from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
+from dreamer_racing.modules.rssm import RSSM, Posterior
 from dreamer_racing.modules.sizes import SIZES, ModelSize, get_size
 from dreamer_racing.modules.world_model import WorldModel, join_features
 

@@ -35,9 +35,9 @@ class ActionDistribution(NamedTuple):
     mean: Tensor
     std: Tensor
 
-    def sample(self) -> Tensor:
-        """Draw an action ``(..., A)``, differentiable in mean and std."""
-        return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean))
+    def sample(self, noise: Tensor | None = None) -> Tensor:
+        """Draw an action ``(..., A)``, differentiable in mean and std; by normal noise ``(..., A)`` if it is given."""
+        return torch.addcmul(self.mean, self.std, torch.randn_like(self.mean) if noise is None else noise)
 
     def mode(self) -> Tensor:
         """Return the likeliest action ``(..., A)``."""
@@ -98,6 +98,10 @@ class Actor(nn.Module):
         self.mlp = MLP(in_features, (1 + state_std) * action_dim, layers, units, norm, output_scale=0.01)
         first = torch.tensor((FIRST_STD - min_std) / max(max_std - min_std, 1e-6)).clamp(0.01, 0.99).logit()
         self.raw_std = None if state_std else nn.Parameter((first - STD_SHIFT).repeat(action_dim))
+        self.few_kernels = False
+        self.action_dim = action_dim
+        shift = torch.tensor([0.0, STD_SHIFT]).repeat_interleave(action_dim)
+        self.shift = nn.Buffer(shift if state_std else shift[:action_dim], persistent=False)  # of the network's output
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = nn.Buffer(torch.tensor(float(max_std)))
 
@@ -109,7 +113,19 @@ class Actor(nn.Module):
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""
+        if self.few_kernels:
+            return self._with_few_kernels(self.mlp(features))
         output = self.mlp(features).float()
         mean, raw_std = output.chunk(2, -1) if self.raw_std is None else (output, self.raw_std.expand_as(output))
         std = (self.max_std - self.min_std) * torch.sigmoid(raw_std + STD_SHIFT) + self.min_std
         return ActionDistribution(torch.tanh(mean), std)
+
+    def _with_few_kernels(self, output: Tensor) -> ActionDistribution:
+        """Do what ``forward`` does behind the network, whose output ``(..., 2·A)`` or ``(..., A)`` is in any type."""
+        output = output + self.shift  # in float32
+        mean, shifted = output.chunk(2, -1) if self.raw_std is None else (output, self._shifted_std(output))
+        return ActionDistribution(torch.tanh(mean), torch.lerp(self.min_std, self.max_std, torch.sigmoid(shifted)))
+
+    def _shifted_std(self, like: Tensor) -> Tensor:
+        assert self.raw_std is not None
+        return (self.raw_std + STD_SHIFT).expand_as(like)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dreamer_racing.modules.encoder import fold_patches, make_convolution, smallest_map, unfold_patches
 from dreamer_racing.modules.heads import MLP, symexp, symlog
-from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, initialize_convolution, linear
+from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, in_own_type, initialize_convolution, linear
 
 
 class DenseProjection(nn.Module):
@@ -61,7 +61,9 @@ class UpsampledConvolution(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         """Map ``(N, C, H, W)`` to ``(N, C', 2H, 2W)``."""
-        return self.convolution(F.interpolate(maps, scale_factor=2.0, mode="nearest"))
+        with in_own_type(maps):
+            doubled = F.interpolate(maps, scale_factor=2.0, mode="nearest")
+        return self.convolution(doubled)
 
 
 class StridedConvolution(nn.ConvTranspose2d):

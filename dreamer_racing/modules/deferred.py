@@ -46,22 +46,25 @@ class DeferredWeight:
     Under autocast the weight is cast once, not at every step.
 
     Args:
-        weight: ``(..., I, O)``; leading dimensions are those of a batched product.
-        bias: ``(O,)``, only with a weight ``(I, O)``; or None.
+        weight: ``(I, O)``, or ``(G, I, O)`` for a batched product.
+        bias: ``(O,)`` or ``(G, 1, O)``; or None.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
-        self._dtype = _autocast_dtype(weight.device.type) or weight.dtype
+        self._dtype = autocast_type(weight.device.type) or weight.dtype
         self._tape = Tape()
+        self.has_bias = bias is not None
         cast = None if bias is None else bias.to(self._dtype)
         self._weight, self._bias = _Collect.apply(weight.to(self._dtype), cast, self._tape)
 
-    def product(self, inputs: Tensor) -> Tensor:
-        """Map ``(..., N, I)`` to ``(..., N, O)``."""
+    def product(self, inputs: Tensor, base: Tensor | None = None) -> Tensor:
+        """Map ``(..., N, I)`` to ``(..., N, O)``; where there is no bias, a base ``(N, O)`` may be added."""
+        if base is not None:
+            return _Sum.apply(base.to(self._dtype), inputs.to(self._dtype), self._weight, self._tape)
         return _Product.apply(inputs.to(self._dtype), self._weight, self._bias, self._tape)
 
 
-def _autocast_dtype(device_type: str) -> torch.dtype | None:
+def autocast_type(device_type: str) -> torch.dtype | None:
     """Return the type that autocast computes in on a kind of device; None where it is off."""
     if not torch.amp.is_autocast_available(device_type) or not torch.is_autocast_enabled(device_type):
         return None
@@ -84,7 +87,8 @@ class _Collect(Function):
         if taken is None:
             return None, None, None
         inputs, outputs = taken
-        return inputs.mT @ outputs, outputs.sum(-2) if ctx.needs_input_grad[1] else None, None
+        of_bias = outputs.sum(-2, keepdim=outputs.ndim == 3) if ctx.needs_input_grad[1] else None
+        return inputs.mT @ outputs, of_bias, None
 
 
 class _Product(Function):
@@ -94,10 +98,28 @@ class _Product(Function):
     def forward(ctx: FunctionCtx, inputs: Tensor, weight: Tensor, bias: Tensor | None, tape: Tape) -> Tensor:
         ctx.save_for_backward(inputs, weight)
         ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
-        return inputs @ weight if bias is None else torch.addmm(bias, inputs, weight)
+        if bias is None:
+            return inputs @ weight
+        return (torch.addmm if weight.ndim == 2 else torch.baddbmm)(bias, inputs, weight)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         inputs, weight = ctx.saved_tensors
         ctx.tape.add(inputs, gradient)
         return gradient @ weight.mT if ctx.needs_input_grad[0] else None, None, None, None
+
+
+class _Sum(Function):
+    """One step, added to something."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, base: Tensor, inputs: Tensor, weight: Tensor, tape: Tape) -> Tensor:
+        ctx.save_for_backward(inputs, weight)
+        ctx.tape = tape  # type: ignore[attr-defined]  # torch lets a context hold anything
+        return torch.addmm(base, inputs, weight)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, weight = ctx.saved_tensors
+        ctx.tape.add(inputs, gradient)
+        return gradient, gradient @ weight.mT if ctx.needs_input_grad[1] else None, None, None

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -48,18 +49,40 @@ def initialize(weight: Tensor, fan_in: int, scale: float = 1.0) -> None:
     nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
 
 
+class OfSteps:
+    """A parameter for the steps of one loop: their gradients are summed once after it, not one by one on the way.
+
+    Args:
+        parameter: Any shape.
+        steps: Length of the loop.
+    """
+
+    def __init__(self, parameter: Tensor, steps: int) -> None:
+        self._left = iter(parameter.expand(steps, *parameter.shape).unbind(0))
+
+    def take(self) -> Tensor:
+        """Return the parameter for the next step."""
+        return next(self._left)
+
+
 class Linear(nn.Linear):
     """Linear layer that a time loop may use; see ``unrolled``."""
 
     deferred: DeferredWeight | None = None
 
-    def defer(self) -> DeferredWeight:
-        """Return the weight for the steps of one loop."""
+    def defer(self, with_bias: bool = True) -> DeferredWeight:
+        """Return weight and bias for the steps of one loop."""
         return DeferredWeight(self.weight.mT, self.bias)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``(..., I)`` to ``(..., O)``."""
         return super().forward(inputs) if self.deferred is None else self.deferred.product(inputs)
+
+    def plus(self, base: Tensor, inputs: Tensor) -> Tensor:
+        """Map ``(N, I)`` to ``(N, O)`` and add a base ``(N, O)``, in one kernel; without the layer's bias."""
+        if self.deferred is None:
+            return torch.addmm(base, inputs, self.weight.mT)
+        return self.deferred.product(inputs, base)
 
 
 def linear(in_features: int, out_features: int, bias: bool = True, scale: float = 1.0) -> Linear:
@@ -101,6 +124,7 @@ class RMSNorm(nn.Module):
     """
 
     shifts = False
+    of_steps: dict[str, OfSteps] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -108,17 +132,40 @@ class RMSNorm(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``(..., features)`` over its last dimension."""
+        weight = self.weight if self.of_steps is None else self.of_steps["weight"].take()
         # The cast does nothing but under autocast, where mixed types would leave the fused kernel.
-        return F.rms_norm(inputs, self.weight.shape, self.weight.to(inputs.dtype), NORM_EPS)
+        with in_own_type(inputs):
+            return F.rms_norm(inputs, weight.shape, weight.to(inputs.dtype), NORM_EPS)
 
 
 class LayerNorm(nn.LayerNorm):
     """Layer normalisation of the 2023 DreamerV3; on CPU one fused kernel, 4-9 times faster than RMS backward."""
 
     shifts = True
+    of_steps: dict[str, OfSteps] | None = None  # see ``unrolled``
 
     def __init__(self, features: int) -> None:
         super().__init__(features, eps=NORM_EPS)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Normalise ``(..., features)`` over its last dimension."""
+        weight: Tensor = self.weight
+        bias: Tensor = self.bias
+        if self.of_steps is not None:
+            weight, bias = (self.of_steps[name].take() for name in ("weight", "bias"))
+        if inputs.device.type != "cpu":  # where one kernel takes float32 beside bfloat16
+            weight, bias = weight.to(inputs.dtype), bias.to(inputs.dtype)
+        with in_own_type(inputs):
+            return F.layer_norm(inputs, self.normalized_shape, weight, bias, self.eps)
+
+
+def in_own_type(inputs: Tensor) -> Any:
+    """Return the context for what autocast of CUDA, but not of a CPU, would compute in float32: norms, upsampling.
+
+    They gain nothing by it, for they compute their statistics in float32 anyway, and everything after them would have
+    to be cast back.
+    """
+    return nullcontext() if inputs.device.type == "cpu" else autocast(inputs.device, enabled=False)
 
 
 NORMS: dict[str, type[RMSNorm] | type[LayerNorm]] = {"rms": RMSNorm, "layer": LayerNorm}
@@ -162,6 +209,7 @@ class SplitNormedLinear(nn.Module):
         super().__init__()
         self.norm = NORMS[norm](out_features)
         fan_in = first_features + second_features
+        self.few_kernels = False
         self.first = linear(first_features, out_features, False, (first_features / fan_in) ** 0.5)
         self.second = linear(second_features, out_features, not self.norm.shifts, (second_features / fan_in) ** 0.5)
 
@@ -171,6 +219,8 @@ class SplitNormedLinear(nn.Module):
 
     def forward(self, first: Tensor, projected: Tensor) -> Tensor:
         """Map the first input ``(..., first_features)`` and the projected second one to ``(..., O)``."""
+        if self.few_kernels and first.ndim == 2:
+            return F.silu(self.norm(self.first.plus(projected, first)))
         return F.silu(self.norm(self.first(first) + projected))
 
 
@@ -201,9 +251,10 @@ class BlockLinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_features)) if bias else None
         initialize(self.weight, fan_in or in_features // blocks)
 
-    def defer(self) -> DeferredWeight:
-        """Return the weight for the steps of one loop."""
-        return DeferredWeight(self.weight)
+    def defer(self, with_bias: bool = False) -> DeferredWeight:
+        """Return the weight for the steps of one loop, and the bias if it is to go with it."""
+        bias = self.bias.view(self.blocks, 1, -1) if with_bias and self.bias is not None else None
+        return DeferredWeight(self.weight, bias)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``(N, I)`` to ``(N, O)``."""
@@ -211,23 +262,34 @@ class BlockLinear(nn.Module):
         blocked = inputs.unflatten(-1, (self.blocks, -1)).transpose(0, 1)
         product = torch.bmm(blocked, self.weight) if self.deferred is None else self.deferred.product(blocked)
         outputs = product.transpose(0, 1).flatten(1)
-        return outputs if self.bias is None else outputs + self.bias
+        has_bias = self.deferred is not None and self.deferred.has_bias
+        return outputs if self.bias is None or has_bias else outputs + self.bias
 
 
 @contextmanager
-def unrolled(*modules: nn.Module) -> Iterator[None]:
+def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
     """Let the linear layers of modules that a time loop calls at every step compute their weight gradients after it.
 
     Gradients are the same but for rounding. Does nothing without gradients, and under ``torch.compile``, which cannot
     trace it.
+
+    Args:
+        modules: That the loop calls, each layer of them once a step.
+        steps: Length of the loop, to do so for gains and biases, too: fewer kernels; None: no.
     """
-    layers = [layer for module in modules for layer in module.modules() if isinstance(layer, (Linear, BlockLinear))]
+    inside = [layer for module in modules for layer in module.modules()]
     if not torch.is_grad_enabled() or torch.compiler.is_compiling():
-        layers = []
+        inside = []
+    layers = [layer for layer in inside if isinstance(layer, (Linear, BlockLinear))]
+    norms = [layer for layer in inside if steps and isinstance(layer, (RMSNorm, LayerNorm))]
     for layer in layers:
-        layer.deferred = layer.defer() if layer.weight.requires_grad else None
+        layer.deferred = layer.defer(with_bias=steps is not None) if layer.weight.requires_grad else None
+    for norm in norms:
+        norm.of_steps = {name: OfSteps(gain, steps or 0) for name, gain in norm._parameters.items() if gain is not None}
     try:
         yield
     finally:
         for layer in layers:
             layer.deferred = None
+        for norm in norms:
+            norm.of_steps = None

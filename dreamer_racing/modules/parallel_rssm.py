@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from dreamer_racing.modules.layers import NormedLinear, linear
 from dreamer_racing.modules.linear_recurrence import linear_recurrence
-from dreamer_racing.modules.rssm import RSSM, Posterior, SplitInputCell
+from dreamer_racing.modules.recurrent_cells import SplitInputCell
+from dreamer_racing.modules.rssm import RSSM, Posterior
 
 LAYERS = 2
 """Layers of the recurrence: channels of one do not see each other's past, those of the next one read all of it."""
@@ -59,8 +60,8 @@ class DiagonalSSM(SplitInputCell):
         self.gates = nn.ModuleList(gates)
         self.mixes = nn.ModuleList(NormedLinear(width, hidden, norm) for _ in range(LAYERS - 1))
 
-    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
-        """Return the next belief; arguments as in ``DenseGRUCell.forward``."""
+    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor, low: Tensor | None = None) -> Tensor:
+        """Return the next belief; arguments as in ``DenseGRUCell.forward``, of which ``low`` is not needed."""
         return self._run(belief, state, projected_action, None)
 
     def scan(self, belief: Tensor, state: Tensor, projected_action: Tensor, begins: Tensor) -> Tensor:

@@ -6,15 +6,23 @@ S state = L·K, U hidden. Everything here is plain tensors, so that a time loop 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd import Function
+from torch.autograd.function import FunctionCtx
 
-from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear, unrolled
+from dreamer_racing.modules.deferred import autocast_type
+from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, linear, unrolled
+from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell, gated_update
 from dreamer_racing.modules.stored_latents import LatentFormat
+
+Begin = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
+"""Belief and state from which step t goes on, of t and those that the step before left."""
 
 
 class Posterior(NamedTuple):
@@ -39,13 +47,17 @@ def mix_uniform(logits: Tensor, unimix: float) -> Tensor:
     return torch.add(probabilities * (1.0 - unimix), unimix / logits.shape[-1])
 
 
-def sample_one_hot(probabilities: Tensor, noise: Tensor | None) -> Tensor:
+def sample_one_hot(
+    probabilities: Tensor, noise: Tensor | None, blank: Tensor | None = None, dtype: torch.dtype | None = None
+) -> Tensor:
     """Choose one class of each latent.
 
     Args:
         probabilities: ``(..., L, K)``.
         noise: Uniform numbers in [0, 1), ``(..., L, 1)``, at which the distribution function is inverted (one number a
             latent, where Gumbel noise needs one a class); None takes the mode.
+        blank: Zeros ``(..., L, K)`` that are written on; None makes some.
+        dtype: Of these; None: that of the probabilities. It holds 0 and 1.
 
     Returns:
         One-hots ``(..., L, K)`` whose gradient is that of ``probabilities`` (straight-through).
@@ -54,117 +66,22 @@ def sample_one_hot(probabilities: Tensor, noise: Tensor | None) -> Tensor:
     if noise is None:
         index = fixed.argmax(-1, keepdim=True)
     else:
-        # Rounding may leave the last sum just below 1, and the number above it.
-        index = torch.searchsorted(fixed.cumsum(-1), noise, right=True).clamp_max_(fixed.shape[-1] - 1)
-    one_hot = torch.zeros_like(fixed).scatter_(-1, index, 1.0)
-    if not probabilities.requires_grad:
-        return one_hot
-    return one_hot + (probabilities - fixed)
+        # Without the last sum, which rounding may leave just below 1, and below the number.
+        index = torch.searchsorted(fixed[..., :-1].cumsum(-1), noise, right=True)
+    one_hot = (torch.zeros_like(fixed, dtype=dtype) if blank is None else blank).scatter_(-1, index, 1.0)
+    return _StraightThrough.apply(one_hot, probabilities) if probabilities.requires_grad else one_hot
 
 
-def _gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
-    """Return the next belief from the gates before activation and the belief, each float32 ``(N, D)``."""
-    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-    # The shift of -1 makes a fresh cell remember rather than overwrite.
-    return torch.lerp(belief, candidate, torch.sigmoid(update - 1.0))
+class _StraightThrough(Function):
+    """Passes a sample on, and its gradient to the probabilities that it was drawn by."""
 
+    @staticmethod
+    def forward(ctx: FunctionCtx, sample: Tensor, probabilities: Tensor) -> Tensor:
+        return sample.view_as(sample)
 
-class SplitInputCell(nn.Module):
-    """Recurrent cell that reads the state and the action through one normalised layer, the action's part ahead of time.
-
-    Args:
-        state: S.
-        action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
-    """
-
-    def __init__(self, state: int, action: int, hidden: int, norm: str) -> None:
-        super().__init__()
-        self.action_dim = action
-        self.inputs = SplitNormedLinear(state, action, hidden, norm)
-
-    def project_action(self, action: Tensor) -> Tensor:
-        """Map actions ``(..., A)`` to their part of the input layer ``(..., U)``."""
-        return self.inputs.project(action)
-
-
-class DenseGRUCell(SplitInputCell):
-    """GRU of the 2023 DreamerV3: one dense layer before it, one normalised dense layer for its three gates.
-
-    Args:
-        belief: D.
-        state: S.
-        action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
-        blocks: Ignored; here so that both cells are made alike.
-    """
-
-    def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 1) -> None:
-        super().__init__(state, action, hidden, norm)
-        self.gates_norm = NORMS[norm](3 * belief)
-        self.gates = linear(hidden + belief, 3 * belief, bias=not self.gates_norm.shifts)
-
-    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
-        """Return the next belief.
-
-        Args:
-            belief: ``(N, D)``.
-            state: ``(N, S)``.
-            projected_action: From ``project_action``, ``(N, U)``.
-
-        Returns:
-            ``(N, D)``.
-        """
-        inputs = self.inputs(state, projected_action)
-        gates = self.gates_norm(self.gates(torch.cat((inputs, belief), -1))).float()
-        reset, candidate, update = gates.chunk(3, -1)
-        return _gated_update(reset, candidate, update, belief)
-
-
-class BlockGRUCell(nn.Module):
-    """GRU of the 2025 DreamerV3: block-diagonal in the belief, so that a wide belief costs few weights.
-
-    The reference feeds every block the same 3·U inputs beside its own part of the belief. The product is the sum of a
-    dense layer of those inputs and a block-diagonal layer of the belief, which is how it is computed here.
-
-    Args:
-        belief: D, divisible by ``blocks``.
-        state: S.
-        action: A.
-        hidden: U.
-        norm: ``"rms"`` or ``"layer"``.
-        blocks: G.
-
-    Reference: danijar/dreamerv3, ``rssm.RSSM._core``.
-    """
-
-    def __init__(self, belief: int, state: int, action: int, hidden: int, norm: str, blocks: int = 8) -> None:
-        super().__init__()
-        self.action_dim = action
-        self.blocks = blocks
-        self.from_belief = NormedLinear(belief, hidden, norm)
-        self.from_state = NormedLinear(state, hidden, norm)
-        self.from_action = NormedLinear(action, hidden, norm)
-        fan_in = belief // blocks + 3 * hidden
-        self.hidden_shared = linear(3 * hidden, belief, scale=(3 * hidden / fan_in) ** 0.5)
-        self.hidden_blocks = BlockLinear(belief, belief, blocks, fan_in=fan_in, bias=False)
-        self.hidden_norm = NORMS[norm](belief)
-        self.gates = BlockLinear(belief, 3 * belief, blocks)
-
-    def project_action(self, action: Tensor) -> Tensor:
-        """Map actions ``(..., A)`` to their hidden layer ``(..., U)``."""
-        return self.from_action(action)
-
-    def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor) -> Tensor:
-        """Return the next belief; arguments as in ``DenseGRUCell.forward``."""
-        inputs = torch.cat((self.from_belief(belief), self.from_state(state), projected_action), -1)
-        hidden = F.silu(self.hidden_norm(self.hidden_shared(inputs) + self.hidden_blocks(belief)))
-        # Each block holds its reset, candidate and update gates: (N, 3D) -> three of (N, D)
-        gates = self.gates(hidden).float().unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
-        reset, candidate, update = (gate.flatten(1) for gate in gates)
-        return _gated_update(reset, candidate, update, belief)
+    @staticmethod
+    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[None, Tensor]:
+        return None, gradient.float()
 
 
 class RSSM(nn.Module):
@@ -228,6 +145,10 @@ class RSSM(nn.Module):
         if recurrence not in self.cells:
             raise ValueError(f"{type(self).__name__}: recurrence={recurrence!r}, known here: {', '.join(self.cells)}.")
         self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
+        self.few_kernels = False
+        self.compiled = False
+        self.mix: Callable[[Tensor, float], Tensor] = mix_uniform
+        self.uniform = nn.Buffer(torch.tensor(1.0 / classes), persistent=False)
         state = latents * classes
         self.cell = self.cells[recurrence](belief, state, action, hidden, norm, blocks)
         widths = [belief] + [hidden] * prior_layers
@@ -287,15 +208,20 @@ class RSSM(nn.Module):
         actions = self._project_action(previous_action, resets).unbind(1)
         embeddings = self.posterior_hidden.project(embedding).unbind(1)
         noises = [None] * time if deterministic else self.draw_noise(time, batch).unbind(0)
+        dtype = self._state_type(belief)
+        begin = self._begin_steps(resets, (start[0], start[1].to(dtype)))
         beliefs, states, logits = [], [], []
-        with unrolled(self.cell, self.posterior_hidden, self.posterior_output):
-            for reset, action, embedded, noise in zip(resets.unbind(1), actions, embeddings, noises, strict=True):
-                belief, state, logit = self._observe(belief, state, start, reset, action, embedded, noise)
+        steps = time if self.few_kernels else None
+        with unrolled(self.cell, self.posterior_hidden, self.posterior_output, steps=steps):
+            for at, (action, embedded, noise) in enumerate(zip(actions, embeddings, noises, strict=True)):
+                belief, state = begin(at, belief, state)
+                belief, state, logit = self._observe(belief, state, action, embedded, noise, dtype)
                 beliefs.append(belief)
                 states.append(state)
                 logits.append(logit)
         belief = torch.stack(beliefs, 1)
-        return Posterior(belief, torch.stack(states, 1), torch.stack(logits, 1), self.prior_logits(belief))
+        state = torch.stack(states, 1).float()
+        return Posterior(belief, state, torch.stack(logits, 1), self.prior_logits(belief))
 
     def observe_step(
         self,
@@ -323,7 +249,9 @@ class RSSM(nn.Module):
         action = self._project_action(previous_action, reset)
         embedded = self.posterior_hidden.project(embedding)
         noise = None if deterministic else self.draw_noise(len(is_init))
-        return self._observe(belief, state, self.initial(), reset, action, embedded, noise)[:2]
+        start = self.initial()
+        belief, state = torch.where(reset, start[0], belief), torch.where(reset, start[1], state)
+        return self._observe(belief, state, action, embedded, noise)[:2]
 
     def imagine_step(
         self, belief: Tensor, state: Tensor, action: Tensor, deterministic: bool = False
@@ -343,6 +271,51 @@ class RSSM(nn.Module):
         noise = None if deterministic else self.draw_noise(len(belief))
         return belief, self._sample(self.prior_logits(belief), noise)
 
+    def _state_type(self, belief: Tensor) -> torch.dtype:
+        """Return the type of states in a loop: where they are one-hots, that in which autocast computes will do."""
+        low = autocast_type(belief.device.type) if self.few_kernels and self.sampled else None
+        return low or belief.dtype
+
+    def _begin_steps(self, resets: Tensor, start: tuple[Tensor, Tensor]) -> Begin:
+        """Return what lets the steps of a window ``(B, T, 1)`` begin from an episode's start where it is reset.
+
+        A choice takes one kernel, and four on the way back, to make the zeros of what was not chosen; with
+        ``few_kernels`` it is a multiplication, one and one.
+        """
+        if not self.few_kernels:
+            choices = resets.unbind(1)
+            return lambda at, *latents: tuple(map(partial(torch.where, choices[at]), start, latents))
+        starts = [(value.unsqueeze(1) * resets).unbind(1) for value in start]
+        stays = ~resets
+        kept = [stays.to(value.dtype).unbind(1) for value in start]
+        return lambda at, *latents: tuple(
+            torch.addcmul(begins[at], before.to(begins[at].dtype), goes_on[at])
+            for begins, goes_on, before in zip(starts, kept, latents, strict=True)
+        )
+
+    def imagine_low(self, belief: Tensor, features: Tensor, action: Tensor, noise: Tensor, following: Tensor) -> Tensor:
+        """Do what ``imagine_step`` does, with every latent cast once, and where it is to be.
+
+        Args:
+            belief: ``(N, D)``.
+            features: Belief and state in the type that autocast computes in, ``(N, F)``.
+            action: ``(N, A)``.
+            noise: ``(N, L, 1)``.
+            following: Zeros of that type, ``(N, F)``, on which the next belief and state are written.
+
+        Returns:
+            The next belief, in its own type.
+        """
+        width = belief.shape[-1]
+        action = self.cell.project_action(action.clamp(-1.0, 1.0))
+        belief = self.cell(belief, features[:, width:], action, features[:, :width])
+        low, state = following[:, :width], following[:, width:]
+        logits = self.prior_logits(low.copy_(belief))
+        sample = self._sample(logits, noise, state.unflatten(-1, (self.latents, self.classes)))
+        if not self.sampled:
+            state.copy_(sample)
+        return belief
+
     def _project_action(self, previous_action: Tensor, reset: Tensor) -> Tensor:
         """Clip, zero where ``reset`` and project actions ``(..., A)``."""
         return self.cell.project_action(previous_action.clamp(-1.0, 1.0).masked_fill(reset, 0.0))
@@ -351,25 +324,38 @@ class RSSM(nn.Module):
         self,
         belief: Tensor,
         state: Tensor,
-        start: tuple[Tensor, Tensor],
-        reset: Tensor,
         projected_action: Tensor,
         embedded: Tensor,
         noise: Tensor | None,
+        dtype: torch.dtype | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Step belief ``(N, D)`` and state ``(N, S)``, and return them with the posterior's logits ``(N, L, K)``."""
-        belief = torch.where(reset, start[0], belief)
-        state = torch.where(reset, start[1], state)
         belief = self.cell(belief, state, projected_action)
         logits = self._posterior_logits(belief, embedded)
-        return belief, self._sample(logits, noise), logits
+        return belief, self._sample(logits, noise, dtype=dtype), logits
 
     def _posterior_logits(self, belief: Tensor, embedded: Tensor) -> Tensor:
         """Map beliefs ``(..., D)`` and projected embeddings ``(..., U)`` to the posterior's logits ``(..., L, K)``."""
         logits = self.posterior_output(self.posterior_hidden(belief, embedded))
         return logits.float().unflatten(-1, (self.latents, self.classes))
 
-    def _sample(self, logits: Tensor, noise: Tensor | None) -> Tensor:
-        """Return states ``(..., S)`` by logits ``(..., L, K)``."""
-        probabilities = mix_uniform(logits, self.unimix)
-        return (sample_one_hot(probabilities, noise) if self.sampled else probabilities).flatten(-2)
+    def _sample(
+        self, logits: Tensor, noise: Tensor | None, blank: Tensor | None = None, dtype: torch.dtype | None = None
+    ) -> Tensor:
+        """Return states ``(..., S)`` by logits ``(..., L, K)``; the other arguments are those of ``sample_one_hot``."""
+        if self.few_kernels and not self.compiled:
+            probabilities = torch.lerp(torch.softmax(logits, -1), self.uniform, self.unimix)
+        else:
+            probabilities = self.mix(logits, self.unimix)
+        return (sample_one_hot(probabilities, noise, blank, dtype) if self.sampled else probabilities).flatten(-2)
+
+    def compile_steps(self) -> None:
+        """Compile the arithmetic of a step, with ``torch.compile``: the gates, and the probabilities of states.
+
+        Not the loop: unrolled it takes minutes to compile, and its matrix products gain nothing.
+        """
+        self.mix = torch.compile(mix_uniform, dynamic=False)
+        self.compiled = True
+        if hasattr(self.cell, "gated_update"):
+            self.cell.few_kernels = False
+            self.cell.gated_update = torch.compile(gated_update, dynamic=False)

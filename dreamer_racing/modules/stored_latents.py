@@ -54,5 +54,6 @@ class LatentFormat(NamedTuple):
         """Return belief ``(*N, D)`` and state ``(*N, S)``, float32, of packed latents ``[*N]``."""
         belief, state = packed.get("belief").float(), packed.get("state")
         if self.sampled:
-            state = torch.nn.functional.one_hot(state.long(), self.classes).flatten(-2)
+            # Not one_hot, which looks at the classes first.
+            state = (state.unsqueeze(-1) == torch.arange(self.classes, device=state.device)).flatten(-2)
         return belief, state.float()

@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from composing.schema import DreamerConfig, RunConfig, is_race
+import torch
+
+from composing.schema import DreamerConfig, EnvConfig, RunConfig, is_race
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
@@ -22,6 +24,12 @@ def scene_name(config: RunConfig) -> str:
     return config.track if is_race(config) else config.task
 
 
+def worlds_device(device: torch.device, env: EnvConfig) -> str:
+    """The device for worlds: the learner's, where they have a simulator and the renderer asked for, else the CPU."""
+    fits = env.suite == "race" and env.renderer in ("auto", "warp")
+    return str(device) if device.type == "cuda" and fits else "cpu"
+
+
 def camera_of(config: RunConfig) -> Camera:
     """The nose camera."""
     side = config.env.image_size
@@ -29,7 +37,7 @@ def camera_of(config: RunConfig) -> Camera:
 
 
 def worlds_of(config: RunConfig) -> dict[str, Any]:
-    """Arguments of every `DroneRacingEnv` of the run."""
+    """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
     env = config.env
     return {
         "track": with_decoys(config.track, config.decoys) if config.decoys else config.track,
@@ -38,6 +46,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "camera": camera_of(config),
         "control_rate": env.control_rate,
         "from_pixels": env.from_pixels,
+        "device": env.device,
     }
 
 
@@ -55,7 +64,6 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             start_at_gate=env.start_at_gate,
             start_on_line=env.start_on_line,
             miss_radius=env.miss_radius,
-            device=env.device,
             looks=env.looks,
             seed=config.seed,
             **worlds_of(config),

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker
 
-from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name
+from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name, worlds_device
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
@@ -66,8 +66,10 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     if config.env.episode_steps is None:
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
-        config.env.device = worlds_device(config)
-        print(f"worlds: {config.env.device} (env.device=auto)")
+        overlapped = str(config.get("collection", "")).endswith("overlapped")
+        config.env.device = "cpu" if overlapped else worlds_device(device, config.env)
+        if config.env.device != "cpu":
+            print(f"worlds: {config.env.device} (env.device=auto)")
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device
@@ -92,13 +94,6 @@ def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictCon
     return config
 
 
-def worlds_device(config: DictConfig) -> str:
-    """The device for the worlds to train in: the learner's, where they have a simulator and the renderer asked for."""
-    on_cuda = torch.device(config.device).type == "cuda"
-    fits = config.env.suite == "race" and config.env.renderer in ("auto", "warp")
-    return str(config.device) if on_cuda and fits else "cpu"
-
-
 def seed_generators(seed: int) -> None:
     """Seed all global generators, of which torch's samples actions and latents."""
     random.seed(seed)
@@ -116,7 +111,10 @@ def make_curriculum(config: RunConfig) -> BodyRateCurriculum | None:
 
 
 def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:
-    """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device."""
+    """Make the collector of rollouts [num_envs, rollout_steps], on the worlds' device.
+
+    Worlds on a CPU have to wait for the actions of a policy on a CUDA device; beside it, all is in order by itself.
+    """
     return Collector(
         TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
         policy,
@@ -126,7 +124,7 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
         policy_device=config.device,
         storing_device=env.device,
         track_traj_ids=False,
-        no_cuda_sync=False,
+        no_cuda_sync=env.device.type == "cuda",
     )
 
 

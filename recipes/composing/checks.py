@@ -208,8 +208,8 @@ def check_dreamer(config: DreamerConfig) -> None:
         )
     if config.collection is Collection.overlapped and config.env.device != "cpu":
         raise ValueError(
-            "collection=overlapped steps worlds in a thread, and evaluation steps others on cpu meanwhile, which warp "
-            "cannot do on two devices: use env.device=cpu, or collection=sync."
+            "collection=overlapped steps worlds in a thread, and evaluation steps others meanwhile, which warp can do "
+            "on a CPU only: use env.device=cpu, or collection=sync."
         )
     if config.collection is Collection.overlapped and model.cuda_graph:
         raise ValueError(

@@ -163,9 +163,9 @@ def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], outpu
     dreams = [(stage_name(file), dream) for file, dream in stages.items()]
     plot_dreams(dreams, output / f"{name}.png", problems=problems)
     fps, film = 1 / (VIDEO_SLOWER * dreams[0][1].frame_dt), dream_video(dreams)
-    write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
+    filmed = write_video(output / f"{name}.mp4", film, fps=fps, scale=2)
     write_gif(output / f"{name}.gif", film, fps=fps)
-    return Drawn([f"{name}.png", f"{name}.mp4", f"{name}.gif"], problems)
+    return Drawn([f"{name}.png", *([f"{name}.mp4"] if filmed else []), f"{name}.gif"], problems)
 
 
 def draw_trajectories(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:

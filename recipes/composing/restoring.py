@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import torch
 
-from composing.arena import Environment, make_env
+from composing.arena import Environment, make_env, worlds_device
 from composing.command_line import AGENTS
 from composing.devices import choose_device
 from composing.learners import clock_times, make_learner, scheduled_numbers
@@ -116,6 +116,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
         flyer, counters = restore_learner(trained, checkpoint, device, config.weights)
         weights = TRAINED if getattr(flyer, "averaged", None) is None else AVERAGED
         env_steps = counters["env_steps"]
+    trained.env.device = worlds_device(device, trained.env)
     print(f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {env_steps:,} env_steps)")
     print(f"weights: {weights}{' (weights=auto)' if config.weights == 'auto' else ''}")
     return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine)

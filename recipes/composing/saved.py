@@ -14,7 +14,15 @@ from composing.schema import RECIPES, DreamerConfig, RunConfig
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
-OF_THIS_MACHINE = ("device", "env.device", "env.renderer", "model.mixed_precision", "resume", "run_dir")
+OF_THIS_MACHINE = (
+    "device",
+    "env.device",
+    "env.renderer",
+    "model.mixed_precision",
+    "model.cuda_graph",
+    "resume",
+    "run_dir",
+)
 """What a run that is resumed chooses anew, unless it was begun with a choice."""
 
 Config = TypeVar("Config", DictConfig, ListConfig)

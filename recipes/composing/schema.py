@@ -37,7 +37,8 @@ class EnvConfig:
     start_on_line: float = setting(0.0, SHARE)
     # m; training episodes end where a gate is missed by less than this; 0: they go on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
-    device: str = "cpu"  # of the worlds to train in: cpu | cuda | auto, which takes the learner's
+    # of the worlds, to train and to be evaluated in: cpu | cuda | auto, which takes the learner's where it can
+    device: str = "auto"
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
     looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
     from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
@@ -112,7 +113,8 @@ class SequenceReplayConfig(ReplayConfig):
     held_out: int = setting(1, NOT_NEGATIVE)
     recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
     recent_records: int = setting(20_000, COUNT)  # how many those are
-    context: bool = False  # windows go on from stored latents, refreshed at each update, instead of from none
+    # windows go on from stored latents, refreshed at each update, instead of from none; null: where batches are short
+    context: bool | None = None
 
 
 @dataclass

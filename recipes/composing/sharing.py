@@ -11,6 +11,7 @@ import os
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 
 from composing.checks import steps_alone
 from composing.schema import DreamerConfig
@@ -88,19 +89,22 @@ def check_devices(config: DreamerConfig) -> None:
 
 
 def check_captured(config: DreamerConfig) -> None:
-    """Refuse to capture or compile updates that exchange imagined returns on their way.
+    """Refuse to capture updates that exchange imagined returns on their way.
 
     Raises:
         ValueError: the message names the settings.
     """
-    imagines = getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True)
-    for name in ("cuda_graph", "compile"):
-        if imagines and getattr(config.model, name):
-            raise ValueError(
-                f"model.{name}=true: loss.actor={config.loss.actor} exchanges imagined returns between "
-                f"{parallel.count()} processes in the midst of an update. Set model.{name}=false, or choose "
-                "loss.actor=asymmetric_ppo, which imagines nothing."
-            )
+    if imagines(config) and config.model.cuda_graph:
+        raise ValueError(
+            f"model.cuda_graph=true: loss.actor={config.loss.actor} exchanges imagined returns between "
+            f"{parallel.count()} processes in the midst of an update. Set model.cuda_graph=false, or choose "
+            "loss.actor=asymmetric_ppo, which imagines nothing."
+        )
+
+
+def imagines(config: DreamerConfig | DictConfig) -> bool:
+    """Whether the actor's loss does."""
+    return getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True)
 
 
 def _own_device(device: str) -> str:

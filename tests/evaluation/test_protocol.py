@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.evaluation.course import act
 from dreamer_racing.evaluation.evaluate import CRASHES
 from dreamer_racing.evaluation.lesions import Intact, LesionedPolicy
 from dreamer_racing.evaluation.protocol import (
@@ -37,13 +39,23 @@ class Falling(torch.nn.Module):
 
     deterministic = True
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.where = torch.nn.Parameter(torch.zeros(()))
+
     def make_primer(self) -> TensorDictPrimer:
         return TensorDictPrimer({"memory": Unbounded(shape=(1,))}, default_value=0.0, expand_specs=True)
 
     def forward(self, tensordict):
-        action = torch.zeros(*tensordict.batch_size, 4)
+        action = torch.zeros(*tensordict.batch_size, 4, device=self.where.device)
         action[:, 0] = -1.0 if self.deterministic else 1.0
         return tensordict.set("action", action).set(("next", "memory"), tensordict["memory"])
+
+
+def test_a_policy_hands_its_action_back_to_where_the_worlds_are():
+    on_meta = TensorDict({"memory": torch.zeros(2, 1)}, [2], device="meta")
+    assert act(Falling().to("meta"), on_meta)["action"].device.type == "meta"
+    assert act(Falling(), TensorDict({"memory": torch.zeros(2, 1)}, [2]))["action"].device.type == "cpu"
 
 
 def by_name(name: str) -> Condition:

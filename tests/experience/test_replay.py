@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.experience.records import records_from_rollout
 from dreamer_racing.experience.replay import make_replay, replay_bytes
+from dreamer_racing.learners.launches import launches
 from dreamer_racing.modules.stored_latents import LatentFormat
 
 REWARDS = ("reward", "reward_base", "body_rate_norm")
@@ -477,6 +478,47 @@ def test_refreshing_reaches_the_records_after_those_seen_and_no_others():
     for key, value in before.items(include_nested=True, leaves_only=True):
         unchanged = ~touched if key[0] == "context" else slice(None)
         assert torch.equal(after[key][unchanged], value[unchanged]), key
+
+
+def test_where_windows_overlap_the_last_one_is_kept_and_nobody_waits():
+    replay = make_replay(39, 3, 2, 4, latents=FORMAT)
+    replay.extend(with_latents(collect(CountingEnv(3, end=0.0), steps=12, batches=1)[0], first=1))
+    slots = torch.tensor([[2, 3, 4, 5], [3, 4, 5, 6]])
+    belief = torch.arange(8.0).view(2, 4, 1).expand(2, 4, 2) / 8  # exact in float16
+    for shift in (0.0, 0.5):  # what the first call remembers of slots must not show in the second
+        seen = launches(lambda shift=shift: replay.refresh(slots, belief + shift, torch.zeros(2, 4, 3)))
+        assert (seen.waits, seen.mixed) == ([], [])
+        kept = replay.storage._storage["context", "belief"][3:7, 0] - shift
+        assert (8 * kept).tolist() == [0, 4, 5, 6], "of slots 4 and 5 the second window's"
+
+
+def test_samples_are_drawn_without_waiting():
+    replay = make_replay(60, 3, 6, 4, latents=FORMAT, recent_share=0.5)
+    replay.extend(with_latents(collect(CountingEnv(3), steps=5, batches=1)[0], first=1))
+    slots = replay._sampler.sample(replay.storage, 6)[0]  # on the CPU, whatever the storage is on
+    seen = launches(lambda: replay.storage.get(slots))
+    assert (seen.waits, seen.mixed) == ([], []) and seen.count > 0
+
+
+@pytest.mark.gpu
+def test_a_replay_on_cuda_is_written_sampled_and_refreshed_as_one_on_the_cpu():
+    samples = []
+    for device in ("cpu", "cuda"):
+        replay = make_replay(60, 3, 6, 4, device=device, latents=FORMAT)
+        for rollout in collect(CountingEnv(3), steps=5, batches=3):
+            replay.extend(with_latents(rollout, first=1).to(device))
+        batch = replay.sample()
+        latents = torch.full((6, 4, 2), 0.5, device=device), torch.ones(6, 4, 3, device=device)
+        replay.refresh(batch["index"], *latents)
+        torch.cuda.set_sync_debug_mode("error" if device == "cuda" else "default")
+        try:
+            replay.refresh(batch["index"], *latents)
+            sample = replay.sample()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        assert sample["pixels"].device.type == device
+        samples.append(sample.cpu())
+    assert (samples[0] == samples[1]).all()
 
 
 def test_context_survives_a_checkpoint_and_counts_in_the_size(tmp_path):

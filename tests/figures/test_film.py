@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import imageio.v3 as iio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from PIL import Image
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.figures import film
 from dreamer_racing.figures.film import (
     CONTEXT_COLOR,
     OPEN_LOOP_COLOR,
@@ -57,7 +60,7 @@ def flight(steps: int = 10) -> Trajectory:
 def test_video_reads_back(tmp_path, size, scale, expected):
     path = tmp_path / "new" / "video.mp4"
     frames = blocks(12, *size)
-    write_video(path, frames, fps=50, scale=scale)
+    assert write_video(path, frames, fps=50, scale=scale)
     read = iio.imread(path, plugin="FFMPEG")
     assert read.shape == (12, *expected, 3)
     metadata = iio.immeta(path, plugin="FFMPEG")
@@ -67,6 +70,16 @@ def test_video_reads_back(tmp_path, size, scale, expected):
     corner, middle = read[:, 3, 3].astype(int), read[:, -4, -4].astype(int)
     assert np.abs(middle - frames[:, -1, -1]).max() < 25
     assert np.abs(corner - frames[:, 0, 0]).max() < 25
+
+
+def test_without_ffmpeg_one_warning_stands_for_all_videos(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(film, "_finds_ffmpeg", cache(film._finds_ffmpeg.__wrapped__))  # that has found nothing yet
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: (_ for _ in ()).throw(RuntimeError("No ffmpeg.")))
+    assert not any(write_video(tmp_path / f"{name}.mp4", blocks(3)) for name in "ab")
+    assert not list(tmp_path.iterdir())
+    assert [record.message for record in caplog.records] == [
+        "no videos are written: No ffmpeg. pip install imageio-ffmpeg brings one."
+    ]
 
 
 def test_gif_reads_back(tmp_path):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 
+from dreamer_racing.evaluation.course import Course
+from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.learners.dreamer import DreamerLearner
 from tests.dreamers import learner_of
 
@@ -70,6 +73,39 @@ def test_graphed_updates_learn_as_eager_ones(settings: dict[str, object]) -> Non
     # Random numbers differ, what is learned does not.
     assert first[1] == pytest.approx(first[0], rel=0.02)
     assert last[1] == pytest.approx(last[0], rel=0.1)
+
+
+@pytest.mark.gpu
+def test_after_the_capture_a_learner_is_measured_saved_and_flown(tmp_path: Path) -> None:
+    learner, other = (make("cuda", cuda_graph=True, average_rate=0.1, mixed_precision=True) for _ in range(2))
+    for _ in range(3):
+        learner.update(batch("cuda"))
+    before = {name: value.clone() for name, value in learner.agent.state_dict().items()}
+    metrics = held_out_metrics(learner, batch("cuda", steps=SEEN + 3))
+    assert all(value.isfinite() for value in metrics.values())
+    torch.save(learner.state_dict(), tmp_path / "learner.pt")
+    other.load_state_dict(torch.load(tmp_path / "learner.pt", weights_only=False))
+    for name, value in before.items():
+        assert torch.equal(value, other.agent.state_dict()[name]), name
+    course = Course(learner.evaluation_policy(), {"track": "circle", "device": "cuda"}, 2)
+    assert len(course.evaluate(2).episodes) == 2
+    course.close()
+    assert learner.update(batch("cuda"))["loss"].isfinite(), "the graph still replays"
+    assert other.update(batch("cuda"))["loss"].isfinite()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mixed_precision", [False, True])
+def test_an_update_waits_for_nothing(mixed_precision: bool) -> None:
+    learner = make("cuda", mixed_precision=mixed_precision)
+    data = batch("cuda")
+    for _ in range(3):
+        learner.update(data)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        learner._backward(data)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.gpu

@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from dreamer_racing.modules.rssm import RSSM, BlockGRUCell, mix_uniform, sample_one_hot
+from dreamer_racing.modules.recurrent_cells import BlockGRUCell
+from dreamer_racing.modules.rssm import RSSM, mix_uniform, sample_one_hot
 from dreamer_racing.modules.world_model import RSSMS
 
 KINDS = [

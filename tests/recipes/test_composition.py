@@ -80,6 +80,75 @@ def test_decoys_are_a_config_group() -> None:
     assert OmegaConf.to_object(compose("evaluate", "checkpoint=x", "+decoys=none")).decoys == "none"
 
 
+@pytest.mark.parametrize(
+    ("device", "overrides", "expected"),
+    [
+        ("cpu", [], "cpu"),
+        ("cuda", [], "cuda"),
+        ("cuda", ["env.renderer=warp"], "cuda"),
+        ("cuda", ["env.renderer=egl"], "cpu"),
+        ("cuda", ["env=dmc"], "cpu"),
+        ("cuda", ["env.device=cpu"], "cpu"),
+        ("cuda", ["collection=overlapped"], "cpu"),
+    ],
+)
+def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
+    monkeypatch: pytest.MonkeyPatch, device: str, overrides: list[str], expected: str
+) -> None:
+    """Where they can be; the device is asked for, not looked for."""
+    arena, config = recipe_module("composing.arena"), resolved_on(device, monkeypatch, *overrides)
+    assert config.env.device == expected
+    if config.env.suite == "race":
+        made = []
+        monkeypatch.setattr(arena, "EvaluationReport", lambda *arguments, **options: made.append(arguments[2]))
+        arena.make_report(OmegaConf.to_object(config), Path(), None, 1, 1)
+        assert made[0]["device"] == expected
+
+
+def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -> object:
+    """A configuration for a device that is asked for, not looked for."""
+    dreamer = recipe_module("dreamer_v3")
+    for module in (dreamer, recipe_module("composing.building")):
+        monkeypatch.setattr(module, "choose_device", torch.device)
+    monkeypatch.setattr(dreamer, "computes_bfloat16", lambda device: True)
+    return dreamer.resolve(compose("dreamer_v3", f"device={device}", *overrides))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ([], ("size12m", 64, 16, True, True)),
+        (["budget=paper"], ("paper_large", 64, 16, True, True)),
+        (["model=paper_large"], ("paper_large", 16, 64, False, True)),  # a size that is named has numbers of its own
+        (["budget=smoke"], ("debug", 4, 16, False, True)),
+        (["model.batch_length=64"], ("size12m", 16, 64, False, True)),
+        (["replay.context=false"], ("size12m", 16, 64, False, True)),
+        (["model.cuda_graph=false"], ("size12m", 64, 16, True, False)),
+        (["collection=overlapped"], ("size12m", 64, 16, True, False)),
+        (["tuned=race"], ("cpu_small", 32, 16, True, True)),
+    ],
+)
+def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
+    monkeypatch: pytest.MonkeyPatch, overrides: list[str], expected: tuple
+) -> None:
+    config = resolved_on("cuda", monkeypatch, *overrides)
+    model = config.model
+    assert (model.size, model.batch_size, model.batch_length, config.replay.context, model.cuda_graph) == expected
+    recipe_module("composing.checks").check_dreamer(OmegaConf.to_object(config))
+
+
+def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = resolved_on("cpu", monkeypatch, "model=size12m")
+    assert (config.model.batch_size, config.model.batch_length) == (16, 64)
+    assert (config.replay.context, config.model.cuda_graph, config.model.few_kernels) == (False, False, None)
+
+
+def test_several_processes_capture_what_does_not_imagine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert not resolved_on("cuda", monkeypatch).model.cuda_graph
+    assert resolved_on("cuda", monkeypatch, "tuned=race").model.cuda_graph
+
+
 def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
     build(f"run_dir={tmp_path}", "env.num_envs=4", "prefill=64", "total_env_steps=80", "replay.capacity=1000")
     assert OmegaConf.load(tmp_path / "config.yaml").model.batch_length == 16

@@ -102,7 +102,7 @@ def test_shares_add_up_to_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
         (["replay.held_out=2"], 2, ["replay.held_out=2", "has 2 of env.num_envs=4"]),
         (["device=cuda"], 2, ["device=cuda", "each of the 2 processes", "has 1", "--nproc-per-node=1"]),
         (["device=cuda:1"], 2, ["device=cuda:1", "device=cuda each has its own"]),
-        (["loss.actor=reinforce", "model.compile=true"], 2, ["model.compile=true", "loss.actor=reinforce"]),
+        (["loss.actor=reinforce", "model.cuda_graph=true"], 2, ["model.cuda_graph=true", "loss.actor=reinforce"]),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, list) else None,
 )

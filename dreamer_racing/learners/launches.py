@@ -1,0 +1,116 @@
+"""What code asks of a device, seen from torch's dispatcher: kernels, waits, and tensors of several devices.
+
+A CPU stands in for a GPU: its operations are the same, though here nothing is launched and nobody waits. What an
+operation would do on a CUDA device is told by its name and its arguments.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+VIEWS = frozenset((
+    "_reshape_alias", "_unsafe_view", "alias", "as_strided", "chunk", "detach", "diagonal", "expand",
+    "lift_fresh", "permute", "real", "reshape", "select", "slice", "split", "split_with_sizes", "squeeze", "t",
+    "transpose", "unbind", "unfold", "unsafe_split", "unsqueeze", "view", "view_as",
+))  # fmt: skip
+"""Operations that only describe memory anew."""
+ALLOCATIONS = frozenset((
+    "_record_function_enter_new", "_record_function_exit", "empty", "empty_like", "empty_permuted",
+    "empty_strided", "new_empty", "new_empty_strided", "record_stream", "resize_", "set_",
+))  # fmt: skip
+"""Operations that only take memory, or say who uses it or what goes on."""
+WAITS = frozenset((
+    "_local_scalar_dense", "_unique2", "bincount", "equal", "is_nonzero", "item", "masked_select", "nonzero",
+    "unique_consecutive", "unique_dim",
+))  # fmt: skip
+"""Operations whose result, or its size, the CPU has to know."""
+INDEXED = frozenset((
+    "_index_put_impl_", "_unsafe_index", "_unsafe_index_put", "index", "index_put", "index_put_",
+))  # fmt: skip
+COPIES = frozenset(("_to_copy", "copy_"))
+
+
+class Launches(TorchDispatchMode):
+    """Counts the operations that launch kernels while it is on, and notes those that a CUDA device would not like.
+
+    A fused or ``foreach`` operation counts once however many tensors it takes; a matrix product or a reduction, for
+    which a library may launch two kernels, counts once too.
+
+    Attributes:
+        kernels: Operations by name.
+        waits: Where the CPU would wait for the device, as ``operation at file:line``.
+        mixed: Where an operation has tensors of several devices, or copies from one to another; likewise.
+
+    Example:
+        >>> with Launches() as seen:
+        ...     total = (torch.ones(2, 3).T + 1).sum()
+        ...     value = total.item()
+        >>> seen.count, dict(seen.kernels), len(seen.waits)
+        (3, {'ones': 1, 'add': 1, 'sum': 1}, 1)
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernels: Counter[str] = Counter()
+        self.waits: list[str] = []
+        self.mixed: list[str] = []
+
+    @property
+    def count(self) -> int:
+        """Of all kernels."""
+        return self.kernels.total()
+
+    def __torch_dispatch__(
+        self, func: Any, types: Sequence[type], args: tuple = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """Look at one operation, and make it."""
+        kwargs = kwargs or {}
+        name = func._schema.name.partition("::")[2]
+        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+        if name in WAITS or _indexes_by_mask(name, args):
+            self.waits.append(_place(name))
+        elif name not in VIEWS | ALLOCATIONS:
+            self.kernels[name] += 1
+        result = func(*args, **kwargs)
+        if len(_devices(tensors, result if name in COPIES else ())) > 1:
+            self.mixed.append(_place(name))
+        return result
+
+
+def _indexes_by_mask(name: str, args: tuple) -> bool:
+    """Tell whether an operation chooses by a mask, whose number of elements the CPU has to know."""
+    return name in INDEXED and any(
+        isinstance(index, Tensor) and index.dtype in (torch.bool, torch.uint8) for index in tree_leaves(args[1])
+    )
+
+
+def _devices(tensors: Sequence[Tensor], result: Any) -> set[str]:
+    """Return the kinds of device of some tensors; a number that is a tensor goes with any of them."""
+    results = [value for value in tree_leaves(result) if isinstance(value, Tensor)]
+    return {value.device.type for value in (*tensors, *results) if value.ndim or value.device.type != "cpu"}
+
+
+def _place(name: str) -> str:
+    """Say which line of the project, or of the code nearest to it, asked for an operation."""
+    stack = [frame for frame in traceback.extract_stack()[:-2] if not _is_machinery(frame.filename)]
+    frame = stack[-1]
+    return f"{name} at {'/'.join(frame.filename.split('/')[-2:])}:{frame.lineno}"
+
+
+def _is_machinery(filename: str) -> bool:
+    return any(part in filename for part in ("/torch/", "/tensordict/", "/contextlib", __file__))
+
+
+def launches(function: Callable[[], Any]) -> Launches:
+    """Call a function; return what it asked for."""
+    with Launches() as seen:
+        function()
+    return seen
