@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
 
-import torch
 from composing.arena import make_env
 from composing.building import (
     assemble,
@@ -35,6 +34,7 @@ from composing.sharing import imagines, share_of
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch import device as Device
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
@@ -217,7 +217,7 @@ def resolve(config: DictConfig) -> DictConfig:
     return config
 
 
-def shorten_windows(config: DictConfig, device: torch.device) -> None:
+def shorten_windows(config: DictConfig, device: Device) -> None:
     """On a CUDA device, take the records of a batch in more and shorter windows where their number is left open.
 
     A record of a window waits for the one before it, and every wait is a kernel's launch; windows begin warm then, or
@@ -236,7 +236,7 @@ def shorten_windows(config: DictConfig, device: torch.device) -> None:
         config.replay.context = shortened
 
 
-def captures(config: DictConfig, device: torch.device) -> bool:
+def captures(config: DictConfig, device: Device) -> bool:
     """Whether updates can be captured as a CUDA graph: not beside what acts meanwhile, or exchanges on the way."""
     alone = parallel.asked_for() == 1 or not imagines(config)
     return device.type == "cuda" and config.collection is Collection.sync and alone

@@ -323,7 +323,7 @@ def test_a_closed_environment_has_freed_its_renderer():
     env.reset()
     env.close()
     assert env.is_closed
-    with pytest.raises(RuntimeError, match="or is closed"):
+    with pytest.raises(RuntimeError, match="it is closed"):
         env.reset()
     env.close()
 
