@@ -11,7 +11,7 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 
 `render` draws the on-board view, larger (`render_mode="rgb_array"`). All in SI units.
 
-`info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (name of the `CrashCause`, `"none"` while flying),
+`info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (the number of a `CrashCause`, 0 while flying),
 `finished`, `reward_base` and `body_rate_norm` rad/s (`reward = reward_base − b₂ · body_rate_norm`), and with
 `privileged=True` a dictionary `privileged` of the state. Zeros after a reset.
 
@@ -29,7 +29,6 @@ from gymnasium.spaces import Box, Dict, Discrete
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
-from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
@@ -39,7 +38,6 @@ from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions
 
 OBSERVATIONS = ("pixels", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
-CRASH_NAMES = np.array([cause.name.lower() for cause in CrashCause], dtype=object)
 
 Observation = np.ndarray | dict[str, np.ndarray]
 
@@ -196,7 +194,7 @@ class GymWorlds:
             "gates_passed": values("gates_passed", np.int64),
             "gate_offset": values("gate_offset", np.float64),
             "lap_time": values("lap_time", np.float64),
-            "crash": CRASH_NAMES[values("crash", np.int64)],
+            "crash": values("crash", np.int64),
             "finished": values("finished", np.bool_),
             "reward_base": values("reward_base", np.float64),
             "body_rate_norm": values("body_rate_norm", np.float64),
@@ -247,7 +245,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         >>> observation, info = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> info["crash"]
-        'none'
+        0
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}

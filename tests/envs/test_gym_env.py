@@ -17,6 +17,7 @@ import dreamer_racing
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv
 from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
+from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
@@ -110,7 +111,7 @@ def test_single_environment_is_one_of_the_worlds() -> None:
         assert reward == (outcome.reward_base - 0.01 * outcome.body_rate_norm).item()
         assert info["reward_base"] - 0.01 * info["body_rate_norm"] == pytest.approx(reward, abs=1e-7)
         np.testing.assert_array_equal(info["privileged"]["attitude"], observation["attitude"])
-        assert (terminated, truncated, info["crash"]) == (False, False, "none")
+        assert (terminated, truncated, info["crash"]) == (False, False, CrashCause.NONE)
 
 
 def test_vector_is_what_torchrl_agents_see() -> None:
@@ -147,14 +148,14 @@ def test_crash_terminates_and_names_its_cause() -> None:
         _, reward, terminated, truncated, info = env.step(np.array([-1.0, 0.0, 0.0, 0.0]))
         if terminated:
             break
-    assert (terminated, truncated, reward, info["crash"]) == (True, False, -4.0, "ground")
+    assert (terminated, truncated, reward, info["crash"]) == (True, False, -4.0, CrashCause.GROUND)
 
 
 def test_action_that_is_not_finite_ends_the_single_environment() -> None:
     env = DroneRaceGymEnv("circle")
     env.reset(seed=0)
     observation, reward, terminated, _, info = env.step(np.array([0, np.nan, 0, 0], np.float32))
-    assert (terminated, reward, info["crash"]) == (True, -4.0, "invalid_action")
+    assert (terminated, reward, info["crash"]) == (True, -4.0, CrashCause.INVALID_ACTION)
     assert env.observation_space.contains(observation)
     env.close()
 

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from torchrl.envs import GymWrapper
+from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs.gym_env import OBSERVATIONS
 from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
+from dreamer_racing.envs.race.gates import CrashCause
 from tests.envs.test_gym_env import HOVER, IDS, INFO, make_vec
 
 CLIMB = np.array([0.5, 0.0, 0.0, 0.0], np.float32)
@@ -39,7 +40,7 @@ def test_vector_spaces_infos_and_frames() -> None:
     observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
     assert envs.observation_space.contains(observation)
     assert reward.shape == terminated.shape == truncated.shape == (3,)
-    assert list(info["crash"]) == ["none"] * 3
+    assert list(info["crash"]) == [CrashCause.NONE] * 3
     np.testing.assert_array_equal(info["privileged"]["target_gate"], observation["target_gate"])
     assert [frame.shape for frame in envs.render()] == [(256, 256, 3)] * 3
     envs.close()
@@ -54,13 +55,13 @@ def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
     poisoned[1] = np.nan
     _, reward, terminated, _, info = envs.step(poisoned)
     assert list(terminated) == [False, True, False]
-    assert list(info["crash"]) == ["none", "invalid_action", "none"]
+    assert list(info["crash"]) == [CrashCause.NONE, CrashCause.INVALID_ACTION, CrashCause.NONE]
     assert reward[1] == -4.0
 
     observation, reward, terminated, _, info = envs.step(poisoned)  # its action does not matter now
     assert not terminated.any()
     assert reward[1] == 0.0
-    assert info["crash"][1] == "none"
+    assert info["crash"][1] == CrashCause.NONE
     np.testing.assert_array_equal(observation["position"][1], start["position"][1])
     np.testing.assert_array_equal(observation["pixels"][1], start["pixels"][1])
 
@@ -113,7 +114,7 @@ def test_every_mode_of_make_vec(mode: str | None, kind: type) -> None:
     assert envs.reset(seed=0)[0].shape == (2, 21)
     observations, rewards, terminated, truncated, info = envs.step(envs.action_space.sample())
     assert observations.shape == (2, 21) and rewards.shape == terminated.shape == truncated.shape == (2,)
-    assert list(info["crash"]) == ["none", "none"]
+    assert list(info["crash"]) == [CrashCause.NONE, CrashCause.NONE]
     envs.close()
 
 
@@ -132,7 +133,7 @@ def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> 
     last, rewards, terminated, truncated, info = make_and_poison(envs)
     assert list(terminated) == [False, True, False] and not truncated.any() and rewards[1] == -4.0
     assert list(info["_final_obs"]) == list(info["_final_info"]) == [False, True, False]
-    assert info["final_info"]["crash"][1] == "invalid_action" and info["crash"][1] == "none"
+    assert info["final_info"]["crash"][1] == CrashCause.INVALID_ACTION and info["crash"][1] == CrashCause.NONE
     assert info["final_obs"][0] is None and info["final_obs"][2] is None
     of = (lambda seen: seen) if observation == "vector" else (lambda seen: seen["position"])
     assert not np.allclose(of(last)[0], of(start)[0])  # flies on
@@ -193,14 +194,24 @@ def test_an_unknown_autoreset_mode_is_refused() -> None:
         make_vec(autoreset_mode="never")
 
 
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
 @pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_torchrl_takes_the_vector_environment(observation: str) -> None:
-    envs = make_vec(observation=observation, autoreset_mode="Disabled", max_episode_steps=4)
-    env = GymWrapper(envs)
+def test_torchrl_takes_the_vector_environment(observation: str, mode: str) -> None:
+    envs = make_vec(observation=observation, autoreset_mode=mode, max_episode_steps=4)
+    env = GymWrapper(envs, categorical_action_encoding=True)  # which is of `target_gate`, too
     check_env_specs(env)
     flown = env.rollout(10, break_when_any_done=False)
     assert flown.batch_size == (3, 10)
     assert flown["next", "truncated"][..., 0].nonzero()[:, 1].tolist() == [3, 7] * 3  # and flies on from new starts
     key = "observation" if observation in ("pixels", "vector") else "position"
     assert (flown[key][:, 4] != flown["next", key][:, 3]).flatten(1).any(1).all()
+    env.close()
+
+
+def test_torchrl_flies_one_process_for_each_environment() -> None:
+    env = GymEnv(f"dreamer_racing:{IDS[0]}", num_envs=2, observation="both", categorical_action_encoding=True)
+    check_env_specs(env)
+    flown = env.rollout(3)
+    assert flown.batch_size == (2, 3) and flown["pixels"].shape == (2, 3, 64, 64, 3)
+    assert (flown["next", "crash"] == CrashCause.NONE).all()
     env.close()

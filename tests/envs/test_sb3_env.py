@@ -6,6 +6,7 @@ import pytest
 
 import dreamer_racing
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.race.gates import CrashCause
 
 pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
 
@@ -58,7 +59,7 @@ def test_crash_ends_an_episode_and_begins_the_next_in_the_same_step() -> None:
             break
     assert list(ended) == [False, True, False]
     assert (rewards.dtype, rewards[1]) == (np.float32, -4.0)
-    assert [info["crash"] for info in infos] == ["none", "ground", "none"]
+    assert [info["crash"] for info in infos] == [CrashCause.NONE, CrashCause.GROUND, CrashCause.NONE]
     assert [info["TimeLimit.truncated"] for info in infos] == [False] * 3
     assert ["terminal_observation" in info for info in infos] == [False, True, False]
     last = infos[1]["terminal_observation"]
@@ -69,7 +70,7 @@ def test_crash_ends_an_episode_and_begins_the_next_in_the_same_step() -> None:
     for name in ("position", "pixels"):
         np.testing.assert_array_equal(observation[name][1], start[name][1])
         assert (observation[name][0] != last[name]).any()
-    assert env.reset_infos[1]["crash"] == "none"
+    assert env.reset_infos[1]["crash"] == CrashCause.NONE
     env.close()
 
 
