@@ -17,7 +17,7 @@ from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import recipe, rows
 
 SETTINGS = [
-    "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=7", "env.num_envs=4",
+    "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=4", "env.num_envs=4",
     "env.episode_steps=40", "env.start_on_line=0.5", "env.control_rate=25", "prefill=64", "replay.capacity=700",
     "replay.recent_share=0.5",
     "evaluation.every=300", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=480",
@@ -124,7 +124,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     before = parts(tmp_path / "killed")
     train(tmp_path, "resume=killed")
     whole, resumed = parts(tmp_path / "whole"), parts(tmp_path / "killed")
-    assert learner_updates(whole) - learner_updates(before) >= 200
+    assert learner_updates(whole) - learner_updates(before) >= 100
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {
         "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes", "journal",
@@ -190,7 +190,8 @@ run.Run.take_in = stopped
 """Gets SIGTERM once a rollout is collected, before anything is learned from it."""
 STOPS = {
     "dreamer_v3": (
-        [*SETTINGS, *RACE, "evaluation.every=500", "checkpoint.every=800", "logger.every=400", "total_env_steps=900"],
+        [*SETTINGS, *RACE, "evaluation.every=500", "checkpoint.every=800", "logger.every=400", "total_env_steps=900",
+         "model.replay_ratio=2"],
         [TERMINATED.format(kind="ReplayRun", env_steps=800, updates=3)],  # owes updates, a row and a checkpoint
     ),
     "sac": ([*BASELINE, *SMALL["sac"]], [TERMINATED.format(kind="ReplayRun", env_steps=1024, updates=1)]),
