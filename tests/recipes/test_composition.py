@@ -126,6 +126,7 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -
         (["model.cuda_graph=false"], ("size12m", 64, 16, True, False)),
         (["collection=overlapped"], ("size12m", 64, 16, True, False)),
         (["tuned=race"], ("cpu_small", 32, 16, True, True)),
+        (["tuned=gpu"], ("cpu_small", 64, 16, True, True)),
     ],
 )
 def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(

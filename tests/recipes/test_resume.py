@@ -190,8 +190,15 @@ run.Run.take_in = stopped
 """Gets SIGTERM once a rollout is collected, before anything is learned from it."""
 STOPS = {
     "dreamer_v3": (
-        [*SETTINGS, *RACE, "evaluation.every=500", "checkpoint.every=800", "logger.every=400", "total_env_steps=900",
-         "model.replay_ratio=2"],
+        [
+            *SETTINGS,
+            *RACE,
+            "evaluation.every=500",
+            "checkpoint.every=800",
+            "logger.every=400",
+            "total_env_steps=900",
+            "model.replay_ratio=2",
+        ],
         [TERMINATED.format(kind="ReplayRun", env_steps=800, updates=3)],  # owes updates, a row and a checkpoint
     ),
     "sac": ([*BASELINE, *SMALL["sac"]], [TERMINATED.format(kind="ReplayRun", env_steps=1024, updates=1)]),

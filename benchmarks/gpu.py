@@ -1,0 +1,420 @@
+"""What a GPU is asked first: stage by stage, each within a time of its own, so that a short loan leaves what it can.
+
+    python benchmarks/gpu.py --json results/gpu.jsonl --budget 1800          # all stages, in this order
+    python benchmarks/gpu.py --json results/gpu.jsonl --stages probe env     # some
+    python benchmarks/gpu.py --device cpu --tiny --json tiny.jsonl           # whether all of it runs, without a GPU
+    python benchmarks/gpu.py --page results/gpu.jsonl                        # no measuring: writes docs/benchmarks.md
+
+Every job of a stage is a process of its own with a limit in seconds; what it measures is appended to the file as lines
+of JSON at once. A job that fails or takes too long leaves a line that says so, and the next one begins. Started again
+with the same file, jobs that were done are left out, and the training goes on where it was. Compiled kernels are kept
+in the folder `--caches`.
+
+`probe`: versions, speed of a matrix product (8192³ in bfloat16) and of a copy. `env`: steps of the worlds eager, and as
+a CUDA graph, which must fly as the eager ones do. `learner`: a captured update learns; held-out metrics, a checkpoint
+and an evaluation after the capture; the replay. `tests`: those marked `gpu`, and a short run that is resumed. `speed`:
+updates of each size, eager, captured and with the compiled cell, in long windows and in short ones; the kernels that
+take most of a captured one. `train`: Kidney by `tuned=gpu`, until the budget is spent.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "benchmarks.md"
+BEGIN, END = "<!-- benchmarks/gpu.py writes this -->", "<!-- end of benchmarks/gpu.py -->"
+GPU_TESTS = (
+    "tests/learners/test_cuda_graph.py",
+    "tests/envs/simulator/test_mujoco_warp.py",
+    "tests/envs/race/test_gates.py",
+    "tests/experience/test_replay.py",
+)
+SIZES = ("paper_large", "size12m", "paper_small", "cpu_small")
+SHORTEST = 15.0  # s that must be left for a job to begin
+
+
+class Job(NamedTuple):
+    """Something to measure.
+
+    Attributes:
+        stage: To which it belongs.
+        name: Of its line in the results.
+        limit: s it may take.
+        command: Arguments of a process; of Python, where the first is no program.
+    """
+
+    stage: str
+    name: str
+    limit: float
+    command: list[str]
+
+
+def main() -> None:
+    """Run the jobs that are asked for and not done yet, one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", help="file of results, a line each, which is continued")
+    parser.add_argument("--stages", nargs="*", default=list(STAGES), choices=STAGES)
+    parser.add_argument("--budget", type=float, default=1800.0, help="s for all of it")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--tiny", action="store_true", help="the smallest of everything: measures nothing")
+    parser.add_argument("--caches", default=".gpu_caches", help="folder of compiled kernels, and of the training run")
+    parser.add_argument("--page", metavar="JSONL", help="write the table of docs/benchmarks.md from these results")
+    parser.add_argument("--measure", help=argparse.SUPPRESS)  # what one of the processes does
+    arguments = parser.parse_args()
+    if arguments.measure:
+        name, *details = arguments.measure.split(",")
+        print(json.dumps(MEASURES[name](arguments.device, arguments.tiny, *details)))
+        return
+    if arguments.page:
+        write_page(Path(arguments.page), PAGE)
+        return
+    if not arguments.json:
+        parser.error("--json FILE: where the results go.")
+    run(arguments)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Run jobs until the budget is spent."""
+    from dreamer_racing.machine import provenance
+
+    results, ends = Path(arguments.json), time.monotonic() + arguments.budget
+    done = {(record["stage"], record["name"]) for record in read(results) if record["state"] == "done"}
+    where = {**provenance(), "device": arguments.device, "tiny": arguments.tiny}
+    for job in jobs(arguments):
+        left = ends - time.monotonic()
+        if (job.stage, job.name) in done:
+            continue
+        if left < SHORTEST:
+            print(f"the budget of {arguments.budget:.0f} s is spent before {job.stage} {job.name}")
+            return
+        started = time.monotonic()
+        outcome = attempt(job, min(job.limit, left), Path(arguments.caches))
+        record = {"benchmark": "gpu", "stage": job.stage, "name": job.name, **outcome}
+        record |= {"seconds": round(time.monotonic() - started, 1), **where}
+        append(results, record)
+        print(f"{job.stage} {job.name}: {outcome['state']}, {record['seconds']} s {outcome.get('why', '')}", flush=True)
+
+
+def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
+    """What the stages asked for consist of, in order."""
+    for stage in STAGES:
+        if stage in arguments.stages:
+            for name, limit, command in STAGES[stage](arguments.device, arguments.tiny, Path(arguments.caches)):
+                yield Job(stage, name, limit, command)
+
+
+def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
+    """Run a job for so many seconds at most; return its state and what it measured, or why it did not."""
+    environment = {
+        **os.environ,
+        "WARP_CACHE_PATH": str((caches / "warp").absolute()),
+        "TORCHINDUCTOR_CACHE_DIR": str((caches / "inductor").absolute()),
+    }
+    try:
+        process = subprocess.run(
+            [sys.executable, *job.command], cwd=ROOT, env=environment, timeout=limit, capture_output=True, text=True
+        )
+    except subprocess.TimeoutExpired:
+        return {"state": "too long", "why": f"more than {limit:.0f} s"}
+    lines = process.stdout.strip().splitlines()
+    if process.returncode:
+        said = (process.stderr or process.stdout).strip().splitlines()
+        return {"state": "failed", "why": said[-1] if said else f"status {process.returncode}"}
+    if "--measure" in job.command:
+        return {"state": "done", **json.loads(lines[-1])}
+    return {"state": "done", "said": lines[-1] if lines else ""}
+
+
+def read(results: Path) -> list[dict[str, Any]]:
+    """Return what a file of results holds; a last line that a kill cut short is left out."""
+    records = []
+    for line in results.read_text(encoding="utf-8").splitlines() if results.exists() else ():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return records
+
+
+def append(results: Path, record: dict[str, Any]) -> None:
+    """Add a line, behind whatever a kill may have left of one."""
+    results.parent.mkdir(parents=True, exist_ok=True)
+    cut = results.exists() and not results.read_bytes().endswith(b"\n") and results.stat().st_size > 0
+    with results.open("a", encoding="utf-8") as file:
+        file.write(("\n" if cut else "") + json.dumps(record) + "\n")
+
+
+# --- stages: name, limit in seconds and command of each job ---
+
+Commands = Iterator[tuple[str, float, list[str]]]
+
+
+def measured(device: str, tiny: bool, *details: object) -> list[str]:
+    """The command of something that this file measures itself."""
+    small = ["--tiny"] if tiny else []
+    return [__file__, "--device", device, *small, "--measure", ",".join(map(str, details))]
+
+
+def probe_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """What there is."""
+    yield "machine", 300.0, measured(device, tiny, "probe")
+
+
+def env_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """Worlds of both presets, seen and not, with looks that vary and not."""
+    for number in (2,) if tiny else (256, 1024, 4096):
+        for preset in ("easy", "faithful"):
+            for images in ("pixels", "state"):
+                if not tiny or (preset, images) != ("faithful", "pixels"):
+                    yield f"{number} {preset} {images}", 240.0, measured(device, tiny, "env", number, preset, images)
+    yield "looks", 240.0, measured(device, tiny, "env", 2 if tiny else 1024, "easy", "looks")
+
+
+def learner_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """Updates, and what must go on working once they are captured."""
+    yield "captured", 180.0, measured(device, tiny, "learner", "debug")
+    if not tiny:
+        yield "captured paper_large", 300.0, measured(device, tiny, "learner", "paper_large")
+
+
+def test_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """The tests that need a GPU, by name: collecting all takes longer than they do; and a run, and its resume."""
+    if device != "cpu":
+        for file in GPU_TESTS:
+            yield file, 300.0, ["-m", "pytest", "-q", "-m", "gpu", file]
+    place = caches / "smoke"
+    smoke = ["recipes/dreamer_v3.py", "budget=smoke", "track=circle", f"device={device}", f"run_dir={place.absolute()}"]
+    steps = 600 if tiny else 1200
+    yield "smoke", 400.0, [*smoke, "evaluation.every=0", f"total_env_steps={steps}"]
+    yield "resume", 400.0, ["recipes/dreamer_v3.py", f"resume={place.absolute()}", f"total_env_steps={steps + 200}"]
+
+
+def speed_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """Updates of all sizes, in all ways."""
+    ways = ("eager",) if device == "cpu" else ("eager", "graph", "compile+graph")
+    for size in ("debug",) if tiny else SIZES:
+        for way in ways:
+            for batch in ("2x4",) if tiny else ("16x64", "64x16"):
+                yield f"{size} {way} {batch}", 240.0, measured(device, tiny, "speed", size, way, batch)
+    size, way, batch = ("debug", "eager", "2x4") if device == "cpu" else ("paper_large", "graph", "64x16")
+    yield f"kernels of {size} {way} {batch}", 240.0, measured(device, tiny, "kernels", size, way, batch)
+
+
+def train_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+    """Kidney, for as long as there is time: a run that is cut off goes on the next time."""
+    run_dir = (caches / "kidney").absolute()
+    begin = ["tuned=gpu", "track=kidney", f"device={device}", f"run_dir={run_dir}", "checkpoint.minutes=3"]
+    if tiny:
+        begin += ["model=debug", "model.batch_size=4", "env.num_envs=4", "env.start_on_line=0", "budget=smoke"]
+        begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0", "loss.ppo.flown=128"]
+    begun = any((run_dir / "checkpoints").glob("checkpoint-*"))
+    yield "kidney", 3600.0, ["recipes/dreamer_v3.py", *([f"resume={run_dir}"] if begun else begin)]
+
+
+STAGES: dict[str, Callable[[str, bool, Path], Commands]] = {
+    "probe": probe_jobs,
+    "env": env_jobs,
+    "learner": learner_jobs,
+    "tests": test_jobs,
+    "speed": speed_jobs,
+    "train": train_jobs,
+}
+"""In the order in which they are worth most."""
+
+
+# --- what is measured, each in a process of its own ---
+
+
+def measure_probe(device: str, tiny: bool) -> dict[str, Any]:
+    """Measure what the device could reach."""
+    import torch
+    from learner import matmul_speed, seconds, synchronize
+
+    from dreamer_racing.envs.simulator.warp_device import load_warp
+
+    found: dict[str, Any] = {"torch": torch.__version__, "cuda": torch.version.cuda, "warp": load_warp().__version__}
+    if device != "cpu":
+        found |= {"gpu": torch.cuda.get_device_name(), "capability": torch.cuda.get_device_capability()}
+    if not tiny:
+        found["matmul_tflops"] = matmul_speed(device, torch.bfloat16) / 1e12
+    source = torch.empty(2**20 if tiny else 2**30, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    target.copy_(source)
+    synchronize(device)
+    found["copy_gb_per_s"] = (
+        2e-9 * source.numel() / min(seconds(lambda: target.copy_(source), device) for _ in range(5))
+    )
+    return found
+
+
+def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) -> dict[str, Any]:
+    """Step worlds eager and as they step by themselves; both must come to the same."""
+    import torch
+    from learner import seconds
+
+    from dreamer_racing.envs.worlds import RaceWorlds
+
+    looks = "randomised" if images == "looks" else "nominal"
+    worlds = RaceWorlds(
+        "kidney", int(number), preset, from_pixels=images != "state", device=device, seed=0, looks=looks,
+        backend="mujoco_warp",
+    )  # fmt: skip
+    worlds.reset()
+    action = torch.zeros(int(number), 4, device=device)
+    first = seconds(lambda: worlds.step(action), device)  # captures, on CUDA
+    before = worlds.state_dict()
+    eager = [worlds._fly(action).reward_base for _ in range(3)]
+    worlds.load_state_dict(before)
+    stepped = [worlds.step(action).reward_base for _ in range(3)]
+    difference = max(float((one - other).abs().max()) for one, other in zip(eager, stepped, strict=True))
+    if difference > 1e-4:
+        raise RuntimeError(f"steps as a CUDA graph are not those of eager mode: rewards differ by {difference}.")
+
+    steps = 3 if tiny else 1000
+
+    def fly() -> None:
+        for _ in range(steps):
+            worlds.step(action)
+            if images != "state":
+                worlds.render()
+
+    taken = seconds(fly, device)
+    return {"first_s": first, "difference": difference, "steps_per_s": steps * int(number) / taken, "steps": steps}
+
+
+def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
+    """Learn with captured updates; then measure, save, restore and fly."""
+    import copy
+
+    import torch
+    from learner import filled_replay, interface_of
+
+    from dreamer_racing.evaluation.course import Course
+    from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
+    from dreamer_racing.learners.dreamer import make_dreamer
+    from dreamer_racing.learners.dreamer_config import LearnerConfig
+    from dreamer_racing.losses import LossConfig
+
+    config = LearnerConfig(cuda_graph=device != "cpu", learning_rate=1e-3, warmup_updates=0, mixed_precision=True)
+    learner, other = (
+        make_dreamer(size, interface_of(64), LossConfig(), config, horizon=3, device=device, seed=0) for _ in range(2)
+    )
+    replay = filled_replay((2, 8), device, streams=2)
+    updates = 5 if tiny else 60
+    losses = [learner.update(replay.sample())["loss_image"] for _ in range(updates)]
+    learner.check_finite()
+    held_out = held_out_metrics(learner, filled_replay((2, SEEN + 3), device, streams=2).sample())
+    other.load_state_dict(copy.deepcopy(learner.state_dict()))
+    for each in (learner, other):
+        each.update(replay.sample())
+        each.check_finite()
+    course = Course(learner.evaluation_policy(), {"track": "circle", "device": device}, 2)
+    flown = course.evaluate(2)
+    course.close()
+    first, last = (float(torch.stack(part).mean()) for part in (losses[:3], losses[-3:]))
+    found = {"held_out_image_error": float(held_out["held_out/image_error"]), "flown_steps": flown.episode_length}
+    return {"loss_before": first, "loss_after": last, **found}
+
+
+def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str) -> dict[str, Any]:
+    """Time updates."""
+    from learner import seconds
+
+    update = update_of(device, tiny, size, way, batch)
+    first = seconds(update, device)
+    times = [seconds(update, device) for _ in range(2 if tiny else 23)]
+    return {"ms": 1e3 * statistics.median(times[-20:]), "first_s": first}
+
+
+def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) -> dict[str, Any]:
+    """Profile updates: the kernels that take most time, in ms of an update, and how many are launched in one."""
+    from learner import seconds
+    from torch.profiler import DeviceType, ProfilerActivity, profile
+
+    update = update_of(device, tiny, size, way, batch)
+    for _ in range(3):
+        seconds(update, device)  # captures
+    updates = 2 if tiny else 10
+    kind, activity = (
+        (DeviceType.CPU, ProfilerActivity.CPU) if device == "cpu" else (DeviceType.CUDA, ProfilerActivity.CUDA)
+    )
+    with profile(activities=[activity]) as profiled:
+        for _ in range(updates):
+            seconds(update, device)
+    kernels = [event for event in profiled.key_averages() if event.device_type == kind]
+    times = {
+        event.key: (event.self_cpu_time_total if device == "cpu" else event.self_device_time_total) for event in kernels
+    }
+    most = sorted(times, key=times.__getitem__, reverse=True)[:15]
+    return {
+        "launched": sum(event.count for event in kernels) / updates,
+        "kernels_ms": {key: round(1e-3 * times[key] / updates, 4) for key in most},
+        "ms": 1e-3 * sum(times.values()) / updates,
+    }
+
+
+def update_of(device: str, tiny: bool, size: str, way: str, batch: str) -> Callable[[], Any]:
+    """An update of a learner on one batch of the replay, ready to be called."""
+    from learner import Setting, filled_replay
+
+    windows, length = map(int, batch.split("x"))
+    setting = Setting(
+        "reconstruction", "reinforce", True, 64, (windows, length), 3 if tiny else 16, device, 1, 20, True
+    )
+    learner = setting.learner(size, way)
+    data = filled_replay((windows, length), device).sample()
+    return lambda: learner.update(data)
+
+
+MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
+    "probe": measure_probe,
+    "env": measure_env,
+    "learner": measure_learner,
+    "speed": measure_speed,
+    "kernels": measure_kernels,
+}
+
+
+# --- the page ---
+
+
+def write_page(results: Path, page: Path) -> None:
+    """Put the table of all jobs of a GPU into the page; what was not run says so."""
+    text = page.read_text(encoding="utf-8")
+    head, found, rest = text.partition(BEGIN)
+    _, closed, tail = rest.partition(END)
+    if not found or not closed:
+        raise SystemExit(f"{page} lacks the lines {BEGIN} and {END}, between which the table goes.")
+    page.write_text(f"{head}{BEGIN}\n{table(read(results))}\n{END}{tail}", encoding="utf-8")
+
+
+def table(records: list[dict[str, Any]]) -> str:
+    """A row for each job, of its latest attempt on a GPU."""
+    latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
+    lines = ["| stage | what | |", "|---|---|---|"]
+    for stage, commands in STAGES.items():
+        for name, _, _ in commands("cuda", False, Path()):
+            record = latest.get((stage, name))
+            lines.append(f"| {stage} | `{name}` | {'not run' if record is None else in_words(record)} |")
+    return "\n".join(lines)
+
+
+def in_words(record: dict[str, Any]) -> str:
+    """What came of a job."""
+    if record["state"] != "done":
+        return f"{record['state']}: {record.get('why', '')}"
+    shown = {"ms": "ms", "steps_per_s": "steps/s", "matmul_tflops": "TFLOP/s", "copy_gb_per_s": "GB/s"}
+    numbers = [f"{record[key]:,.3g} {unit}" for key, unit in shown.items() if key in record]
+    return ", ".join(numbers) or f"done in {record['seconds']} s"
+
+
+if __name__ == "__main__":
+    main()

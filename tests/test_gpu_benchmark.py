@@ -1,0 +1,104 @@
+"""`benchmarks/gpu.py` without a GPU: its stages run, what fails stops nothing, and what was done is not done again."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.running_recipes import ROOT, module_of
+
+SCRIPT = ROOT / "benchmarks" / "gpu.py"
+gpu = module_of("benchmarks", "gpu")
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPT), "--device", "cpu", "--tiny", "--json", str(folder / "results.jsonl")]
+    return subprocess.run(
+        [*command, "--caches", str(folder / "caches"), *arguments], capture_output=True, text=True, check=True
+    )
+
+
+def stages_of(records: list[dict]) -> set[str]:
+    return {record["stage"] for record in records}
+
+
+@pytest.mark.slow
+def test_stages_run_on_a_cpu_and_once(tmp_path: Path) -> None:
+    """Of those that are quick; all of them run by `python benchmarks/gpu.py --device cpu --tiny --json FILE`."""
+    stages = ["probe", "learner", "speed"]
+    said = run(tmp_path, "--stages", *stages).stdout
+    records = gpu.read(tmp_path / "results.jsonl")
+    assert [record["state"] for record in records] == ["done"] * len(records), said
+    assert stages_of(records) == set(stages) and all(record["tiny"] for record in records)
+    by_name = {record["name"]: record for record in records}
+    assert by_name["captured"]["loss_after"] < by_name["captured"]["loss_before"]
+    kernels = by_name["kernels of debug eager 2x4"]
+    assert kernels["launched"] > 100 and sum(kernels["kernels_ms"].values()) <= kernels["ms"]
+    assert run(tmp_path, "--stages", *stages).stdout == "", "all was done"
+    assert gpu.read(tmp_path / "results.jsonl") == records
+
+
+def test_what_fails_or_takes_too_long_says_so(tmp_path: Path) -> None:
+    failing = gpu.Job("speed", "one", 60.0, ["-c", "raise SystemExit('no kernel image is available')"])
+    assert gpu.attempt(failing, 60.0, tmp_path) == {"state": "failed", "why": "no kernel image is available"}
+    endless = gpu.Job("speed", "two", 60.0, ["-c", "import time; time.sleep(60)"])
+    assert gpu.attempt(endless, 0.2, tmp_path) == {"state": "too long", "why": "more than 0 s"}
+
+
+def test_a_failed_job_stops_no_other_and_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    commands = {"a": ["-c", "raise SystemExit('bad')"], "b": ["-c", "print('well')"]}
+    monkeypatch.setattr(gpu, "STAGES", {"probe": lambda *_: ((name, 60.0, each) for name, each in commands.items())})
+    results = tmp_path / "results.jsonl"
+    results.write_text('{"cut sho')
+    options = ["gpu.py", "--json", str(results), "--device", "cpu", "--caches", str(tmp_path)]
+    states = []
+    for begin in (["-c", "raise SystemExit('bad')"], ["-c", "print('better')"]):
+        commands["a"] = begin
+        monkeypatch.setattr(sys, "argv", options)
+        gpu.main()
+        states.append([(record["name"], record["state"]) for record in gpu.read(results)])
+    assert states[0] == [("a", "failed"), ("b", "done")]
+    assert states[1] == [*states[0], ("a", "done")]
+
+
+def test_no_job_begins_when_the_budget_is_spent(tmp_path: Path) -> None:
+    assert "budget of 1 s is spent before probe machine" in run(tmp_path, "--budget", "1").stdout
+    assert not (tmp_path / "results.jsonl").exists()
+
+
+def test_the_table_says_what_was_not_run(tmp_path: Path) -> None:
+    page, results = tmp_path / "page.md", tmp_path / "results.jsonl"
+    page.write_text(f"before\n{gpu.BEGIN}\nold\n{gpu.END}\nafter\n")
+    record = {
+        "stage": "speed",
+        "name": "size12m graph 64x16",
+        "state": "done",
+        "ms": 12.34,
+        "device": "cuda",
+        "tiny": False,
+    }
+    records = [
+        record | {"name": "size12m eager 64x16", "state": "failed", "why": "out of memory"},
+        record,
+        record | {"name": "paper_large graph 64x16", "tiny": True},
+        record | {"name": "paper_small graph 64x16", "device": "cpu"},
+    ]
+    results.write_text("".join(json.dumps(each) + "\n" for each in records))
+    gpu.write_page(results, page)
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "| speed | `size12m graph 64x16` | 12.3 ms |" in text
+    assert "| speed | `size12m eager 64x16` | failed: out of memory |" in text
+    for name in ("paper_large", "paper_small"):
+        assert f"| speed | `{name} graph 64x16` | not run |" in text, "a GPU's numbers come from a GPU"
+
+
+def test_the_tests_that_are_named_are_those_that_need_a_gpu() -> None:
+    marked = {
+        str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("test_*.py") if "mark.gpu" in path.read_text()
+    }
+    assert marked - {str(Path(__file__).relative_to(ROOT))} == set(gpu.GPU_TESTS)
