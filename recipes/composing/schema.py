@@ -212,7 +212,8 @@ class DreamerConfig(ReplayRunConfig):
     algorithm: str = "dreamer_v3"
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
     init_from: str | None = None
-    tuned: str = "auto"  # none: DreamerV3 as published | race: what races on a CPU | gpu: race for a GPU, unmeasured | auto
+    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; auto chooses, and says so
+    tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
