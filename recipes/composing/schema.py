@@ -212,7 +212,7 @@ class DreamerConfig(ReplayRunConfig):
     algorithm: str = "dreamer_v3"
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
     init_from: str | None = None
-    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; auto chooses, and says so
+    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; auto chooses one
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
