@@ -23,8 +23,9 @@ from dreamer_racing.envs.tracks import (
     validate_track,
 )
 from dreamer_racing.envs.tracks.validation import boxes_intersect
+from tests.running_recipes import ROOT
 
-PAGE = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8").partition("\n## Physics")[0]
+PAGE = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8").partition("\n## Physics")[0]
 
 GOOD = """\
 name: mine
