@@ -20,6 +20,7 @@ take most of a captured one. `train`: Kidney by `tuned=gpu`, until the budget is
 import argparse
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -86,11 +87,11 @@ def run(arguments: argparse.Namespace) -> None:
     from dreamer_racing.machine import provenance
 
     results, ends = Path(arguments.json), time.monotonic() + arguments.budget
-    done = {(record["stage"], record["name"]) for record in read(results) if record["state"] == "done"}
     where = {**provenance(), "device": arguments.device, "tiny": arguments.tiny}
+    done = {identity(record) for record in read(results) if record["state"] == "done"}
     for job in jobs(arguments):
         left = ends - time.monotonic()
-        if (job.stage, job.name) in done:
+        if identity({"stage": job.stage, "name": job.name, **where}) in done:
             continue
         if left < SHORTEST:
             print(f"the budget of {arguments.budget:.0f} s is spent before {job.stage} {job.name}")
@@ -103,11 +104,17 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"{job.stage} {job.name}: {outcome['state']}, {record['seconds']} s {outcome.get('why', '')}", flush=True)
 
 
+def identity(record: dict[str, Any]) -> tuple[str, str, str, bool]:
+    """What a record is of: numbers of a CPU, and of the smallest sizes, stand for no others."""
+    return record["stage"], record["name"], record["device"], record["tiny"]
+
+
 def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
     """What the stages asked for consist of, in order."""
+    runs = Path(arguments.caches).absolute() / f"runs_{arguments.device}{'_tiny' if arguments.tiny else ''}"
     for stage in STAGES:
         if stage in arguments.stages:
-            for name, limit, command in STAGES[stage](arguments.device, arguments.tiny, Path(arguments.caches)):
+            for name, limit, command in STAGES[stage](arguments.device, arguments.tiny, runs):
                 yield Job(stage, name, limit, command)
 
 
@@ -123,7 +130,8 @@ def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
             [sys.executable, *job.command], cwd=ROOT, env=environment, timeout=limit, capture_output=True, text=True
         )
     except subprocess.TimeoutExpired:
-        return {"state": "too long", "why": f"more than {limit:.0f} s"}
+        why = f"more than {limit:.0f} s{'; it goes on the next time' if job.stage == 'train' else ''}"
+        return {"state": "too long", "why": why}
     lines = process.stdout.strip().splitlines()
     if process.returncode:
         said = (process.stderr or process.stdout).strip().splitlines()
@@ -163,12 +171,12 @@ def measured(device: str, tiny: bool, *details: object) -> list[str]:
     return [__file__, "--device", device, *small, "--measure", ",".join(map(str, details))]
 
 
-def probe_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def probe_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """What there is."""
     yield "machine", 300.0, measured(device, tiny, "probe")
 
 
-def env_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def env_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """Worlds of both presets, seen and not, with looks that vary and not."""
     for number in (2,) if tiny else (256, 1024, 4096):
         for preset in ("easy", "faithful"):
@@ -178,28 +186,26 @@ def env_jobs(device: str, tiny: bool, caches: Path) -> Commands:
     yield "looks", 240.0, measured(device, tiny, "env", 2 if tiny else 1024, "easy", "looks")
 
 
-def learner_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def learner_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """Updates, and what must go on working once they are captured."""
     yield "captured", 180.0, measured(device, tiny, "learner", "debug")
     if not tiny:
         yield "captured paper_large", 300.0, measured(device, tiny, "learner", "paper_large")
 
 
-def test_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def test_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """The tests that need a GPU, by name: collecting all takes longer than they do; and a run, and its resume."""
     if device != "cpu":
         for file in GPU_TESTS:
             yield file, 300.0, ["-m", "pytest", "-q", "-m", "gpu", file]
-    place = caches / "smoke"
-    smoke = ["recipes/dreamer_v3.py", "budget=smoke", "track=circle", f"device={device}", f"run_dir={place.absolute()}"]
-    steps = 600 if tiny else 1200
-    yield "smoke", 400.0, [*smoke, "evaluation.every=0", f"total_env_steps={steps}"]
-    yield "resume", 400.0, ["recipes/dreamer_v3.py", f"resume={place.absolute()}", f"total_env_steps={steps + 200}"]
+    yield "smoke", 600.0, measured(device, tiny, "smoke", runs / "smoke")
 
 
-def speed_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def speed_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """Updates of all sizes, in all ways."""
     ways = ("eager",) if device == "cpu" else ("eager", "graph", "compile+graph")
+    plain = ("debug", "eager", "2x4") if tiny else ("size12m", "eager" if device == "cpu" else "graph", "64x16")
+    yield f"{' '.join(plain)} without few kernels", 240.0, measured(device, tiny, "speed", *plain, "plain")
     for size in ("debug",) if tiny else SIZES:
         for way in ways:
             for batch in ("2x4",) if tiny else ("16x64", "64x16"):
@@ -208,9 +214,9 @@ def speed_jobs(device: str, tiny: bool, caches: Path) -> Commands:
     yield f"kernels of {size} {way} {batch}", 240.0, measured(device, tiny, "kernels", size, way, batch)
 
 
-def train_jobs(device: str, tiny: bool, caches: Path) -> Commands:
+def train_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """Kidney, for as long as there is time: a run that is cut off goes on the next time."""
-    run_dir = (caches / "kidney").absolute()
+    run_dir = runs / "kidney"
     begin = ["tuned=gpu", "track=kidney", f"device={device}", f"run_dir={run_dir}", "checkpoint.minutes=3"]
     if tiny:
         begin += ["model=debug", "model.batch_size=4", "env.num_envs=4", "env.start_on_line=0", "budget=smoke"]
@@ -268,7 +274,8 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
         backend="mujoco_warp",
     )  # fmt: skip
     worlds.reset()
-    action = torch.zeros(int(number), 4, device=device)
+    hover = torch.tensor([worlds.parameters.hover_action, 0.0, 0.0, 0.0], device=device)
+    action = hover.expand(int(number), 4).contiguous()
     first = seconds(lambda: worlds.step(action), device)  # captures, on CUDA
     before = worlds.state_dict()
     eager = [worlds._fly(action).reward_base for _ in range(3)]
@@ -279,10 +286,14 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
         raise RuntimeError(f"steps as a CUDA graph are not those of eager mode: rewards differ by {difference}.")
 
     steps = 3 if tiny else 1000
+    generator = torch.Generator(device).manual_seed(0)
 
     def fly() -> None:
+        """Fly about the start at random, as a fresh policy does; who has ended begins anew, as in training."""
         for _ in range(steps):
-            worlds.step(action)
+            wild = 0.3 * torch.randn(action.shape, generator=generator, device=device)
+            outcome = worlds.step(wild + hover)
+            worlds.reset(outcome.terminated | outcome.truncated)
             if images != "state":
                 worlds.render()
 
@@ -320,15 +331,27 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
     flown = course.evaluate(2)
     course.close()
     first, last = (float(torch.stack(part).mean()) for part in (losses[:3], losses[-3:]))
+    if not last < first:
+        raise RuntimeError(f"captured updates do not learn: an image's loss was {first} and is {last}.")
     found = {"held_out_image_error": float(held_out["held_out/image_error"]), "flown_steps": flown.episode_length}
     return {"loss_before": first, "loss_after": last, **found}
 
 
-def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str) -> dict[str, Any]:
+def measure_smoke(device: str, tiny: bool, place: str) -> dict[str, Any]:
+    """Train for a minute, and go on from its checkpoint; what an earlier attempt left is removed."""
+    shutil.rmtree(place, ignore_errors=True)
+    steps = 600 if tiny else 1200
+    settings = ["budget=smoke", "track=circle", f"device={device}", f"run_dir={place}", "evaluation.every=0"]
+    for overrides in ([*settings, f"total_env_steps={steps}"], [f"resume={place}", f"total_env_steps={steps + 200}"]):
+        subprocess.run([sys.executable, "recipes/dreamer_v3.py", *overrides], check=True, stdout=sys.stderr)
+    return {"env_steps": steps + 200}
+
+
+def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str, kernels: str = "few") -> dict[str, Any]:
     """Time updates."""
     from learner import seconds
 
-    update = update_of(device, tiny, size, way, batch)
+    update = update_of(device, tiny, size, way, batch, few_kernels=kernels == "few")
     first = seconds(update, device)
     times = [seconds(update, device) for _ in range(2 if tiny else 23)]
     return {"ms": 1e3 * statistics.median(times[-20:]), "first_s": first}
@@ -361,13 +384,13 @@ def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) ->
     }
 
 
-def update_of(device: str, tiny: bool, size: str, way: str, batch: str) -> Callable[[], Any]:
+def update_of(device: str, tiny: bool, size: str, way: str, batch: str, few_kernels: bool = True) -> Callable[[], Any]:
     """An update of a learner on one batch of the replay, ready to be called."""
     from learner import Setting, filled_replay
 
     windows, length = map(int, batch.split("x"))
     setting = Setting(
-        "reconstruction", "reinforce", True, 64, (windows, length), 3 if tiny else 16, device, 1, 20, True
+        "reconstruction", "reinforce", True, 64, (windows, length), 3 if tiny else 16, device, 1, 20, few_kernels
     )
     learner = setting.learner(size, way)
     data = filled_replay((windows, length), device).sample()
@@ -378,6 +401,7 @@ MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
     "probe": measure_probe,
     "env": measure_env,
     "learner": measure_learner,
+    "smoke": measure_smoke,
     "speed": measure_speed,
     "kernels": measure_kernels,
 }
@@ -399,7 +423,9 @@ def write_page(results: Path, page: Path) -> None:
 def table(records: list[dict[str, Any]]) -> str:
     """A row for each job, of its latest attempt on a GPU."""
     latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
-    lines = ["| stage | what | |", "|---|---|---|"]
+    places = sorted({f"{r.get('gpu')} at {r['commit']}" for r in latest.values()})
+    lines = [f"Measured on {', '.join(places)}.", ""] if places else []
+    lines += ["| stage | what | |", "|---|---|---|"]
     for stage, commands in STAGES.items():
         for name, _, _ in commands("cuda", False, Path()):
             record = latest.get((stage, name))

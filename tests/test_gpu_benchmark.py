@@ -40,6 +40,7 @@ def test_stages_run_on_a_cpu_and_once(tmp_path: Path) -> None:
     assert kernels["launched"] > 100 and sum(kernels["kernels_ms"].values()) <= kernels["ms"]
     assert run(tmp_path, "--stages", *stages).stdout == "", "all was done"
     assert gpu.read(tmp_path / "results.jsonl") == records
+    assert gpu.identity(records[0]) != gpu.identity(records[0] | {"device": "cuda", "tiny": False})
 
 
 def test_what_fails_or_takes_too_long_says_so(tmp_path: Path) -> None:
@@ -80,6 +81,8 @@ def test_the_table_says_what_was_not_run(tmp_path: Path) -> None:
         "ms": 12.34,
         "device": "cuda",
         "tiny": False,
+        "gpu": "NVIDIA H200",
+        "commit": "abc1234",
     }
     records = [
         record | {"name": "size12m eager 64x16", "state": "failed", "why": "out of memory"},
@@ -91,6 +94,7 @@ def test_the_table_says_what_was_not_run(tmp_path: Path) -> None:
     gpu.write_page(results, page)
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "Measured on NVIDIA H200 at abc1234.\n" in text
     assert "| speed | `size12m graph 64x16` | 12.3 ms |" in text
     assert "| speed | `size12m eager 64x16` | failed: out of memory |" in text
     for name in ("paper_large", "paper_small"):
