@@ -5,9 +5,10 @@
     python recipes/hil.py actor=exports/paper_large arm=false patience=60     # beside recipes/plant.py track=circle
 
 Sizes are exported as recipes/export.py does it, parity check included, of networks with initial weights: how long a
-step takes does not depend on what was learned, nor on what is seen, which is noise here. With --keep an export stays in
-a folder of its size's name, and flies like any other, if badly: with arm=false the loop sees, chooses and sends at each
-tick, and never arms.
+step takes does not depend on what was learned, nor on what is seen, which is noise here. They are written in parts,
+too: `act` is what is left between image and action where the memory was advanced before the image came. With --keep an
+export stays in a folder of its size's name, and flies like any other, if badly: with arm=false the loop sees, chooses
+and sends at each tick, and never arms.
 """
 
 import argparse
@@ -24,14 +25,16 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track, load_track
 from dreamer_racing.export.actor_step import export_actor, make_step
 from dreamer_racing.export.contract import make_contract
-from dreamer_racing.export.onnx_actor import OnnxActor, measure_latency
+from dreamer_racing.export.onnx_actor import PARTS, OnnxActor, measure_latency
 from dreamer_racing.export.parity import MIN_STEPS, episode_steps, record_flight
 from dreamer_racing.modules import SIZES, Interface, get_size
 from dreamer_racing.modules.agent import Agent
 
 AGENTS = Path(__file__).parents[1] / "agents"
 ACTOR, PRESET = "actor.onnx", "easy"
-COLUMNS = ("actor", "parameters", "threads", "steps", "p50_ms", "p99_ms", "max_ms", "file_mb")
+COLUMNS = (
+    "actor", "parameters", "threads", "steps", "p50_ms", "p99_ms", "max_ms", "act_p50_ms", "act_p99_ms", "file_mb",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -75,20 +78,24 @@ def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:
     source["track_sha256"] = hash_track(load_track(track))
     contract = make_contract(step, env.worlds.parameters, env.worlds.camera, **source)
     folder.mkdir(parents=True, exist_ok=True)
-    export_actor(step, contract, flight, folder / ACTOR)
+    export_actor(step, contract, flight, folder / ACTOR, parts=True)
     return folder / ACTOR
 
 
 def measure(name: str, path: Path, steps: int, threads: int) -> dict[str, Any]:
     """Time single steps of an actor."""
-    actor = OnnxActor(path, threads=threads)
+    actor = OnnxActor(path, threads=threads, whole=True)
     entry = actor.contract["inputs"][0]
     seen = np.random.default_rng(0).integers(0, 256, (steps, *entry["shape"][1:])).astype(entry["type"])
-    latency = measure_latency(actor.step, seen)
+    latency, act = measure_latency(actor.step, seen), None
+    if PARTS.keys() <= actor.contract["files"].keys():
+        actor = OnnxActor(path, threads=threads)
+        act = measure_latency(actor.step, seen, actor.prepare)
     return {
         "benchmark": "actor_latency", "actor": name, "size": actor.contract["model"]["name"],
         "parameters": actor.contract["model"]["parameters"], "runtime": "onnxruntime", "threads": threads,
         "steps": steps, "p50_ms": latency.p50, "p99_ms": latency.p99, "max_ms": latency.max,
+        "act_p50_ms": act and act.p50, "act_p99_ms": act and act.p99,
         "file_mb": sum(file.stat().st_size for file in weights_of(path)) / 1e6,
     }  # fmt: skip
 

@@ -46,7 +46,6 @@ from dreamer_racing.export.shipped_agent import (
     ACTOR,
     AGENT,
     CONFIG,
-    FILES,
     ShippedAgent,
     choose_weights,
     is_agent,
@@ -93,15 +92,15 @@ def export(config: ExportConfig) -> None:
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     about = describe(config, trained, checkpoint, step, contract) if config.agent else None
-    deviation = export_actor(step, contract, flight, output, config.seed, shared_weights=about is not None)
+    deviation = export_actor(step, contract, flight, output, config.seed, about is not None, config.parts)
     print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, no latent flipped")
     for name, value in deviation.items():
         print(f"largest deviation of an action, {name} from torch: {value:.1e}")
-    measure(step, flight, output)
-    names: tuple[str, ...] = (output.name, output.with_suffix(".pt2").name, CONTRACT)
+    measure(step, flight, output, config.parts)
+    names = [*(file["name"] for file in read_contract(output.parent / CONTRACT)["files"].values()), CONTRACT]
     if about:
         write_agent(output.parent, trained, about)
-        names = FILES
+        names += [CONFIG, AGENT]
     size = sum((output.parent / name).stat().st_size for name in names)
     print(f"written to {output.parent}: {', '.join(names)} ({size / 1e6:.2f} MB)")
 
@@ -238,11 +237,15 @@ def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> 
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def measure(step: ActorStep, flight: RecordedFlight, output: Path) -> None:
+def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) -> None:
     """Print how long one step takes, with one thread."""
     contract = read_contract(output.parent / CONTRACT)
-    for name, actor in (("onnxruntime", OnnxActor(output)), ("torch", TorchActor(contract, step))):
+    actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
+    for name, actor in actors.items():
         print(f"one step, 1 thread, {name}: {measure_latency(actor.step, flight.observations)}")
+    if parts:
+        actor = OnnxActor(output)
+        print(f"of it from image to action: {measure_latency(actor.step, flight.observations, actor.prepare)}")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,10 @@
 is_init[, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
 ``torch.export`` program, and publishes both, with the contract of `contract`, only if they pass `parity`.
 
+A large step can be written in two `PARTS`, too: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, which
+needs no observation, so that a vehicle can run it while a command is on its way; and ``act``, ``(observation,
+h_next[, noise]) -> (action, z_next)``, which is all that stands between seeing and acting.
+
 Shape legend: D belief, S state = L·K, L latents, K classes, A action, V numbers.
 """
 
@@ -14,14 +18,14 @@ import importlib.util
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, RecurrentActor, hash_file
+from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, RECURRENT, OnnxActor, RecurrentActor, hash_file
 from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights
 from dreamer_racing.modules import join_features
@@ -97,8 +101,18 @@ class ActorStep(nn.Module):
         Returns:
             Action ``(1, A)`` in [−1, 1], next belief ``(1, D)``, next state ``(1, S)``.
         """
-        h, z = self.rssm.observe_step(self._embed(observation), previous_action, is_init, h, z, deterministic=True)
-        return self._act(h, z)
+        h = self.advance(h, z, previous_action, is_init)
+        action, z = self.act(observation, h)
+        return action, h, z
+
+    def advance(self, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor) -> Tensor:
+        """Return the next belief ``(1, D)``, which needs no observation; arguments as in `forward`."""
+        return self.rssm.advance(previous_action, is_init, h, z)
+
+    def act(self, observation: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        """Return action ``(1, A)`` and next state ``(1, S)`` by what is seen and the next belief ``(1, D)``."""
+        z = self.rssm.take_in(h, self._embed(observation), deterministic=True)
+        return self.actor(join_features(h, z)).mode(), z
 
     def example_inputs(self) -> dict[str, Tensor]:
         """Return inputs by name, in the order of ``forward``."""
@@ -121,9 +135,6 @@ class ActorStep(nn.Module):
     def _embed(self, observation: Tensor) -> Tensor:
         return self.encoder({self.interface.observation_keys[0]: observation})
 
-    def _act(self, h: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return self.actor(join_features(h, z)).mode(), h, z
-
 
 class SampledActorStep(ActorStep):
     """One acting step of explicit state whose z is a sample of the posterior, by the Gumbel-max trick.
@@ -145,18 +156,42 @@ class SampledActorStep(ActorStep):
         self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Step; arguments as in `ActorStep.forward`, and ``noise``: uniform numbers in [0, 1), ``(1, L, K)``."""
-        posterior = self.rssm.observe(
-            self._embed(observation).unsqueeze(1),
-            previous_action.unsqueeze(1),
-            is_init.unsqueeze(1),
-            (h, z),
-            deterministic=True,
-        )
-        probabilities = mix_uniform(posterior.posterior_logits.squeeze(1), self.rssm.unimix)
+        h = self.advance(h, z, previous_action, is_init)
+        action, z = self.act(observation, h, noise)
+        return action, h, z
+
+    def act(self, observation: Tensor, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        """Return action and next state; arguments as in `ActorStep.act` and `forward`."""
+        probabilities = mix_uniform(self.rssm.posterior_logits(h, self._embed(observation)), self.rssm.unimix)
         gumbel = -(-noise.log()).log()
         index = (probabilities.log() + gumbel).argmax(-1, keepdim=True)
         z = torch.zeros_like(probabilities).scatter(-1, index, 1.0).flatten(1)
-        return self._act(posterior.belief.squeeze(1), z)
+        return self.actor(join_features(h, z)).mode(), z
+
+
+class StepPart(nn.Module):
+    """A part of a step, to be written alone.
+
+    Args:
+        step: The step.
+        name: Of `PARTS`.
+    """
+
+    def __init__(self, step: ActorStep, name: str) -> None:
+        super().__init__()
+        self.step, self.name = step, name
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Compute the part; inputs in the order of `example_inputs`."""
+        return getattr(self.step, self.name)(*inputs)
+
+    def example_inputs(self) -> dict[str, Tensor]:
+        """Return inputs by name, in the order of ``forward``."""
+        given, before = self.step.example_inputs(), (*RECURRENT, "is_init")
+        if self.name == "advance":
+            return {name: given[name] for name in before}
+        seen, *noise = (name for name in given if name not in before)
+        return {seen: given[seen], "h_next": torch.zeros_like(given["h"]), **{name: given[name] for name in noise}}
 
 
 LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep, SampledActorStep)}
@@ -220,20 +255,22 @@ def export_actor(
     output: str | Path,
     seed: int = 0,
     shared_weights: bool = False,
+    parts: bool = False,
 ) -> dict[str, float]:
-    """Write a step as ``.onnx`` and ``.pt2`` with contract.json beside them, if both fly as the original does.
+    """Write a step as ``.onnx`` and ``.pt2`` with contract.json beside them, if all fly as the original does.
 
     Args:
         step: The step.
         contract: From `contract.make_contract`.
         flight: To compare them over, at least ``MIN_STEPS`` steps.
-        output: Path of the ``.onnx`` file; the ``.pt2`` has the same stem. Those of an earlier export are replaced.
+        output: Path of the ``.onnx`` file; others are named after its stem. Those of an earlier export are replaced.
         seed: Of the noise that samples latents in the comparison.
-        shared_weights: Keep the weights in a file beside the ``.onnx``, which torch can read too, instead of inside of
-            it; the ``.pt2``, which would hold them once more, is compared and left out.
+        shared_weights: Keep the weights in a file beside those of ONNX, which torch can read too, instead of inside of
+            each; the ``.pt2``, which would hold them once more, is compared and left out.
+        parts: Write the two `PARTS` of the step for ONNX, too.
 
     Returns:
-        Largest deviation of an action from the original's, of either.
+        Largest deviation of an action from the original's, of each copy.
 
     Raises:
         ParityError: If one does not fly alike; no file is left and those of an earlier export stay.
@@ -247,24 +284,31 @@ def export_actor(
     partial.mkdir()
     try:
         onnx, program = partial / output.name, partial / output.with_suffix(".pt2").name
+        graphs = {"onnx": onnx, **{name: partial / f"{output.stem}_{name}.onnx" for name in PARTS if parts}}
         write_step(step, onnx, program)
-        written = {"onnx": onnx, "torch_export": program}
+        for name in PARTS if parts else ():
+            write_onnx(StepPart(step, name), PARTS[name], graphs[name])
+        written = {**graphs, "torch_export": program}
         if shared_weights:
-            written = {"onnx": onnx, "weights": partial / WEIGHTS}
-            share_weights(step, onnx, written["weights"])
+            written = {**graphs, "weights": partial / WEIGHTS}
+            share_weights(step, list(graphs.values()), written["weights"])
         files = {kind: {"name": path.name, "sha256": hash_file(path)} for kind, path in written.items()}
         full = {**contract, "files": files}
         _write_json(partial / CONTRACT, full)
         actors: dict[str, RecurrentActor] = {
             "torch": TorchActor(full, step),
-            "onnxruntime": OnnxActor(onnx),
+            "onnxruntime": OnnxActor(onnx, whole=True),
             "torch.export": TorchActor(full, torch.export.load(program).module()),
         }
+        if parts:
+            actors["onnxruntime in parts"] = OnnxActor(onnx)
         deviation = check_parity(actors, flight, seed)
         full["verification"] = _verification(flight, deviation)
         _write_json(partial / CONTRACT, full)
         for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
+        for name in PARTS if not parts else ():
+            (output.parent / f"{output.stem}_{name}.onnx").unlink(missing_ok=True)  # of an earlier export
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return deviation
@@ -290,40 +334,46 @@ def write_step(step: ActorStep, onnx: Path, program: Path) -> None:
     size = sum(parameter.nbytes for parameter in step.parameters())
     if size >= PROTOBUF_LIMIT:
         raise ValueError(f"The actor's weights are {size / 1e9:.1f} GB; an ONNX file holds less than 2 GB.")
+    torch.export.save(write_onnx(step, OUTPUTS, onnx), program)
+
+
+def write_onnx(step: ActorStep | StepPart, outputs: Sequence[str], path: Path) -> torch.export.ExportedProgram:
+    """Write a step, or a part of one, as ONNX file, weights inside; return the program that it was made from."""
     inputs = step.example_inputs()
     with torch.no_grad():
         exported = torch.export.export(step, tuple(inputs.values()))
     for node in exported.graph.nodes:
         # Paths of this machine's source files, which both formats would keep.
         node.meta.pop("stack_trace", None)
-    torch.export.save(exported, program)
     torch.onnx.export(
         exported,
-        f=onnx,
+        f=path,
         dynamo=True,
         input_names=list(inputs),
-        output_names=list(OUTPUTS),
+        output_names=list(outputs),
         external_data=False,
         verbose=False,
     )
+    return exported
 
 
-def share_weights(step: ActorStep, onnx: Path, weights: Path) -> None:
-    """Write the weights of a step to a file, and have its ONNX file point into that instead of holding them.
+def share_weights(step: ActorStep, files: Sequence[Path], weights: Path) -> None:
+    """Write the weights of a step to a file, and have its ONNX files point into that instead of holding them.
 
-    What the exporter has transformed, or has found to be equal to another weight, stays inside of the ONNX file.
+    What the exporter has transformed, or has found to be equal to another weight, stays inside of an ONNX file.
     """
     import onnx as onnx_format
 
     extents = write_weights(weights, step.state_dict())
     content = weights.read_bytes()
-    model = onnx_format.load(onnx)
-    for tensor in model.graph.initializer:
-        extent = extents.get(tensor.name)
-        if extent and tensor.raw_data == content[extent.offset : extent.offset + extent.length]:
-            onnx_format.external_data_helper.set_external_data(tensor, weights.name, *extent)
-            tensor.ClearField("raw_data")
-    onnx.write_bytes(model.SerializeToString())
+    for file in files:
+        model = onnx_format.load(file)
+        for tensor in model.graph.initializer:
+            extent = extents.get(tensor.name.removeprefix("step."))
+            if extent and tensor.raw_data == content[extent.offset : extent.offset + extent.length]:
+                onnx_format.external_data_helper.set_external_data(tensor, weights.name, *extent)
+                tensor.ClearField("raw_data")
+        file.write_bytes(model.SerializeToString())
 
 
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:

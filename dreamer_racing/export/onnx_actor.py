@@ -28,13 +28,19 @@ logger = logging.getLogger(__name__)
 CONTRACT = "contract.json"
 FORMAT, FORMAT_VERSION = "dreamer_racing.actor", 1
 RECURRENT = ("h", "z", "previous_action")
+PARTS = {"advance": ("h_next",), "act": ("action", "z_next")}
+"""Outputs of the two parts of a step. The first takes all that is recurrent and ``is_init``, the second the
+observation, ``h_next`` and the noise, if there is any."""
 WARM_UP_STEPS = 20
 
 _TENSOR = {"name": str, "shape": [int], "type": str}
 _LAYOUT = {
     "inputs": [_TENSOR],
     "outputs": [_TENSOR],
-    "files": {"onnx": {"sha256": str}, "weights?": {"name": str, "sha256": str}},
+    "files": {
+        "onnx": {"sha256": str},
+        **{f"{kind}?": {"name": str, "sha256": str} for kind in ("weights", "advance", "act")},
+    },
     "model": {},
     "weights_sha256": str,
     "action": {"channels": [{"name": str, "unit": str, "offset": float, "scale": float}]},
@@ -83,6 +89,12 @@ class RecurrentActor:
         """Begin an episode: the next step forgets everything before it."""
         self.state = {name: np.zeros(self._shapes[name], np.float32) for name in RECURRENT}
         self.is_init = True
+
+    def prepare(self) -> None:
+        """Do ahead of time what of the next step needs no observation, if this actor can; actions stay the same.
+
+        Worth it after a step, when its action is on its way.
+        """
 
     def step(self, observation: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
         """Take in what is seen now and return what to do; call it once per control period.
@@ -137,10 +149,17 @@ class RecurrentActor:
 class OnnxActor(RecurrentActor):
     """An exported actor in onnxruntime, on the CPU.
 
+    Where its contract names the two parts of a step, ``advance`` and ``act``, these are run, so that `prepare` can do
+    the first one ahead of time; else the whole.
+
     Args:
-        path: The ``.onnx`` file; its contract.json lies beside it.
+        path: The ``.onnx`` file; its contract.json and its parts lie beside it.
         seed: Of the noise that samples latents; only ``latent=sample`` has any.
         threads: Threads that one step may use; more than one rarely helps at batch size 1.
+        whole: Run the whole step even where there are parts.
+
+    Attributes:
+        in_parts: Whether `prepare` takes something off the next step.
 
     Raises:
         FileNotFoundError: There is no such file, or no contract beside it.
@@ -151,24 +170,47 @@ class OnnxActor(RecurrentActor):
         >>> actor = OnnxActor("actor.onnx")  # doctest: +SKIP
         >>> action = actor.step(np.zeros((64, 64, 3), np.uint8))  # doctest: +SKIP
         >>> collective_thrust, *body_rates = actor.setpoint(action)  # doctest: +SKIP
+        >>> actor.prepare()  # doctest: +SKIP
     """
 
-    def __init__(self, path: str | Path, seed: int | None = None, threads: int = 1) -> None:
+    def __init__(self, path: str | Path, seed: int | None = None, threads: int = 1, whole: bool = False) -> None:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"There is no file {path}: give the .onnx file that recipes/export.py wrote.")
+        self._next_h: np.ndarray | None = None  # if it has been prepared
+        self._first_h: np.ndarray | None = None  # of an episode, which is always the same
         super().__init__(read_contract(path.parent / CONTRACT), seed)
         self._check_files(path)
-        self._session = _open_session(path, threads)
-        self._check_session(path)
+        described = self.contract["files"]
+        files = {part: described.get(part) for part in PARTS}
+        self.in_parts = None not in files.values() and not whole
+        if self.in_parts:
+            self._sessions = {part: _open_session(path.parent / file["name"], threads) for part, file in files.items()}
+            self._check_parts(path)
+            self._first_h = self._advance()
+            self.reset()
+        else:
+            self._sessions = {"step": _open_session(path, threads)}
+            self._check_session(path)
         self._outputs = [entry["name"] for entry in self.contract["outputs"]]
 
+    def reset(self) -> None:
+        """Begin an episode: the next step forgets everything before it."""
+        super().reset()
+        self._next_h = self._first_h
+
+    def prepare(self) -> None:
+        """Advance the belief, which needs no observation; where the actor is one piece, do nothing."""
+        if self.in_parts and self._next_h is None:
+            self._next_h = self._advance()
+
     def _check_files(self, path: Path) -> None:
-        """Refuse a contract that belongs to other files; there are `weights` where the ONNX file holds none."""
+        """Refuse a contract that belongs to other files; there are `weights` where the ONNX files hold none."""
         described = self.contract["files"]
         files = {"onnx": path}
-        if described.get("weights") is not None:
-            files["weights"] = path.parent / described["weights"]["name"]
+        for kind in ("weights", *PARTS):
+            if described.get(kind) is not None:
+                files[kind] = path.parent / described[kind]["name"]
         for kind, file in files.items():
             if not file.is_file():
                 raise FileNotFoundError(f"There is no {file}: it belongs beside {path.name}, from the same export.")
@@ -180,14 +222,39 @@ class OnnxActor(RecurrentActor):
 
     def _check_session(self, path: Path) -> None:
         """Refuse a contract that promises what the file does not have."""
-        for kind, arguments in (("inputs", self._session.get_inputs()), ("outputs", self._session.get_outputs())):
+        session = self._sessions["step"]
+        for kind, arguments in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
             there = [(argument.name, list(argument.shape)) for argument in arguments]
             promised = [(entry["name"], entry["shape"]) for entry in self.contract[kind]]
             if there != promised:
                 raise ValueError(f"{path} has the {kind} {there}, but its contract promises {promised}.")
 
+    def _check_parts(self, path: Path) -> None:
+        """Refuse parts that do not make the step that the contract promises."""
+        shapes = {entry["name"]: entry["shape"] for kind in ("inputs", "outputs") for entry in self.contract[kind]}
+        before = [*RECURRENT, "is_init"]
+        inputs = {"advance": before, "act": ["h_next", *(name for name in self._shapes if name not in before)]}
+        for part, session in self._sessions.items():
+            there = {each.name: list(each.shape) for each in (*session.get_inputs(), *session.get_outputs())}
+            promised = {name: shapes.get(name) for name in (*inputs[part], *PARTS[part])}
+            if there != promised:
+                file = path.parent / self.contract["files"][part]["name"]
+                raise ValueError(f"{file} has the inputs and outputs {there}, but its contract promises {promised}.")
+
+    def _advance(self) -> np.ndarray:
+        feed = {**self.state, "is_init": np.array([self.is_init])}
+        belief: np.ndarray = self._sessions["advance"].run(PARTS["advance"], feed)[0]
+        return belief
+
     def _run(self, feed: dict[str, np.ndarray]) -> Sequence[np.ndarray]:
-        return self._session.run(self._outputs, feed)
+        if not self.in_parts:
+            outputs: Sequence[np.ndarray] = self._sessions["step"].run(self._outputs, feed)
+            return outputs
+        belief = self._advance() if self._next_h is None else self._next_h
+        self._next_h = None
+        seen = {name: value for name, value in feed.items() if name not in (*RECURRENT, "is_init")}
+        action, state = self._sessions["act"].run(PARTS["act"], {**seen, "h_next": belief})
+        return action, belief, state
 
 
 def read_contract(path: str | Path) -> dict[str, Any]:
@@ -283,17 +350,24 @@ class Latency(NamedTuple):
         return f"p50 {self.p50:.2f} ms, p99 {self.p99:.2f} ms, max {self.max:.2f} ms"
 
 
-def measure_latency(step: Callable[[np.ndarray], object], observations: Sequence[np.ndarray] | np.ndarray) -> Latency:
+def measure_latency(
+    step: Callable[[np.ndarray], object],
+    observations: Sequence[np.ndarray] | np.ndarray,
+    prepare: Callable[[], object] = lambda: None,
+) -> Latency:
     """Time single steps, after some that are not counted.
 
     Args:
         step: Called with one observation.
         observations: One for each timed step.
+        prepare: Called before each of them; what it takes is not counted.
     """
     for index in range(WARM_UP_STEPS):
+        prepare()
         step(observations[index % len(observations)])
     durations = []
     for observation in observations:
+        prepare()
         start = time.perf_counter()
         step(observation)
         durations.append(1e3 * (time.perf_counter() - start))
@@ -328,6 +402,8 @@ def main() -> None:
     seen = np.random.default_rng(0).integers(0, 256, (arguments.steps, *entry["shape"][1:])).astype(entry["type"])
     logger.info("onnxruntime, %d steps, %d thread(s): %s", arguments.steps, arguments.threads,
                 measure_latency(actor.step, seen))  # fmt: skip
+    if actor.in_parts:
+        logger.info("of it from seeing to acting: %s", measure_latency(actor.step, seen, actor.prepare))
 
 
 if __name__ == "__main__":

@@ -183,6 +183,10 @@ class FlightChain:
         setpoint = self._flyer.act(pose, image, self.progress.target)
         return setpoint, image, drawn - start, time.perf_counter() - drawn
 
+    def prepare(self) -> None:
+        """Do what the next tick needs and can be done before it, once the command of this one is out."""
+        self._flyer.prepare()
+
     def close(self) -> None:
         """Free the camera."""
         if self._camera is not None:

@@ -35,6 +35,10 @@ class Flyer(Protocol):
         """Choose from where the vehicle is, what it sees if the flyer has a camera, and which gate comes next."""
         ...
 
+    def prepare(self) -> None:
+        """Do what the next choice needs and can be done before it: called when a command is on its way."""
+        ...
+
 
 class ActorFlyer:
     """An exported actor: it sees the image and nothing else.
@@ -66,6 +70,10 @@ class ActorFlyer:
         assert image is not None, "there is a camera, so there is an image"
         thrust, *rates = self._actor.setpoint(self._actor.step(image))
         return Setpoint(float(thrust), np.array(rates))
+
+    def prepare(self) -> None:
+        """Advance the actor's memory by the action that it chose."""
+        self._actor.prepare()
 
 
 def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:

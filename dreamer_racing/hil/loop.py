@@ -77,7 +77,8 @@ class LoopStatistics:
         latency: From the arrival of the pose that a command is made from to its being sent.
         render: Of drawing.
         act: Of the flyer.
-        busy: Of the whole tick.
+        busy: Of the whole tick, until its command is out.
+        prepare: Of what the next one needs and was done ahead of it.
         overruns: Deadlines missed by ticks that took longer than their period: a long one misses several.
         unrecorded: Whether writing or showing the flight failed on the way.
     """
@@ -88,12 +89,13 @@ class LoopStatistics:
     render: list[float] = field(default_factory=list)
     act: list[float] = field(default_factory=list)
     busy: list[float] = field(default_factory=list)
+    prepare: list[float] = field(default_factory=list)
     overruns: int = 0
     unrecorded: bool = False
 
     def summary(self) -> dict[str, Any]:
         """Return p50, p99 and the largest of each in ms, and the counts."""
-        stages = ("jitter", "pose_age", "latency", "render", "act", "busy")
+        stages = ("jitter", "pose_age", "latency", "render", "act", "busy", "prepare")
         table = {name: percentiles(getattr(self, name)) for name in stages}
         return {**table, "ticks": len(self.busy), "overruns": self.overruns, "unrecorded": self.unrecorded}
 
@@ -212,6 +214,8 @@ class FlightLoop:
         sent = self._watchdog.send(outputs.verdict.command)
         self._dropped = not sent
         done = self._clock.now()
+        self._chain.prepare()
+        self.statistics.prepare.append(self._clock.now() - done)
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
         self._show(inputs, outputs, took, sent)

@@ -245,13 +245,23 @@ class RSSM(nn.Module):
         Returns:
             Belief ``(N, D)`` and state ``(N, S)``.
         """
-        reset = is_init.unsqueeze(-1)
+        belief = self.advance(previous_action, is_init, belief, state)
+        return belief, self.take_in(belief, embedding, deterministic)
+
+    def advance(self, previous_action: Tensor, is_init: Tensor, belief: Tensor, state: Tensor) -> Tensor:
+        """Return the next belief ``(N, D)``, which needs no observation yet; arguments as of ``observe_step``."""
+        reset, start = is_init.unsqueeze(-1), self.initial()
         action = self._project_action(previous_action, reset)
-        embedded = self.posterior_hidden.project(embedding)
-        noise = None if deterministic else self.draw_noise(len(is_init))
-        start = self.initial()
-        belief, state = torch.where(reset, start[0], belief), torch.where(reset, start[1], state)
-        return self._observe(belief, state, action, embedded, noise)[:2]
+        return self.cell(torch.where(reset, start[0], belief), torch.where(reset, start[1], state), action)
+
+    def take_in(self, belief: Tensor, embedding: Tensor, deterministic: bool = False) -> Tensor:
+        """Return the state ``(N, S)`` by the next belief and what is seen; arguments as of ``observe_step``."""
+        noise = None if deterministic else self.draw_noise(len(belief))
+        return self._sample(self.posterior_logits(belief, embedding), noise)
+
+    def posterior_logits(self, belief: Tensor, embedding: Tensor) -> Tensor:
+        """Map beliefs ``(..., D)`` and embeddings ``(..., E)`` to the posterior's logits ``(..., L, K)``."""
+        return self._posterior_logits(belief, self.posterior_hidden.project(embedding))
 
     def imagine_step(
         self, belief: Tensor, state: Tensor, action: Tensor, deterministic: bool = False

@@ -57,3 +57,6 @@ class PilotFlyer:
         position, attitude, velocity, rates = (torch.from_numpy(part)[None] for part in parts)
         action = self._pilot.act(position, attitude, velocity, rates, torch.tensor([target_gate]))[0].double().numpy()
         return Setpoint(self._thrust_scale * (1.0 + float(action[0])), self._rate_max * action[1:])
+
+    def prepare(self) -> None:
+        """Nothing: where the vehicle will be is not known before."""

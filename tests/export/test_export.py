@@ -185,6 +185,52 @@ def test_every_architecture_flies_alike(
     assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
 
 
+@pytest.mark.parametrize(
+    ("size", "latent", "shared_weights"),
+    [(LEARNED, "sample", False), (STATE_SPACE, "mode", True)],
+    ids=["gru", "state space"],
+)
+def test_a_step_in_two_parts_is_the_whole_one(
+    size: ModelSize, latent: str, shared_weights: bool, tmp_path: Path
+) -> None:
+    """Whether its first part is run ahead of time, and whether that is in vain because the flight begins anew."""
+    agent, output = make_agent(size), tmp_path / "actor.onnx"
+    step, flight = make_step(agent, latent), make_flight(agent)
+    deviation = export_actor(step, contract_of(step), flight, output, shared_weights=shared_weights, parts=True)
+    assert deviation["onnxruntime in parts"] < 1e-5
+    kept = {"weights.safetensors"} if shared_weights else {"actor.pt2"}
+    files = {"actor.onnx", "actor_advance.onnx", "actor_act.onnx", "contract.json"}
+    assert {path.name for path in tmp_path.iterdir()} == files | kept
+
+    ahead, late, whole = (onnx_actor.OnnxActor(output, seed=3, whole=each) for each in (False, False, True))
+    assert (ahead.in_parts, whole.in_parts) == (True, False)
+    for image, is_init in zip(flight.observations, flight.is_init, strict=True):
+        if is_init:
+            for actor in (ahead, late, whole):
+                actor.reset()
+        action = ahead.step(image)
+        np.testing.assert_array_equal(action, late.step(image))
+        np.testing.assert_allclose(action, whole.step(image), atol=1e-5)
+        ahead.prepare()
+        whole.prepare()  # nothing
+
+
+def test_parts_of_another_export_are_refused(agent: Agent, tmp_path: Path) -> None:
+    step, output = ActorStep(agent), tmp_path / "actor.onnx"
+    export_actor(step, contract_of(step), make_flight(agent), output, parts=True)
+    contract = json.loads((tmp_path / "contract.json").read_text())
+    files = contract["files"]
+    files["advance"], files["act"] = files["act"], files["advance"]
+    (tmp_path / "contract.json").write_text(json.dumps(contract))
+    with pytest.raises(ValueError, match="actor_act.onnx has the inputs and outputs .* but its contract promises"):
+        onnx_actor.OnnxActor(output)
+    (tmp_path / "actor_act.onnx").unlink()
+    with pytest.raises(FileNotFoundError, match="actor_act.onnx: it belongs beside actor.onnx"):
+        onnx_actor.OnnxActor(output)
+    export_actor(step, contract_of(step), make_flight(agent), output)
+    assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}, "no part is left"
+
+
 def test_the_flight_side_flies_as_torch_does(exported: Path, agent: Agent) -> None:
     """As `check_parity` says it, without `check_parity`; and z changes, so that a flip could be seen."""
     import onnxruntime

@@ -50,6 +50,9 @@ class Wobble:
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
         return Setpoint(12.0, np.array([3.0 * math.sin(9.0 * pose.time), math.cos(7.0 * pose.time), 0.0]))
 
+    def prepare(self) -> None:
+        pass
+
 
 @dataclass
 class Flown:

@@ -41,13 +41,16 @@ class Hover:
     camera = None
 
     def __init__(self) -> None:
-        self.resets = 0
+        self.resets = self.prepared = 0
 
     def reset(self) -> None:
         self.resets += 1
 
     def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
         return hover()
+
+    def prepare(self) -> None:
+        self.prepared += 1
 
 
 class Watched(LockStep):
@@ -326,6 +329,7 @@ def test_the_actor_forgets_until_the_vehicle_moves():
     assert chain.safety.state is State.CUT and "fence" in ended
     began = next(moment for moment, command in plant.sent if command.setpoint.collective_thrust > 13.0)
     assert began * 50 - 5 < flyer.resets < (began + 0.4) * 50
+    assert flyer.prepared > began * 50, "after each tick"
 
 
 @pytest.mark.parametrize("name", ["figure8", "kidney"])

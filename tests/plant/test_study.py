@@ -20,6 +20,9 @@ class Hover:
     def act(self, pose, image, target_gate):
         return hover()
 
+    def prepare(self):
+        pass
+
 
 def test_what_ends_at_once_is_said_and_repeats():
     class Fall(Hover):
