@@ -188,6 +188,9 @@ def tune(config: DictConfig) -> str:
 
 def resolve(config: DictConfig) -> DictConfig:
     """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
+    if config.env.device == "auto" and config.collection is Collection.overlapped:
+        config.env.device = "cpu"
+        print("worlds: cpu (collection=overlapped)")
     device = resolve_common(config, NUM_ENVS)
     size = config.model.size
     if size == "auto":

@@ -24,7 +24,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     episode with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the
     last one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: whoever steps begins them, by
     `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. Every entry of `info` but these two is there
-    for every environment (`info["_" + name]` is all true).
+    for every environment (`info["_" + name]` is all true), of a reset for those that were reset.
 
     Args:
         num_envs: N.

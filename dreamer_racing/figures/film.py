@@ -76,7 +76,7 @@ def _finds_ffmpeg() -> bool:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
-        logger.warning("no videos are written: %s pip install imageio-ffmpeg brings one.", error)
+        logger.warning("no videos are written: %s. pip install imageio-ffmpeg brings ffmpeg.", str(error).rstrip("."))
         return False
     return True
 

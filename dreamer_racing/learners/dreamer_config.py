@@ -22,9 +22,10 @@ class LearnerConfig:
             does there.
         cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
             whether the run can, is False.
-        few_kernels: Round elsewhere, where that saves kernels: weights are cast once an update instead of at every use
-            (with ``mixed_precision``), gradients of gains and biases are summed after the loop over T. None: on a CUDA
-            device, where a small kernel's launch takes longer than its work.
+        few_kernels: Save kernels: weights are cast once an update instead of at every use (with ``mixed_precision``),
+            gradients of gains and biases are summed after the loop over T, the noise of imagination is drawn ahead of
+            it. That rounds elsewhere and imagines other samples. None: on a CUDA device, where a small kernel's launch
+            takes longer than its work.
         mixed_precision: Compute the losses under bfloat16 autocast; parameters, logits and losses stay float32. None,
             which the recipes replace by what the device does well, is False.
         learning_rate: The reference's 4e-5 suits large models, small ones learn faster at 1e-4 to 3e-4.

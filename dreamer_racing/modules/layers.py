@@ -71,7 +71,7 @@ class Linear(nn.Linear):
     deferred: DeferredWeight | None = None
 
     def defer(self, with_bias: bool = True) -> DeferredWeight:
-        """Return weight and bias for the steps of one loop."""
+        """Return weight and bias for the steps of one loop; the bias, which costs no kernel, goes along in any case."""
         return DeferredWeight(self.weight.mT, self.bias)
 
     def forward(self, inputs: Tensor) -> Tensor:

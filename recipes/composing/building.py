@@ -66,10 +66,9 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     if config.env.episode_steps is None:
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
-        overlapped = str(config.get("collection", "")).endswith("overlapped")
-        config.env.device = "cpu" if overlapped else worlds_device(device, config.env)
-        if config.env.device != "cpu":
-            print(f"worlds: {config.env.device} (env.device=auto)")
+        config.env.device = worlds_device(device, config.env)
+        if device.type != "cpu":
+            print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device

@@ -78,6 +78,8 @@ class Restored:
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
             "control_rate": self.trained.env.control_rate,
+            "worlds_device": self.trained.env.device,
+            "renderer": self.trained.env.renderer,
             "episodes": config.episodes,
             "seed": config.seed,
             "wall_clock_seconds": round(seconds, 1),
@@ -117,6 +119,8 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
         weights = TRAINED if getattr(flyer, "averaged", None) is None else AVERAGED
         env_steps = counters["env_steps"]
     trained.env.device = worlds_device(device, trained.env)
+    if device.type != "cpu":
+        print(f"worlds: {trained.env.device} (renderer={config.renderer})")
     print(f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {env_steps:,} env_steps)")
     print(f"weights: {weights}{' (weights=auto)' if config.weights == 'auto' else ''}")
     return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine)

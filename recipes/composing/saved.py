@@ -16,7 +16,6 @@ from dreamer_racing.training.directory import RunDirectory
 
 OF_THIS_MACHINE = (
     "device",
-    "env.device",
     "env.renderer",
     "model.mixed_precision",
     "model.cuda_graph",

@@ -113,7 +113,8 @@ class SequenceReplayConfig(ReplayConfig):
     held_out: int = setting(1, NOT_NEGATIVE)
     recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
     recent_records: int = setting(20_000, COUNT)  # how many those are
-    # windows go on from stored latents, refreshed at each update, instead of from none; null: where batches are short
+    # windows go on from stored latents, refreshed at each update, instead of from none; null: where the recipe shortens
+    # windows, as it does for model=auto on CUDA
     context: bool | None = None
 
 
@@ -212,7 +213,7 @@ class DreamerConfig(ReplayRunConfig):
     algorithm: str = "dreamer_v3"
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
     init_from: str | None = None
-    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; auto chooses one
+    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; auto: race or none
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
@@ -335,6 +336,9 @@ class ExportConfig:
     evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
     commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
+    parts: bool = (
+        False  # write the step in two parts, too: what needs no image can then be done before it (docs/export.md)
+    )
     steps: int = setting(200, COUNT)  # of a recorded flight, over which the export must fly as the original does
     renderer: str = "auto"
     seed: int = setting(0, SEED)

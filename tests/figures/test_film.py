@@ -78,7 +78,7 @@ def test_without_ffmpeg_one_warning_stands_for_all_videos(tmp_path, monkeypatch,
     assert not any(write_video(tmp_path / f"{name}.mp4", blocks(3)) for name in "ab")
     assert not list(tmp_path.iterdir())
     assert [record.message for record in caplog.records] == [
-        "no videos are written: No ffmpeg. pip install imageio-ffmpeg brings one."
+        "no videos are written: No ffmpeg. pip install imageio-ffmpeg brings ffmpeg."
     ]
 
 
