@@ -93,6 +93,9 @@ def main() -> None:
     if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
         parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
     if arguments.launches:
+        unused = ("backends", "peers", "device", "mixed_precision", "few_kernels", "image_size", "threads", "updates")
+        if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
+            parser.error(f"--launches counts kernels of both ways on a CPU: no --{given[0].replace('_', '-')} with it.")
         counted = [
             count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
             for size in arguments.sizes
