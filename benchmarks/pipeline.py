@@ -1,0 +1,135 @@
+"""Forecast of training with workers: env_steps a second, what holds it back, how old weights are, what it costs.
+
+    python benchmarks/pipeline.py --json results/pipeline.json
+    python benchmarks/pipeline.py --learn 0.02 --worlds 32 --link 3.1e9      # a learner on a GPU, as fast as assumed
+
+A model, not a measurement: it plays the rounds of `collector=ray`. In a round every worker flies one rollout with the
+weights that it was sent, while the learner learns from the round before; rollouts come over one link, one after the
+other, and are copied by the learner; the round is over when the slowest worker's has come. Times of flights scatter by
+a log-normal factor, and a worker that dies costs its round a new start. What one process needs for an env_step is taken
+from `results/cores.json` (`--fly`, `--learn`); everything else is an argument with its default below.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from measuring import print_table, write_json
+
+CORES = Path(__file__).parents[1] / "results" / "cores.json"
+WORKERS = (1, 2, 4, 8, 64, 512)
+COLUMNS = (
+    "workers", "env_steps_per_s", "times", "held_back_by", "learner_busy", "worker_busy", "link_busy", "weights_age",
+    "weights_age_s", "hours", "cost",
+)  # fmt: skip
+IMAGE, NUMBERS = 64 * 64 * 3, 200
+"""Bytes of a record: its image, and about as many for all the rest of it."""
+
+
+class Pipeline(NamedTuple):
+    """What takes how long.
+
+    Attributes:
+        fly: ms for an env_step, of a worker that flies as many worlds as it has.
+        learn: ms for an env_step, of the learner: the updates that it owes for one.
+        worlds: Of a worker.
+        steps: Control steps of a rollout.
+        bytes_per_step: Of a record, on the link.
+        weights: Bytes that are sent to each worker in each round.
+        link: Bytes a second to and from the learner.
+        copy: Bytes a second at which the learner takes records in.
+        overhead: ms a round that the learner spends on asking and waiting, for each worker.
+        scatter: Standard deviation of the logarithm of the time of a rollout.
+        deaths: Of a worker, an hour.
+        restart: s until one that died has flown its rollout again.
+    """
+
+    fly: float
+    learn: float
+    worlds: int = 16
+    steps: int = 8
+    bytes_per_step: int = IMAGE + NUMBERS
+    weights: float = 2.9e6
+    link: float = 1.25e9
+    copy: float = 1e9
+    overhead: float = 1.0
+    scatter: float = 0.1
+    deaths: float = 0.0
+    restart: float = 20.0
+
+
+def main() -> None:
+    """Print the forecast for every number of workers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, nargs="*", default=WORKERS)
+    for name, value in {**one_process(), **Pipeline._field_defaults}.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
+    parser.add_argument("--rounds", type=int, default=2000)
+    parser.add_argument("--env-steps", type=float, default=1.5e6, help="of the run whose hours and cost are said")
+    parser.add_argument("--learner-price", type=float, default=0.0, help="$ an hour")
+    parser.add_argument("--worker-price", type=float, default=0.0, help="$ an hour")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    pipeline = Pipeline(**{name: getattr(arguments, name) for name in Pipeline._fields})
+    alone = 1e3 / (pipeline.fly + pipeline.learn)
+    print(f"one process, in turns: {alone:,.0f} env_steps/s")
+    records = []
+    for workers in arguments.workers:
+        found = play(pipeline, workers, arguments.rounds)
+        hours = arguments.env_steps / found["env_steps_per_s"] / 3600
+        price = arguments.learner_price + workers * arguments.worker_price
+        records.append(
+            {"benchmark": "pipeline", "workers": workers, **found, "times": found["env_steps_per_s"] / alone,
+             "hours": hours, "cost": hours * price, **pipeline._asdict()}
+        )  # fmt: skip
+    print_table(records, COLUMNS)
+    write_json(records, arguments.json)
+
+
+def one_process() -> dict[str, float]:
+    """Milliseconds for an env_step that one process spends on flying and on learning, as measured on one core."""
+    record = next(each for each in json.loads(CORES.read_text()) if (each["cores"], each["threads"]) == (1, 1))
+    of_a_step = 1e3 / record["env_steps_per_s"]
+    return {"fly": round(record["collect"] * of_a_step, 3), "learn": round((1 - record["collect"]) * of_a_step, 3)}
+
+
+def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[str, Any]:
+    """Play rounds; return env_steps a second, shares of time that are spent working, and the age of weights."""
+    draw = np.random.default_rng(seed)
+    rollout = pipeline.worlds * pipeline.steps  # env_steps
+    flight = 1e-3 * pipeline.fly * rollout
+    transfer = rollout * pipeline.bytes_per_step / pipeline.link
+    sending = workers * pipeline.weights / pipeline.link
+    taking = workers * (rollout * pipeline.bytes_per_step / pipeline.copy + 1e-3 * pipeline.overhead)
+    learning = 1e-3 * pipeline.learn * rollout * workers
+
+    clock, asked, flown, round_age = 0.0, 0.0, 0.0, []
+    for _ in range(rounds):
+        times = flight * draw.lognormal(-0.5 * pipeline.scatter**2, pipeline.scatter, workers)
+        lost = draw.random(workers) < pipeline.deaths * flight / 3600
+        done = asked + sending + np.sort(times + lost * pipeline.restart)
+        # each waits for the link until those before it are through
+        arrived = np.max(done + transfer * np.arange(workers, 0, -1))
+        begins = max(clock, arrived) + taking
+        round_age.append(begins + learning - asked)
+        asked, clock = begins, begins + learning  # the next round is asked for before this one is learned from
+        flown += times.sum()
+
+    busy = {
+        "learner": rounds * (learning + taking) / clock,
+        "worker": flown / workers / clock,
+        "link": rounds * (workers * transfer + sending) / clock,
+    }
+    return {
+        "env_steps_per_s": rounds * rollout * workers / clock,
+        "held_back_by": max(busy, key=busy.__getitem__),
+        **{f"{part}_busy": share for part, share in busy.items()},
+        "weights_age": 2 * rollout * workers,
+        "weights_age_s": float(np.mean(round_age)),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""`benchmarks/pipeline.py`: the model says what can be worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.running_recipes import module_of
+
+pipeline = module_of("benchmarks", "pipeline")
+IDEAL = pipeline.Pipeline(fly=1.0, learn=0.01, weights=0.0, link=1e15, copy=1e15, overhead=0.0, scatter=0.0)
+"""Nothing costs but flying and, little, learning."""
+
+
+@pytest.mark.parametrize("workers", [1, 2, 64])
+def test_where_flying_is_all_workers_add_up(workers: int) -> None:
+    found = pipeline.play(IDEAL, workers, 200)
+    assert found["env_steps_per_s"] == pytest.approx(1000 * workers, rel=0.02)
+    assert found["held_back_by"] == "worker" and found["worker_busy"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_beyond_what_the_learner_learns_workers_gain_nothing() -> None:
+    found = pipeline.play(IDEAL, 512, 200)
+    assert found["env_steps_per_s"] == pytest.approx(100_000, rel=0.01)
+    assert found["held_back_by"] == "learner" and found["weights_age"] == 2 * 512 * 16 * 8
+
+
+def test_a_link_carries_what_it_carries() -> None:
+    found = pipeline.play(IDEAL._replace(link=2_000 * IDEAL.bytes_per_step), 8, 200)
+    assert found["env_steps_per_s"] == pytest.approx(2_000 / (1 + 2_000 / 8_000), rel=0.05)
+    assert found["held_back_by"] == "link"
+
+
+def test_the_slowest_worker_and_deaths_hold_all_back() -> None:
+    speeds = [
+        pipeline.play(IDEAL._replace(scatter=scatter, deaths=deaths), 64, 500)["env_steps_per_s"]
+        for scatter, deaths in ((0.0, 0.0), (0.3, 0.0), (0.3, 20.0))
+    ]
+    assert speeds[0] > 1.3 * speeds[1] > 1.3 * speeds[2]
