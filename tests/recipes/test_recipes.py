@@ -266,6 +266,7 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     copied = shutil.copytree(run_dir, tmp_path / "run")
     saved = OmegaConf.load(copied / "config.yaml")
     saved.model.replay_ratio, saved.loss.discount, saved.env.num_envs = 3.0, 0.9, 2
+    saved.device = saved.env.device = "cuda"
     del saved.tuned, saved.model.average_rate
     OmegaConf.save(saved, copied / "config.yaml")
     resumed = recipe_module("composing.launching").resumed_config
@@ -278,6 +279,8 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     config = composed()
     assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (3.0, 0.9, 2)
     assert (config.tuned, config.model.average_rate, config.device) == ("none", None, "auto")
+    assert config.env.device == "cuda", "the state of its worlds is that of worlds there"
+    assert composed("env.device=cpu").env.device == "cpu"
     config = composed("model.replay_ratio=5", "loss=decoder_free", "schedule.discount.to=0.99")
     assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (5.0, 0.997, 2)
     assert config.loss.world_model == "decoder_free" and config.schedule.discount.to == 0.99
