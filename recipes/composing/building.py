@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
 from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name, worlds_device
 from composing.checks import refuse_to_replace
@@ -25,6 +25,7 @@ from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelRewar
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -53,6 +54,10 @@ OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
 """Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
 
 
+OF_WHO_FLIES = ("env", "collector", "workers")
+"""Parts that a run has or not, by who flies; where a run goes on otherwise, its worlds begin anew."""
+
+
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     """Fill in what every recipe leaves open, and say what was chosen; return the learner's device."""
     device = choose_device(config.device)
@@ -67,12 +72,19 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
         overlapped = str(config.get("collection", "")).endswith("overlapped")
-        config.env.device = "cpu" if overlapped else worlds_device(device, config.env)
+        config.env.device = "cpu" if overlapped else worlds_device(flyers_device(config, device), config.env)
         if config.env.device != "cpu":
             print(f"worlds: {config.env.device} (env.device=auto)")
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device
+
+
+def flyers_device(config: DictConfig, device: torch.device) -> torch.device:
+    """Where policies fly: on the learner's device, or on that of Ray's workers."""
+    if not str(config.get("collector", "")).endswith("ray"):
+        return device
+    return torch.device("cuda" if config.workers.gpus else "cpu")
 
 
 def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
@@ -116,7 +128,7 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
     Worlds on a CPU have to wait for the actions of a policy on a CUDA device; beside it, all is in order by itself.
     """
     return Collector(
-        TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
+        with_memory(env, policy.make_primer()),
         policy,
         frames_per_batch=config.env.num_envs * config.rollout_steps,
         total_frames=-1,
@@ -126,6 +138,11 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
         track_traj_ids=False,
         no_cuda_sync=env.device.type == "cuda",
     )
+
+
+def with_memory(env: Environment, primer: TensorDictPrimer) -> TransformedPixelEnv:
+    """Give an environment the keys of a policy's memory."""
+    return TransformedPixelEnv(env, Compose(InitTracker(), primer))
 
 
 def make_run_replay(
@@ -289,10 +306,13 @@ def assemble(
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
     directory = RunDirectory(lock.directory)
-    tracker = EpisodeTracker(env.batch_size.numel(), crash_causes(config))
+    tracker = EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
+    if isinstance(rollouts, RayRollouts):  # the worlds are theirs
+        del parts["env"], parts["collector"]
+        parts["workers"] = rollouts
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
@@ -301,7 +321,7 @@ def assemble(
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
-        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
+        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WHO_FLIES))
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         if curriculum:
