@@ -8,7 +8,9 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from torchrl.envs import EnvBase
@@ -40,8 +42,8 @@ class Share(NamedTuple):
         return "cuda" if self.gpus else "cpu"
 
 
-def join(address: str) -> None:
-    """Join a Ray cluster, unless this process has joined one already.
+def join(address: str) -> bool:
+    """Join a Ray cluster, unless this process has joined one already; return whether it did now.
 
     Args:
         address: ``local`` starts one on this machine, of all its CPUs and GPUs; ``auto`` is one that runs here already;
@@ -58,7 +60,7 @@ def join(address: str) -> None:
     import ray
 
     if ray.is_initialized():
-        return
+        return False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     try:
         ray.init(address=address, include_dashboard=False, logging_level=logging.WARNING)
@@ -68,6 +70,7 @@ def join(address: str) -> None:
             "same versions of Python and Ray, ray start --head, and give its address, or have one started on this "
             "machine by workers.address=local."
         ) from error
+    return True
 
 
 def leave() -> None:
@@ -136,7 +139,7 @@ def start_workers(
     import ray
     from torchrl.collectors.distributed import RayCollector
 
-    check_resources(workers, share, *resources())
+    _await_room(workers, share)
     try:
         collector = RayCollector(
             make_env,
@@ -181,6 +184,15 @@ def check_versions(here: Mapping[str, str | None], found: list[dict[str, str | N
                 f"collector=ray: worker {worker}, on node {there.get('node')}, has {', '.join(others)}. Install the "
                 "same there, or choose another cluster by workers.address."
             )
+
+
+def _await_room(workers: int, share: Share) -> None:
+    """Check resources, once those of a run that has just ended are back."""
+    for _ in range(10):
+        with suppress(ValueError):
+            return check_resources(workers, share, *resources())
+        time.sleep(0.5)
+    return check_resources(workers, share, *resources())
 
 
 def _in_a_line(error: Exception, last: bool = False) -> str:

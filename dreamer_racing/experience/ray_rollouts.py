@@ -60,6 +60,7 @@ class RayRollouts(RolloutsAhead):
         weight_interval: env_steps that weights may be old at most when the last frame flown with them is learned from,
             this rollout's counted. At least two rounds; new ones are sent no sooner than needed.
         patience: s to wait for a worker that does not answer.
+        leaves: Whether `close` parts from the cluster.
 
     Attributes:
         rounds: Delivered so far in the run.
@@ -80,12 +81,13 @@ class RayRollouts(RolloutsAhead):
         *,
         weight_interval: int,
         patience: float = 600.0,
+        leaves: bool = True,
     ) -> None:
         self._collector, self._policy, self._env, self._settings = collector, policy, env, settings
         self._workers = list(collector.remote_collectors)
         self._frames = collector.frames_per_batch * len(self._workers)
         check_interval(weight_interval, self._frames)
-        self._interval, self._patience = weight_interval, patience
+        self._interval, self._patience, self._leaves = weight_interval, patience, leaves
         self._asked: list[Any] = []  # references to flights, one of each worker
         self._weights: Any = None  # a reference
         self._taken_at = 0
@@ -115,10 +117,11 @@ class RayRollouts(RolloutsAhead):
         return rollout
 
     def close(self) -> None:
-        """End the workers, and part from the cluster."""
-        self._asked.clear()
+        """End the workers."""
+        self._asked = []
         self._collector.shutdown()
-        ray_cluster.leave()
+        if self._leaves:
+            ray_cluster.leave()
 
     def state_dict(self) -> dict[str, Any]:
         """Return how far the run is; what workers are in the midst of is not kept."""
@@ -127,6 +130,7 @@ class RayRollouts(RolloutsAhead):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from there, with worlds that begin anew."""
         self.rounds, self.lost = state["rounds"], state["lost"]
+        logger.info("workers: their worlds begin anew, at round %d", self.rounds)
 
     def _ask(self, number: int) -> None:
         """Ask every worker for its rollout of a round, with new weights if those sent would be too old by its end."""

@@ -279,6 +279,14 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
+def with_workers(parts: dict[str, Any], rollouts: Iterator[TensorDictBase] | None) -> dict[str, Any]:
+    """Leave the worlds out of a run's parts if workers have them, for which how far they are stands in their place."""
+    if not isinstance(rollouts, RayRollouts):
+        return parts
+    own = {name: part for name, part in parts.items() if name not in ("env", "collector")}
+    return own | {"workers": rollouts}
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -310,10 +318,8 @@ def assemble(
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
-    if isinstance(rollouts, RayRollouts):  # the worlds are theirs
-        del parts["env"], parts["collector"]
-        parts["workers"] = rollouts
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
+    parts = with_workers(parts, rollouts)
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}

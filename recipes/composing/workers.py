@@ -72,7 +72,7 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
     with seeded(config.seed):
         agent = make_agent(own, Interface.of(env))  # its weights come with the first request
     flying = DreamerPolicy(agent.world_model, agent.actor)
-    ray_cluster.join(asked.address)
+    joined = ray_cluster.join(asked.address)
     collector = ray_cluster.start_workers(
         partial(make_worker_env, own, flying.make_primer()),
         flying,
@@ -89,6 +89,7 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
         OF_RACES if is_race(config) else (),
         weight_interval=cast(int, asked.weight_interval),
         patience=asked.patience,
+        leaves=joined,
     )
     return collector, rollouts
 
