@@ -134,14 +134,15 @@ def start_workers(
         TorchRL's collector of them, to be given to `RayRollouts`.
 
     Raises:
-        ValueError: there is not enough of something, or a worker cannot begin, or has other versions than this process.
+        ValueError: there is not enough of something, or a node has other versions, or a worker cannot begin.
     """
     import ray
     from torchrl.collectors.distributed import RayCollector
 
     _await_room(workers, share)
+    check_nodes(make_env, policy)
     try:
-        collector = RayCollector(
+        return RayCollector(
             make_env,
             policy,
             frames_per_batch=frames,
@@ -156,34 +157,61 @@ def start_workers(
             env_device=env_device,
             storing_device="cpu",
         )
-        found = ray.get([worker.versions.remote() for worker in collector.remote_collectors])
     except ray.exceptions.RayActorError as error:
         raise ValueError(
-            f"collector=ray: a worker could not begin ({_in_a_line(error, last=True)}). Every node of the cluster "
-            "needs this project at the same version, at the same place or installed, and a renderer (env.renderer=) "
-            "that works there."
+            f"collector=ray: a worker could not begin ({_in_a_line(error, last=True)}). Its worlds are made there as "
+            "they would be here: look for what that node lacks, e.g. a renderer (env.renderer=)."
         ) from error
-    check_versions(versions(), found)
-    return collector
 
 
-def check_versions(here: Mapping[str, str | None], found: list[dict[str, str | None]]) -> None:
-    """Refuse workers of other versions.
+def check_nodes(*parts: object) -> None:
+    """Refuse nodes that could not have a worker: Ray would begin one there again and again.
 
     Args:
-        here: of this process.
-        found: of each worker, with its ``node``.
+        parts: what a worker is made of, which every node must be able to unpickle.
 
     Raises:
-        ValueError: the message names worker, node, and both versions.
+        ValueError: the message names the node, and what is wrong there.
     """
-    for worker, there in enumerate(found):
-        others = [f"{name} {there.get(name)} (here {own})" for name, own in here.items() if there.get(name) != own]
-        if others:
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    ask = ray.remote(num_cpus=0, max_retries=0)(_versions_with)
+    nodes = {node["NodeID"]: node["NodeManagerHostname"] for node in ray.nodes() if node["Alive"]}
+    there = {node: NodeAffinitySchedulingStrategy(node, soft=False) for node in nodes}
+    answers = {node: ask.options(scheduling_strategy=there[node]).remote(*parts) for node in nodes}
+    for node, name in nodes.items():
+        try:
+            found = ray.get(answers[node])
+        except ray.exceptions.RayError as error:
             raise ValueError(
-                f"collector=ray: worker {worker}, on node {there.get('node')}, has {', '.join(others)}. Install the "
-                "same there, or choose another cluster by workers.address."
-            )
+                f"collector=ray: node {name} cannot have a worker ({_in_a_line(error, last=True)}). Every node of the "
+                "cluster needs this project in the same version, at the same place or installed."
+            ) from error
+        check_versions(name, found, versions())
+
+
+def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str, str | None]) -> None:
+    """Refuse a node of other versions.
+
+    Args:
+        node: its name.
+        found: there.
+        here: in this process.
+
+    Raises:
+        ValueError: the message names the node, and both versions.
+    """
+    if others := [f"{name} {found.get(name)} (here {own})" for name, own in here.items() if found.get(name) != own]:
+        raise ValueError(
+            f"collector=ray: node {node} has {', '.join(others)}. Install the same there, or choose another cluster by "
+            "workers.address."
+        )
+
+
+def _versions_with(*parts: object) -> dict[str, str | None]:
+    """Return versions, where the parts could be unpickled."""
+    return versions()
 
 
 def _await_room(workers: int, share: Share) -> None:

@@ -67,6 +67,7 @@ class RayRollouts(RolloutsAhead):
         lost: How often a worker died in the run and another took its place.
         weights_age: env_steps, of the round delivered last: of its oldest weights.
         processes: Host and process id of each worker, as of that round.
+        seconds: Of that round, how long the slowest worker flew.
 
     Raises:
         ValueError: If no weights could be as new as ``weight_interval`` asks.
@@ -94,6 +95,7 @@ class RayRollouts(RolloutsAhead):
         self._all_flew = False
         self.rounds = self.lost = self.weights_age = 0
         self.processes: list[tuple[str, int]] = []
+        self.seconds = 0.0
 
     def __next__(self) -> TensorDictBase:
         """Return the round that was flown meanwhile, ``[N, T]``, and ask for the next.
@@ -161,6 +163,7 @@ class RayRollouts(RolloutsAhead):
                 )
         self._all_flew = True
         self.processes = [flight.process for flight in flights]
+        self.seconds = max(flight.seconds for flight in flights)
         self.weights_age = (self.rounds + 1) * self._frames - min(flight.taken_at for flight in flights)
         return torch.cat([flight.rollout for flight in flights])
 

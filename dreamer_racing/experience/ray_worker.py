@@ -9,6 +9,7 @@ import importlib.metadata
 import os
 import platform
 import socket
+import time
 from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -46,12 +47,14 @@ class Flight(NamedTuple):
         taken_at: that of the weights it was flown with.
         began: whether it is the worker's first, of worlds that begin anew.
         process: host and process id.
+        seconds: that it took, of the worker's time.
     """
 
     rollout: TensorDictBase
     taken_at: int
     began: bool
     process: tuple[str, int]
+    seconds: float
 
 
 class RayWorker(Collector):
@@ -73,6 +76,7 @@ class RayWorker(Collector):
 
     def fly(self, request: Request) -> Flight:
         """Fly a rollout."""
+        start = time.perf_counter()
         for name, value in request.settings.items():
             *path, attribute = name.split(".")
             setattr(attrgetter(".".join(path))(self.env.base_env) if path else self.env.base_env, attribute, value)
@@ -84,7 +88,8 @@ class RayWorker(Collector):
 
             self.update_policy_weights_(ray.get(request.weights[0]))
             self._taken_at = request.taken_at
-        return Flight(self.next(), request.taken_at, began, (socket.gethostname(), os.getpid()))
+        rollout, process = self.next(), (socket.gethostname(), os.getpid())
+        return Flight(rollout, request.taken_at, began, process, time.perf_counter() - start)
 
     def _begin(self, seed: int) -> None:
         """Let all worlds begin anew; the process is this worker's own, and so is its generator."""
@@ -95,10 +100,6 @@ class RayWorker(Collector):
     def __repr__(self) -> str:
         """Name the worker, as Ray does before each line that it prints."""
         return f"worker {self.worker_idx}"
-
-    def versions(self) -> dict[str, str | None]:
-        """Return `versions` of this worker's process, with its ``node``."""
-        return {**versions(), "node": socket.gethostname()}
 
 
 def versions() -> dict[str, str | None]:

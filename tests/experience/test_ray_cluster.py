@@ -42,10 +42,9 @@ def test_what_a_cluster_does_not_have_is_not_waited_for(share: Share, words: str
     check_resources(2, Share(1.0, 0.0), {"CPU": 3.0}, {"CPU": 2.0})
 
 
-def test_workers_of_other_versions_are_refused() -> None:
-    here = {"python": "3.11.2", "torch": "2.13.0"}
-    same = {**here, "node": "one"}
-    check_versions(here, [same, same])
-    words = r"worker 1, on node two, has torch 2\.12\.0 \(here 2\.13\.0\)\. Install the same there"
+def test_nodes_of_other_versions_are_refused() -> None:
+    here = {"python": "3.11.2", "torch": "2.13.0", "ray": "2.60.0"}
+    check_versions("one", here, here)
+    words = r"node two has torch 2\.12\.0 \(here 2\.13\.0\), ray None \(here 2\.60\.0\)\. Install the same there"
     with pytest.raises(ValueError, match=words):
-        check_versions(here, [same, {**here, "torch": "2.12.0", "node": "two"}])
+        check_versions("two", {"python": "3.11.2", "torch": "2.12.0"}, here)

@@ -180,6 +180,30 @@ def test_more_workers_than_there_is_room_for_are_refused(flown: Flown) -> None:
         )  # fmt: skip
 
 
+def absent() -> None:
+    """Not to be found where workers are."""
+
+
+absent.__module__ = "a_module_of_the_learner_alone"
+
+
+def without_a_renderer() -> None:
+    raise RuntimeError("EGL is not there")
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+@pytest.mark.parametrize(
+    ("make_env", "words"),
+    [(absent, r"node .* cannot have a worker"), (without_a_renderer, r"a worker could not begin .*EGL is not there")],
+)
+def test_what_workers_cannot_be_made_of_is_refused_at_once(ray_cluster: None, make_env: object, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        start_workers(
+            make_env, policy_of(small_race(1)), workers=1, share=Share(0.0, 0.0), env_device="cpu", frames=1, seed=0
+        )
+
+
 def test_weights_newer_than_a_round_ahead_are_refused() -> None:
     check_interval(2 * FRAMES, FRAMES)
     with pytest.raises(ValueError, match=rf"workers\.weight_interval=39: a round .* {FRAMES} .* 40 env_steps old"):

@@ -11,12 +11,12 @@ from omegaconf import OmegaConf
 
 from dreamer_racing.training.directory import latest_checkpoint
 from dreamer_racing.training.run import graceful_exit, train
-from tests.running_recipes import AT_THE_END, TINY, compose, recipe_module, rows
+from tests.running_recipes import TINY, compose, recipe_module, rows
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.flown=64",
     "loss.ppo.minibatch=32", "logger.every=32", "env.start_on_line=0", "schedule.start_on_line.to=null",
-    "workers.patience=120", AT_THE_END,
+    "workers.patience=120",
 ]  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(ray_cluster
     assert run.counters["updates"] == int((8 * 32 - 100) * run.config.model.replay_ratio / 64)
     assert "workers" in {path.name.partition("-")[2] for path in latest_checkpoint(tmp_path).glob("components/*")}
 
-    again = make_run(f"resume={tmp_path}", "collector=ray", "total_env_steps=384")
+    again = make_run(f"resume={tmp_path}", "collector=ray", "num_workers=1", "total_env_steps=384")
     assert again.rollouts.rounds == 9 and again.rollouts.lost == 1 and again.counters == run.counters
     train(again)
     again.close()
