@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -64,7 +64,7 @@ class RayRollouts(RolloutsAhead):
 
     Attributes:
         rounds: Delivered so far in the run.
-        lost: How often a worker died in the run and another took its place.
+        lost: How often a worker died in this process's time and another took its place.
         weights_age: env_steps, of the round delivered last: of its oldest weights.
         processes: Host and process id of each worker, as of that round.
         seconds: Of that round, how long the slowest worker flew.
@@ -125,13 +125,9 @@ class RayRollouts(RolloutsAhead):
         if self._leaves:
             ray_cluster.leave()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return how far the run is; what workers are in the midst of is not kept."""
-        return {"rounds": self.rounds, "lost": self.lost}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from there, with worlds that begin anew."""
-        self.rounds, self.lost = state["rounds"], state["lost"]
+    def begin_at(self, env_steps: int) -> None:
+        """Go on with a run that has made so many env_steps, in fresh worlds."""
+        self.rounds = env_steps // self._frames
         logger.info("workers: their worlds begin anew, at round %d", self.rounds)
 
     def _ask(self, number: int) -> None:

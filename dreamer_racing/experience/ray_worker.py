@@ -97,6 +97,13 @@ class RayWorker(Collector):
         self.set_seed(seed)
         self.reset()
 
+    def __bool__(self) -> bool:
+        """Answer Ray, which asks before it reports an error, in place of TorchRL's ``__len__``, which would fail then.
+
+        Ray would take that for the death of the process, and begin it anew, again and again.
+        """
+        return True
+
     def __repr__(self) -> str:
         """Name the worker, as Ray does before each line that it prints."""
         return f"worker {self.worker_idx}"

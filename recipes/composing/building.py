@@ -54,8 +54,8 @@ OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
 """Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
 
 
-OF_WHO_FLIES = ("env", "collector", "workers")
-"""Parts that a run has or not, by who flies; where a run goes on otherwise, its worlds begin anew."""
+OF_WORLDS = ("env", "collector")
+"""Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
@@ -279,14 +279,6 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
-def with_workers(parts: dict[str, Any], rollouts: Iterator[TensorDictBase] | None) -> dict[str, Any]:
-    """Leave the worlds out of a run's parts if workers have them, for which how far they are stands in their place."""
-    if not isinstance(rollouts, RayRollouts):
-        return parts
-    own = {name: part for name, part in parts.items() if name not in ("env", "collector")}
-    return own | {"workers": rollouts}
-
-
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -319,7 +311,8 @@ def assemble(
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
-    parts = with_workers(parts, rollouts)
+    if isinstance(rollouts, RayRollouts):  # workers have the worlds
+        parts = {name: part for name, part in parts.items() if name not in OF_WORLDS}
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
@@ -327,9 +320,11 @@ def assemble(
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
-        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WHO_FLIES))
+        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WORLDS))
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
+        if isinstance(rollouts, RayRollouts):
+            rollouts.begin_at(counters["env_steps"])
         if curriculum:
             env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
         if not journal.restored:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from functools import partial
+from types import ModuleType
 from typing import NamedTuple
 
 import pytest
@@ -180,24 +182,40 @@ def test_more_workers_than_there_is_room_for_are_refused(flown: Flown) -> None:
         )  # fmt: skip
 
 
-def absent() -> None:
-    """Not to be found where workers are."""
-
-
-absent.__module__ = "a_module_of_the_learner_alone"
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_an_error_in_flight_is_raised_as_it_is(flown: Flown) -> None:
+    """And is no loss, after which Ray would ask again."""
+    ray = pytest.importorskip("ray")
+    wrong = Request(ROUNDS + 1, [], 0, {"nowhere.at_all": 1})
+    with pytest.raises(AttributeError, match="nowhere"):
+        ray.get(flown.rollouts._workers[0].fly.remote(wrong), timeout=60)
 
 
 def without_a_renderer() -> None:
     raise RuntimeError("EGL is not there")
 
 
+def of_the_learner_alone() -> None:
+    """Not to be found where workers are."""
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
 @pytest.mark.parametrize(
     ("make_env", "words"),
-    [(absent, r"node .* cannot have a worker"), (without_a_renderer, r"a worker could not begin .*EGL is not there")],
+    [
+        (of_the_learner_alone, r"node .* cannot have a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
+        (without_a_renderer, r"a worker could not begin \(.*EGL is not there\)"),
+    ],
 )
-def test_what_workers_cannot_be_made_of_is_refused_at_once(ray_cluster: None, make_env: object, words: str) -> None:
+def test_what_workers_cannot_be_made_of_is_refused_at_once(
+    ray_cluster: None, make_env: Callable[[], None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(of_the_learner_alone, "__module__", "here_alone")
+    here_alone = ModuleType("here_alone")
+    here_alone.of_the_learner_alone = of_the_learner_alone  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "here_alone", here_alone)
     with pytest.raises(ValueError, match=words):
         start_workers(
             make_env, policy_of(small_race(1)), workers=1, share=Share(0.0, 0.0), env_device="cpu", frames=1, seed=0

@@ -48,10 +48,9 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(ray_cluster
     steps = run.replay.records(0)["is_init"].numel() - int(run.replay.records(0)["is_init"].sum())
     assert steps == 9 * 8, "each env_step of a world is a record of its stream, once"
     assert run.counters["updates"] == int((8 * 32 - 100) * run.config.model.replay_ratio / 64)
-    assert "workers" in {path.name.partition("-")[2] for path in latest_checkpoint(tmp_path).glob("components/*")}
 
     again = make_run(f"resume={tmp_path}", "collector=ray", "num_workers=1", "total_env_steps=384")
-    assert again.rollouts.rounds == 9 and again.rollouts.lost == 1 and again.counters == run.counters
+    assert again.rollouts.rounds == 9 and again.counters == run.counters
     train(again)
     again.close()
     assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))  # with the round that was under way
