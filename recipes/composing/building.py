@@ -279,6 +279,19 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
+def begin_anew(
+    env: Environment,
+    curriculum: BodyRateCurriculum | None,
+    rollouts: Iterator[TensorDictBase] | None,
+    env_steps: int,
+) -> None:
+    """Tell worlds that begin anew, in the midst of a run, how far it is."""
+    if curriculum:
+        env.body_rate_weight = curriculum.body_rate_weight
+    if isinstance(rollouts, RayRollouts):
+        rollouts.begin_at(env_steps)
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -311,8 +324,8 @@ def assemble(
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
-    if isinstance(rollouts, RayRollouts):  # workers have the worlds
-        parts = {name: part for name, part in parts.items() if name not in OF_WORLDS}
+    if isinstance(rollouts, RayRollouts):
+        del parts["env"], parts["collector"]  # workers have the worlds
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
@@ -323,10 +336,7 @@ def assemble(
         saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WORLDS))
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
-        if isinstance(rollouts, RayRollouts):
-            rollouts.begin_at(counters["env_steps"])
-        if curriculum:
-            env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
+        begin_anew(env, curriculum, rollouts, counters["env_steps"])
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
