@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
 
-from composing.arena import make_env
 from composing.building import (
     assemble,
     claim,
-    make_collector,
     make_curriculum,
     make_sequence_replay,
     resolve_common,
@@ -31,6 +29,7 @@ from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import Collection, DreamerConfig, register
 from composing.sharing import imagines, share_of
+from composing.workers import make_own_env, make_rollouts, place_worlds, resolve_workers
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -38,7 +37,8 @@ from torch import device as Device
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
+from dreamer_racing.experience.ahead import RolloutsAhead
+from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
@@ -70,7 +70,7 @@ register()
 
 @dataclass(kw_only=True)
 class DreamerRun(ReplayRun):
-    """A run that also measures its world model, and may collect in a thread."""
+    """A run that also measures its world model, and may collect ahead of learning."""
 
     config: DreamerConfig
     learner: DreamerLearner
@@ -83,6 +83,8 @@ class DreamerRun(ReplayRun):
         """Take note of the gates passed, and of how they were flown, too."""
         episodes = super().take_in(rollout)
         self.learner.watch(rollout)
+        if isinstance(self.rollouts, RayRollouts):
+            self.metrics.push({"collect/weights_age": float(self.rollouts.weights_age)})
         if len(episodes) and "gates_passed" in episodes:
             share = self.passes.update(episodes, self.counters["env_steps"])
             self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})
@@ -149,7 +151,7 @@ class DreamerRun(ReplayRun):
 
     def settle(self) -> None:
         """Take in the rollout that is under way, if there is one."""
-        if isinstance(self.rollouts, OverlappedRollouts) and (rollout := self.rollouts.drain()) is not None:
+        if isinstance(self.rollouts, RolloutsAhead) and (rollout := self.rollouts.drain()) is not None:
             self.take_in(rollout)
 
     def save(self) -> Path:
@@ -159,8 +161,8 @@ class DreamerRun(ReplayRun):
         return super().save()
 
     def close(self) -> None:
-        """End the thread that collects, if there is one."""
-        if isinstance(self.rollouts, OverlappedRollouts):
+        """End what collects ahead, if anything does."""
+        if isinstance(self.rollouts, RolloutsAhead):
             self.rollouts.close()
         super().close()
 
@@ -188,9 +190,7 @@ def tune(config: DictConfig) -> str:
 
 def resolve(config: DictConfig) -> DictConfig:
     """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
-    if config.env.device == "auto" and config.collection is Collection.overlapped:
-        config.env.device = "cpu"
-        print("worlds: cpu (collection=overlapped)")
+    place_worlds(config)
     device = resolve_common(config, NUM_ENVS)
     size = config.model.size
     if size == "auto":
@@ -199,6 +199,7 @@ def resolve(config: DictConfig) -> DictConfig:
         print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
     config.model.size = size
     shorten_windows(config, device)
+    resolve_workers(config)
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
         if OmegaConf.is_missing(config.model, name):
@@ -250,7 +251,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     check_dreamer(config)
     own = share_of(config)
     lock = claim(config)
-    env = make_env(own)
+    env = make_own_env(own)
     with seeded(config.seed):
         agent = make_agent(own, Interface.of(env))
         losses = make_losses(agent, own.loss, own.model.imagination_horizon)
@@ -259,11 +260,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         print(begin_with(learner, config, env))
     seed_generators(own.seed)
     curriculum = make_curriculum(config)
-    policy = learner.policy()
-    overlapped = config.collection is Collection.overlapped
-    acting = acting_copy(policy) if overlapped else policy
-    collector = make_collector(own, env, acting)
-    rollouts = OverlappedRollouts(collector, acting, policy) if overlapped else None
+    collector, rollouts = make_rollouts(own, env, learner)
     latents = learner.latent_format if config.replay.context else None
     parts = {
         "replay": make_sequence_replay(own, env, curriculum, latents),

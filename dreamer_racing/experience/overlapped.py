@@ -8,12 +8,12 @@ generators, so two such runs differ from each other; without overlap they do not
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from tensordict import TensorDictBase
 
+from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.modules import DreamerPolicy
 
 
@@ -22,7 +22,7 @@ def acting_copy(policy: DreamerPolicy) -> DreamerPolicy:
     return copy.deepcopy(policy).requires_grad_(False)
 
 
-class OverlappedRollouts(Iterator[TensorDictBase]):
+class OverlappedRollouts(RolloutsAhead):
     """Collects one rollout ahead.
 
     Args:
@@ -57,10 +57,7 @@ class OverlappedRollouts(Iterator[TensorDictBase]):
         self._acting.load_state_dict(self._policy.state_dict())
 
     def drain(self) -> TensorDictBase | None:
-        """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.
-
-        What a checkpoint holds of replay, environment and collector then belongs together.
-        """
+        """Return the rollout under way, if there is one, and begin no other."""
         if self._next is None:
             return None
         rollout, self._next = self._next.result().clone(), None

@@ -31,7 +31,8 @@ class FlownPPOActorLoss(ClippedActorLoss):
     ``watch`` keeps a rollout with the latents that the policy saw and the distribution that it drew from, so that the
     ratio is right however old they are. Advantages are λ-returns of the rewards paid, less the critic's value, along
     all that is kept; the value of what comes after a step at which time ran out, or after the last one kept, is not
-    known and taken to be that of the step. ``forward`` imagines and judges, which teaches the critic.
+    known and taken to be that of the step; so it is where a rollout's worlds begin anew in the midst of an episode, as
+    those of a lost worker do. ``forward`` imagines and judges, which teaches the critic.
 
     Actions are kept as they were flown, clipped to [−1, 1], and weighed by ``ActionDistribution.log_prob_clipped``.
     The steps are buffers of the module, so a checkpoint holds them. They begin anew with another number of
@@ -81,6 +82,8 @@ class FlownPPOActorLoss(ClippedActorLoss):
             first -= rollout_steps
             for name in self.kept:
                 self.get_buffer(name)[:first] = self.get_buffer(name)[rollout_steps:].clone()
+        if first and (begins := rollout.get("is_init", None)) is not None:
+            self.done[first - 1] |= begins[:, 0].to(self.done.device)
         for name, value in steps.items():
             self.get_buffer(name)[first : first + len(value)] = value
         self._count(first + rollout_steps)

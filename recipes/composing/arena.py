@@ -50,8 +50,14 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
     }
 
 
-def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
-    """Make the environment to train in, with `env.num_envs` worlds or another number."""
+def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
+    """Make the environment to train in, with `env.num_envs` worlds or another number.
+
+    Args:
+        config: resolved.
+        num_envs: worlds; those of the configuration if None.
+        num_threads: that step and draw a race's worlds on a CPU; all that there are if None.
+    """
     env = config.env
     num_envs = num_envs or env.num_envs
     readers = privileged_losses(config) if isinstance(config, DreamerConfig) else []
@@ -66,6 +72,7 @@ def make_env(config: RunConfig, num_envs: int | None = None) -> Environment:
             miss_radius=env.miss_radius,
             looks=env.looks,
             seed=config.seed,
+            num_threads=num_threads,
             **worlds_of(config),
         )
     if readers:

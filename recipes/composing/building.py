@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
 from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name, worlds_device
 from composing.checks import refuse_to_replace
@@ -25,6 +25,7 @@ from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelRewar
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -51,6 +52,10 @@ from dreamer_racing.training.run import Report, Run
 R = TypeVar("R", bound=Run)
 OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
 """Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
+
+
+OF_WORLDS = ("env", "collector")
+"""Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
@@ -115,7 +120,7 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
     Worlds on a CPU have to wait for the actions of a policy on a CUDA device; beside it, all is in order by itself.
     """
     return Collector(
-        TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer())),
+        with_memory(env, policy.make_primer()),
         policy,
         frames_per_batch=config.env.num_envs * config.rollout_steps,
         total_frames=-1,
@@ -125,6 +130,11 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
         track_traj_ids=False,
         no_cuda_sync=env.device.type == "cuda",
     )
+
+
+def with_memory(env: Environment, primer: TensorDictPrimer) -> TransformedPixelEnv:
+    """Give an environment the keys of a policy's memory."""
+    return TransformedPixelEnv(env, Compose(InitTracker(), primer))
 
 
 def make_run_replay(
@@ -261,6 +271,19 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
+def begin_anew(
+    env: Environment,
+    curriculum: BodyRateCurriculum | None,
+    rollouts: Iterator[TensorDictBase] | None,
+    env_steps: int,
+) -> None:
+    """Tell worlds that begin anew, in the midst of a run, how far it is."""
+    if curriculum:
+        env.body_rate_weight = curriculum.body_rate_weight
+    if isinstance(rollouts, RayRollouts):
+        rollouts.begin_at(env_steps)
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -288,11 +311,13 @@ def assemble(
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
     directory = RunDirectory(lock.directory)
-    tracker = EpisodeTracker(env.batch_size.numel(), crash_causes(config))
+    tracker = EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
+    if isinstance(rollouts, RayRollouts):
+        del parts["env"], parts["collector"]  # workers have the worlds
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
@@ -300,11 +325,10 @@ def assemble(
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
-        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal"))
+        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WORLDS))
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
-        if curriculum:
-            env.body_rate_weight = curriculum.body_rate_weight  # of worlds that begin anew, too
+        begin_anew(env, curriculum, rollouts, counters["env_steps"])
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")

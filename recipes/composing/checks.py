@@ -14,6 +14,7 @@ from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
     Collection,
+    CollectorKind,
     DreamerConfig,
     ExperimentConfig,
     PPORunConfig,
@@ -26,6 +27,7 @@ from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, find_loss
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
@@ -201,6 +203,7 @@ def check_dreamer(config: DreamerConfig) -> None:
             f"and the first update needs windows of model.batch_length={model.batch_length}: prefill must be at least "
             f"{config.env.num_envs * model.batch_length}."
         )
+    check_workers(config)
     if config.collection is Collection.overlapped and not is_race(config):
         raise ValueError(
             f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
@@ -216,6 +219,42 @@ def check_dreamer(config: DreamerConfig) -> None:
             "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
         )
+
+
+def check_workers(config: DreamerConfig) -> None:
+    """Refuse workers beside other ways to collect, and worlds or weights that cannot be shared out among them.
+
+    Raises:
+        ValueError: the message names the settings.
+    """
+    workers, num_envs, asked = config.num_workers, config.env.num_envs, config.workers
+    if config.collector is not CollectorKind.ray:
+        if workers is not None:
+            raise ValueError(f"num_workers={workers} is for collector=ray: add that, or leave it out.")
+        return
+    assert workers is not None, "resolve_workers() fills them in"
+    assert asked.weight_interval is not None
+    if parallel.asked_for() > 1:
+        raise ValueError(
+            f"WORLD_SIZE={parallel.asked_for()} with collector=ray: workers fly for a single learner. Start it without "
+            "torchrun, or set collector=local."
+        )
+    if config.collection is not Collection.sync:
+        raise ValueError(
+            f"collection={config.collection.value} with collector=ray: workers fly during updates anyway. Leave one of "
+            "them out."
+        )
+    if num_envs % workers:
+        raise ValueError(
+            f"env.num_envs={num_envs} worlds cannot be shared equally by num_workers={workers}: make it a multiple, "
+            f"e.g. env.num_envs={-(-num_envs // workers) * workers}, or choose another number of workers."
+        )
+    if config.env.device != "cpu" and not asked.gpus:
+        raise ValueError(
+            f"env.device={config.env.device}, and workers.gpus=0 gives workers no GPU: give each one or a part of one, "
+            "e.g. workers.gpus=0.5, or set env.device=cpu."
+        )
+    check_interval(asked.weight_interval, num_envs * config.rollout_steps)
 
 
 def check_imagination(config: DreamerConfig) -> None:

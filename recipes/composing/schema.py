@@ -171,6 +171,26 @@ class Collection(Enum):
     overlapped = "overlapped"
 
 
+class CollectorKind(Enum):
+    """Who flies to learn."""
+
+    local = "local"
+    ray = "ray"
+
+
+@dataclass
+class WorkersConfig:
+    """Workers on a Ray cluster, with `collector=ray`."""
+
+    # local: a cluster started on this machine, for this run | auto: one that runs here | host:port of one
+    address: str = "local"
+    cpus: float = setting(1.0, POSITIVE)  # cores of each, may be a part of one; as many threads draw and step worlds
+    gpus: float = setting(0.0, NOT_NEGATIVE)  # of each, likewise; above 0 its policy and worlds live on a GPU
+    # env_steps that weights are old at most when what was flown with them is learned from; null: two rounds, the least
+    weight_interval: int | None = setting(None, COUNT)
+    patience: float = setting(600.0, POSITIVE)  # s to wait for a worker that was lost, before the run ends
+
+
 @dataclass
 class RunConfig:
     """What all training recipes have in common."""
@@ -218,6 +238,9 @@ class DreamerConfig(ReplayRunConfig):
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
     collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
+    collector: CollectorKind = CollectorKind.local  # ray: workers on a Ray cluster fly, also during updates
+    num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)

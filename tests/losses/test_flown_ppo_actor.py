@@ -83,6 +83,20 @@ def test_where_time_runs_out_the_value_stands_for_what_comes():
     torch.testing.assert_close(loss._return(loss._value())[0, 0, 0], reward + 0.9 * value)
 
 
+def test_an_episode_that_was_broken_off_ends_at_its_last_step():
+    """As of a lost worker, whose worlds begin anew with the next rollout; here of the second environment."""
+    learner = make_learner(ppo=replace(PPO, flown=8))
+    loss = actor_loss(learner)
+    first, second = make_rollout(learner, 2, 2), make_rollout(learner, 2, 2)
+    begins = torch.zeros(2, 2, 1, dtype=torch.bool)
+    loss.watch(first.set("is_init", begins))
+    loss.watch(second.set("is_init", begins.index_fill(0, torch.tensor(1), True)))
+    assert loss.done[:, :, 0].tolist() == [[False, False], [False, True], [False, False], [False, False]]
+    value = loss.critic.value(loss.features)
+    advantage = loss._return(loss._value()) - loss._value()
+    torch.testing.assert_close(advantage[1, 1], first["next", "reward"][1, 1] + 0.9 * value[1, 1] - value[1, 1])
+
+
 def test_the_actor_stands_still_until_enough_was_flown():
     learner = make_learner()
     loss = actor_loss(learner)

@@ -1,0 +1,122 @@
+"""Who flies to learn: this process, in turns with learning or beside it, or workers on a Ray cluster."""
+
+import copy
+from functools import partial
+from typing import cast
+
+import torch
+from omegaconf import DictConfig
+from torchrl.collectors import Collector
+from torchrl.envs import TensorDictPrimer
+
+from composing.arena import Environment, make_env, worlds_device
+from composing.building import make_collector, with_memory
+from composing.learners import make_agent
+from composing.schema import Collection, CollectorKind, DreamerConfig, is_race
+from dreamer_racing.experience import ray_cluster
+from dreamer_racing.experience.ahead import RolloutsAhead
+from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
+from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.experience.ray_rollouts import RayRollouts
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.learner import seeded
+from dreamer_racing.modules import DreamerPolicy, Interface
+
+NUM_WORKERS = 2
+OF_RACES = ("body_rate_weight", "worlds.start_on_line")
+"""What a run changes in its race on the way, by the curriculum and by a schedule."""
+
+
+def place_worlds(config: DictConfig) -> None:
+    """Choose where worlds live that do not live with the learner but with who flies them, and say so."""
+    if config.env.device != "auto":
+        return
+    if config.collection is Collection.overlapped:
+        config.env.device = "cpu"
+    elif config.collector is CollectorKind.ray:
+        config.env.device = worlds_device(torch.device("cuda" if config.workers.gpus else "cpu"), config.env)
+    else:
+        return
+    print(f"worlds: {config.env.device} (collection={config.collection.value}, collector={config.collector.value})")
+
+
+def resolve_workers(config: DictConfig) -> None:
+    """Fill in what is left open on workers, if there are any, and say what was chosen."""
+    if config.collector is not CollectorKind.ray:
+        return
+    asked = config.workers
+    if config.num_workers is None:
+        config.num_workers = NUM_WORKERS
+    if asked.weight_interval is None:
+        asked.weight_interval = 2 * config.env.num_envs * config.rollout_steps
+    print(
+        f"workers: {config.num_workers} on Ray (workers.address={asked.address}), each with "
+        f"{config.env.num_envs // config.num_workers} worlds, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at "
+        f"most {asked.weight_interval:,} env_steps old"
+    )
+
+
+def make_own_env(config: DreamerConfig) -> Environment:
+    """Make the environment of this process: its worlds to train in, or where workers fly, one to take their measure."""
+    return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
+
+
+def make_rollouts(
+    config: DreamerConfig, env: Environment, learner: DreamerLearner
+) -> tuple[Collector, RolloutsAhead | None]:
+    """Make the collector of a run, and the iterator over it if it is not the collector's own.
+
+    Raises:
+        ValueError: workers cannot be had; the message says what was found.
+    """
+    policy = learner.policy()
+    if config.collector is CollectorKind.ray:
+        return make_workers(config, env, policy)
+    if config.collection is Collection.sync:
+        return make_collector(config, env, policy), None
+    acting = acting_copy(policy)
+    collector = make_collector(config, env, acting)
+    return collector, OverlappedRollouts(collector, acting, policy)
+
+
+def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> tuple[Collector, RayRollouts]:
+    """Start workers on a Ray cluster, each with its share of the worlds."""
+    asked, workers = config.workers, cast(int, config.num_workers)
+    own = share_of_worker(config)
+    with seeded(config.seed):
+        agent = make_agent(own, Interface.of(env))  # its weights come with the first request
+    flying = DreamerPolicy(agent.world_model, agent.actor)
+    joined = ray_cluster.join(asked.address)
+    collector = ray_cluster.start_workers(
+        partial(make_worker_env, own, flying.make_primer()),
+        flying,
+        workers=workers,
+        share=ray_cluster.Share(asked.cpus, asked.gpus),
+        env_device=own.env.device,
+        frames=own.env.num_envs * config.rollout_steps,
+        seed=config.seed,
+    )
+    rollouts = RayRollouts(
+        collector,
+        policy,
+        env,
+        OF_RACES if is_race(config) else (),
+        weight_interval=cast(int, asked.weight_interval),
+        patience=asked.patience,
+        leaves=joined,
+    )
+    return collector, rollouts
+
+
+def share_of_worker(config: DreamerConfig) -> DreamerConfig:
+    """What one worker has of a run."""
+    own = copy.deepcopy(config)
+    own.env.num_envs = config.env.num_envs // cast(int, config.num_workers)
+    own.device = "cpu"  # where its policy comes from; the collector takes it to the worker's device
+    own.env.device = "cpu" if config.env.device == "cpu" else "cuda"  # Ray shows a worker its own alone
+    return own
+
+
+def make_worker_env(config: DreamerConfig, primer: TensorDictPrimer) -> TransformedPixelEnv:
+    """Make a worker's worlds, there."""
+    return with_memory(make_env(config, num_threads=max(1, int(config.workers.cpus))), primer)

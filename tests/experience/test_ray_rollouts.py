@@ -1,0 +1,228 @@
+"""Collection by workers on a real Ray cluster, one of which is killed on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from types import ModuleType
+from typing import NamedTuple
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.experience.ray_cluster import Share, start_workers
+from dreamer_racing.experience.ray_rollouts import RayRollouts, check_interval
+from dreamer_racing.experience.ray_worker import RayWorker, Request
+from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.modules import DreamerPolicy, Interface
+from dreamer_racing.training.episodes import EpisodeTracker
+from tests.dreamers import learner_of
+from tests.ray_workers import small_race, worlds_of_worker
+
+N, W, T = 4, 2, 5
+FRAMES = N * T  # of a round
+SEED, ROUNDS, KILLED_AFTER = 3, 9, 4
+INTERVAL = 3 * FRAMES
+TAKEN_AT = [0, 0, 0, 2, 2, 4, 4, 6, 6]
+"""Rounds learned from when the weights of each round were taken: at its end these are 3 rounds old at most."""
+
+
+class Flown(NamedTuple):
+    """What came of it."""
+
+    rounds: list[TensorDictBase]  # each [N, T]
+    ages: list[int]
+    processes: list[list[tuple[str, int]]]
+    rollouts: RayRollouts
+    drained: TensorDictBase | None
+
+    @property
+    def lost_in(self) -> int:
+        """The first round that worker 1's successor flew: the one under way at the kill, unless that was flown."""
+        return next(number for number, now in enumerate(self.processes) if now[1] != self.processes[0][1])
+
+
+def policy_of(env: DroneRacingEnv) -> DreamerPolicy:
+    return learner_of("debug", Interface.of(env), seed=0).policy()
+
+
+@torch.no_grad()
+def learn(policy: DreamerPolicy, env: DroneRacingEnv) -> None:
+    """Change the weights, and b₂."""
+    for parameter in policy.parameters():
+        parameter.add_(0.01)
+    env.body_rate_weight += 0.001
+
+
+def after(rounds: int, env: DroneRacingEnv) -> DreamerPolicy:
+    """The policy after learning from so many rounds, and the environment too."""
+    policy, env.body_rate_weight = policy_of(env), 0.0
+    for _ in range(rounds):
+        learn(policy, env)
+    return policy
+
+
+@pytest.fixture(scope="module")
+def flown(ray_cluster: None) -> Iterator[Flown]:
+    """Rounds with a learner that changes its weights; worker 1 is killed while one is under way."""
+    env = small_race(1)
+    policy = after(0, env)
+    collector = start_workers(
+        partial(worlds_of_worker, N // W, policy.make_primer()), policy_of(env), workers=W, share=Share(1.0, 0.0),
+        env_device="cpu", frames=FRAMES // W, seed=SEED,
+    )  # fmt: skip
+    settings = ("body_rate_weight", "worlds.start_on_line")
+    rollouts = RayRollouts(collector, policy, env, settings, weight_interval=INTERVAL, patience=120.0, leaves=False)
+    rounds, ages, processes = list[TensorDictBase](), list[int](), list[list[tuple[str, int]]]()
+    for number in range(ROUNDS):
+        rounds.append(next(rollouts))
+        ages.append(rollouts.weights_age)
+        processes.append(rollouts.processes)
+        if number == KILLED_AFTER - 1:
+            os.kill(rollouts.processes[1][1], signal.SIGKILL)
+        learn(policy, env)
+    drained = rollouts.drain()
+    yield Flown(rounds, ages, processes, rollouts, drained)
+    rollouts.close()
+
+
+def requests(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
+    """What workers have to be asked for, by hand: b₂ as it was when the round before arrived, weights as stated."""
+    monkeypatch.setattr("ray.get", lambda weights: weights)  # they are here
+    env = small_race(1)
+    asked = []
+    for number, taken_at in enumerate(TAKEN_AT):
+        weights = TensorDict.from_module(after(taken_at, env)).data.clone()
+        after(max(0, number - 1), env)
+        settings = {"body_rate_weight": env.body_rate_weight, "worlds.start_on_line": 0.0}
+        asked.append(Request(number, [weights], taken_at * FRAMES, settings))
+    return asked
+
+
+def twin(worker: int) -> RayWorker:
+    """What a worker is, in this process."""
+    policy = policy_of(small_race(1))
+    return RayWorker(
+        partial(worlds_of_worker, N // W, policy.make_primer()), policy, frames_per_batch=FRAMES // W, total_frames=-1,
+        seed=SEED + 1_000_000 * (worker + 1), track_traj_ids=False,
+    )  # fmt: skip
+
+
+def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
+    for key in ("vector", "action", "is_init", "belief", ("next", "reward"), ("next", "done"), ("next", "vector")):
+        assert torch.equal(one[key], other[key]), key
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same seeds, weights and b₂, bit for bit; a worker that was begun anew, as one with a seed of its own."""
+    asked, worlds = requests(monkeypatch), N // W
+    with torch.random.fork_rng():
+        survivor = twin(0)
+        for number, request in enumerate(asked):
+            assert_same(flown.rounds[number][:worlds], survivor.fly(request).rollout)
+        lost = twin(1)
+        for number, request in enumerate(asked[: flown.lost_in]):
+            assert_same(flown.rounds[number][worlds:], lost.fly(request).rollout)
+        successor = twin(1)
+        for number, request in enumerate(asked[flown.lost_in :], flown.lost_in):
+            assert_same(flown.rounds[number][worlds:], successor.fly(request).rollout)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_a_worker_that_is_killed_is_replaced_and_no_frame_is_lost_or_counted_twice(flown: Flown) -> None:
+    assert flown.rollouts.lost == 1 and flown.rollouts.rounds == ROUNDS + 1
+    assert flown.lost_in in (KILLED_AFTER, KILLED_AFTER + 1)
+    assert {processes[0] for processes in flown.processes} == {flown.processes[0][0]}, "the other one flew on"
+    assert flown.drained is not None and flown.rollouts.drain() is None
+    rounds = [*flown.rounds, flown.drained]
+    assert all(rollout.shape == (N, T) for rollout in rounds)
+    path = torch.cat(rounds, 1)  # [N, 10 T]
+    begins, ended = path["is_init"][:, 1:, 0], path["next", "done"][:, :-1, 0]
+    broken = torch.zeros_like(begins)
+    broken[N // W :, flown.lost_in * T - 1] = True  # the lost worker's worlds, before what its successor flew
+    assert torch.equal(begins, ended | broken) and (ended & ~broken).any()
+    goes_on = ~begins
+    for key in ("vector", "belief", "state", "previous_action"):
+        assert torch.equal(path["next", key][:, :-1][goes_on], path[key][:, 1:][goes_on]), key
+
+    replay, tracker = make_replay(4000, N, 2, 4, observation_keys=("vector",)), EpisodeTracker(N)
+    lengths = []
+    for rollout in rounds:
+        replay.extend(rollout)
+        lengths += tracker.update(rollout)["length"].tolist()
+    assert len(replay) == path.numel() + int(path["is_init"].sum()), "a record for each step, and one for each start"
+    assert max(lengths) <= 12, "no episode is counted on over the loss"
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_weights_are_no_older_than_stated_and_sent_no_sooner_than_needed(flown: Flown) -> None:
+    assert flown.ages == [FRAMES * (number + 1 - taken_at) for number, taken_at in enumerate(TAKEN_AT)]
+    assert max(flown.ages) == INTERVAL
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_more_workers_than_there_is_room_for_are_refused(flown: Flown) -> None:
+    env = small_race(1)
+    policy = policy_of(env)
+    words = r"num_workers=1 with workers\.cpus=1 need 1 CPUs, and the Ray cluster has 2, of which 0 are free"
+    with pytest.raises(ValueError, match=words):
+        start_workers(
+            partial(worlds_of_worker, 1, policy.make_primer()), policy, workers=1, share=Share(1.0, 0.0),
+            env_device="cpu", frames=1, seed=0,
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_an_error_in_flight_is_raised_as_it_is(flown: Flown) -> None:
+    """And is no loss, after which Ray would ask again."""
+    ray = pytest.importorskip("ray")
+    wrong = Request(ROUNDS + 1, [], 0, {"nowhere.at_all": 1})
+    with pytest.raises(AttributeError, match="nowhere"):
+        ray.get(flown.rollouts._workers[0].fly.remote(wrong), timeout=60)
+
+
+def without_a_renderer() -> None:
+    raise RuntimeError("EGL is not there")
+
+
+def of_the_learner_alone() -> None:
+    """Not to be found where workers are."""
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+@pytest.mark.parametrize(
+    ("make_env", "words"),
+    [
+        (of_the_learner_alone, r"node .* cannot have a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
+        (without_a_renderer, r"a worker could not begin \(.*EGL is not there\)"),
+    ],
+)
+def test_what_workers_cannot_be_made_of_is_refused_at_once(
+    ray_cluster: None, make_env: Callable[[], None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(of_the_learner_alone, "__module__", "here_alone")
+    here_alone = ModuleType("here_alone")
+    here_alone.of_the_learner_alone = of_the_learner_alone  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "here_alone", here_alone)
+    with pytest.raises(ValueError, match=words):
+        start_workers(
+            make_env, policy_of(small_race(1)), workers=1, share=Share(0.0, 0.0), env_device="cpu", frames=1, seed=0
+        )
+
+
+def test_weights_newer_than_a_round_ahead_are_refused() -> None:
+    check_interval(2 * FRAMES, FRAMES)
+    with pytest.raises(ValueError, match=rf"workers\.weight_interval=39: a round .* {FRAMES} .* 40 env_steps old"):
+        check_interval(2 * FRAMES - 1, FRAMES)

@@ -1,0 +1,20 @@
+"""Worlds for workers of tests, which import this file by its name."""
+
+from __future__ import annotations
+
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer
+
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+
+
+def small_race(num_envs: int) -> DroneRacingEnv:
+    """Worlds with short episodes and no images."""
+    return DroneRacingEnv(
+        "circle", num_envs, from_pixels=False, privileged=False, seed=0, episode_steps=12, num_threads=1
+    )
+
+
+def worlds_of_worker(num_envs: int, primer: TensorDictPrimer) -> TransformedPixelEnv:
+    """The same, with the keys of a policy's memory."""
+    return TransformedPixelEnv(small_race(num_envs), Compose(InitTracker(), primer))
