@@ -102,7 +102,7 @@ def filling(self, rollout):
 run.Run.take_in = filling
 """
 """No file can grow beyond 100 bytes from 412 env_steps on, until there is room again."""
-WITH_FILMS = [*SMALL, "prefill=200", "evaluation.video_steps=20", "logger=tensorboard"]
+WITH_FILMS = [*SMALL, "prefill=200", "model.replay_ratio=1", "evaluation.video_steps=20", "logger=tensorboard"]
 
 
 @pytest.mark.parametrize("until", [700, 10_000], ids=["for a while", "to the end"])

@@ -36,7 +36,7 @@ BASELINE = [
 ]  # fmt: skip
 SMALL = {
     "ppo": ["rollout_steps=16", "ppo.epochs=2"],
-    "sac": ["prefill=64", "replay.capacity=1200", "sac.batch_size=16", "sac.replay_ratio=8"],
+    "sac": ["prefill=64", "replay.capacity=1200", "sac.batch_size=16", "sac.replay_ratio=4"],
 }
 """What makes a baseline's run short."""
 
