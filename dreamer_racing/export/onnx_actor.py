@@ -68,7 +68,8 @@ class RecurrentActor:
 
     Attributes:
         contract: As given.
-        state: What goes into the next step: ``h`` (1, D), ``z`` (1, S) and ``previous_action`` (1, A), float32.
+        state: What goes into the next step: ``h`` (1, D), ``z`` (1, S) and ``previous_action`` (1, A), float32. To be
+            set by hand before `prepare`, if at all.
         is_init: Whether the next step is an episode's first.
     """
 
@@ -197,11 +198,11 @@ class OnnxActor(RecurrentActor):
     def reset(self) -> None:
         """Begin an episode: the next step forgets everything before it."""
         super().reset()
-        self._next_h = self._first_h
+        self._next_h = None
 
     def prepare(self) -> None:
         """Advance the belief, which needs no observation; where the actor is one piece, do nothing."""
-        if self.in_parts and self._next_h is None:
+        if self.in_parts and self._next_h is None and not self.is_init:
             self._next_h = self._advance()
 
     def _check_files(self, path: Path) -> None:
@@ -250,7 +251,10 @@ class OnnxActor(RecurrentActor):
         if not self.in_parts:
             outputs: Sequence[np.ndarray] = self._sessions["step"].run(self._outputs, feed)
             return outputs
-        belief = self._advance() if self._next_h is None else self._next_h
+        if self.is_init and self._first_h is not None:
+            belief = self._first_h.copy()
+        else:
+            belief = self._advance() if self._next_h is None else self._next_h
         self._next_h = None
         seen = {name: value for name, value in feed.items() if name not in (*RECURRENT, "is_init")}
         action, state = self._sessions["act"].run(PARTS["act"], {**seen, "h_next": belief})
@@ -313,6 +317,8 @@ def _unfit(contract: dict[str, Any]) -> str:
     names = [entry["name"] for entry in contract["inputs"]]
     if absent := [name for name in (*RECURRENT, "is_init") if name not in names]:
         return f"inputs lacks {', '.join(absent)}"
+    if len(parts := contract["files"].keys() & PARTS.keys()) == 1:
+        return f"files has {next(iter(parts))} alone of {' and '.join(PARTS)}"
     if len(set(names)) < len(names):
         return "inputs has a name twice"
     for name, shape, kind in ((entry["name"], entry["shape"], entry["type"]) for entry in contract["inputs"]):

@@ -214,11 +214,12 @@ class FlightLoop:
         sent = self._watchdog.send(outputs.verdict.command)
         self._dropped = not sent
         done = self._clock.now()
-        self._chain.prepare()
-        self.statistics.prepare.append(self._clock.now() - done)
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
         self._show(inputs, outputs, took, sent)
+        shown = self._clock.now()
+        self._chain.prepare()
+        self.statistics.prepare.append(self._clock.now() - shown)
         return outputs
 
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
