@@ -93,18 +93,7 @@ def main() -> None:
     if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
         parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
     if arguments.launches:
-        unused = ("backends", "peers", "device", "mixed_precision", "few_kernels", "image_size", "threads", "updates")
-        if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
-            parser.error(f"--launches counts kernels of both ways on a CPU: no --{given[0].replace('_', '-')} with it.")
-        counted = [
-            count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
-            for size in arguments.sizes
-            for loss in arguments.losses
-            for actor in arguments.actor_losses
-            for few in (False, True)
-        ]
-        print_table(counted, LAUNCHES)
-        write_json(counted, arguments.json)
+        print_launches(parser, arguments)
         return
     shared = (tuple(arguments.batch), arguments.horizon, arguments.device, arguments.threads, arguments.updates)
     few_kernels = True if arguments.few_kernels else None
@@ -144,6 +133,22 @@ def main() -> None:
             print_table(records[-1:], COLUMNS)
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
+
+
+def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Count what a CUDA device would launch, with few kernels and without."""
+    unused = ("backends", "peers", "device", "mixed_precision", "few_kernels", "image_size", "threads", "updates")
+    if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
+        parser.error(f"--launches counts kernels of both ways on a CPU: no --{given[0].replace('_', '-')} with it.")
+    counted = [
+        count_launches(size, loss, actor, arguments.batch, arguments.horizon, few)
+        for size in arguments.sizes
+        for loss in arguments.losses
+        for actor in arguments.actor_losses
+        for few in (False, True)
+    ]
+    print_table(counted, LAUNCHES)
+    write_json(counted, arguments.json)
 
 
 @dataclass(frozen=True)
