@@ -240,12 +240,20 @@ def check_output(output: str | Path) -> Path:
         reason = error.__cause__ or error
         raise PermissionError(f"output={output}: cannot write to its folder ({reason}).") from error
     contract = output.parent / CONTRACT
-    if contract.exists() and not output.exists():
+    if contract.exists() and _described(contract) != output.name:
         raise ValueError(
             f"output={output}: {contract} describes another actor. Every actor has a folder of its own: choose another "
             "folder, or remove that export."
         )
     return output
+
+
+def _described(contract: Path) -> str | None:
+    """Return the name of the ``.onnx`` file that a contract describes; None if it cannot be read off it."""
+    try:
+        return json.loads(contract.read_text(encoding="utf-8"))["files"]["onnx"]["name"]
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def export_actor(

@@ -17,7 +17,7 @@ import torch
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.actor_step import WEIGHTS
 from dreamer_racing.export.contract import describe_camera, hash_tensors
-from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
+from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, read_contract
 from dreamer_racing.export.weights_file import read_weights
 from dreamer_racing.modules import DreamerPolicy, Interface, ModelSize
 from dreamer_racing.modules.agent import Agent
@@ -123,6 +123,7 @@ class ShippedAgent:
         """
         folder, device = Path(folder), torch.device(device)
         about, contract = read_about(folder), read_contract(folder / CONTRACT)
+        _refuse_lacking(folder, *(file["name"] for part in PARTS if (file := contract["files"].get(part))))
         check_env(folder, contract, env)
         agent = Agent(_size(contract["model"]), Interface.of(env), decode=False)
         for name in _ABSENT:
@@ -179,12 +180,16 @@ def read_about(folder: str | Path) -> dict[str, Any]:
         ValueError: If agent.json is not readable.
     """
     folder = Path(folder)
-    if missing := [name for name in FILES if not (folder / name).is_file()]:
-        raise FileNotFoundError(f"The agent {folder} lacks {', '.join(missing)}: copy the whole folder again.")
+    _refuse_lacking(folder, *FILES)
     try:
         return json.loads((folder / AGENT).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{folder / AGENT} is not valid JSON: {error}.") from error
+
+
+def _refuse_lacking(folder: Path, *names: str) -> None:
+    if missing := [name for name in names if not (folder / name).is_file()]:
+        raise FileNotFoundError(f"The agent {folder} lacks {', '.join(missing)}: copy the whole folder again.")
 
 
 def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv) -> None:

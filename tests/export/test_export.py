@@ -569,6 +569,11 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
     (tmp_path / "contract.json").write_text("{}")
     with pytest.raises(ValueError, match="describes another actor"):
         check_output(tmp_path / "actor.onnx")
+    (tmp_path / "contract.json").write_text('{"files": {"onnx": {"name": "actor.onnx"}}}')
+    (tmp_path / "actor_act.onnx").touch()  # a part of that actor
+    with pytest.raises(ValueError, match="describes another actor"):
+        check_output(tmp_path / "actor_act.onnx")
+    assert check_output(tmp_path / "actor.onnx") == tmp_path / "actor.onnx"
     step = ActorStep(agent)
     with pytest.raises(ValueError, match="steps=199: .* at least 200"):
         export_actor(step, contract_of(step), make_flight(agent, 199), tmp_path / "new" / "actor.onnx")

@@ -183,6 +183,13 @@ def alter_weight(folder: Path) -> None:
     write_weights(folder / "weights.safetensors", weights)
 
 
+def name_parts(folder: Path) -> None:
+    contract = json.loads((folder / "contract.json").read_text())
+    for part in ("advance", "act"):
+        contract["files"][part] = {"name": f"actor_{part}.onnx", "sha256": ""}
+    (folder / "contract.json").write_text(json.dumps(contract))
+
+
 def leave_out(folder: Path) -> None:
     weights = read_weights(folder / "weights.safetensors")
     del weights["actor.mlp.output.bias"]
@@ -196,9 +203,10 @@ def leave_out(folder: Path) -> None:
         (alter_weight, ValueError, "weights.safetensors holds other weights than .*contract.json"),
         (leave_out, ValueError, "weights.safetensors does not fit (?s:.*)mlp.output.bias"),
         (lambda folder: (folder / "contract.json").unlink(), FileNotFoundError, "lacks contract.json"),
+        (name_parts, FileNotFoundError, "lacks actor_advance.onnx, actor_act.onnx"),
         (lambda folder: (folder / "agent.json").write_text("{"), ValueError, "agent.json is not valid JSON"),
     ],
-    ids=["cut off", "altered", "left out", "file", "json"],
+    ids=["cut off", "altered", "left out", "file", "parts", "json"],
 )
 def test_a_broken_folder_is_refused(
     spoil: Callable[[Path], None],
