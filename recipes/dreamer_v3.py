@@ -63,6 +63,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 450  # env_steps/s of tuned=race on one core with bfloat16 and AMX, two runs side by side (entry 20)
+FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
 
 register()
@@ -215,9 +216,10 @@ def resolve(config: DictConfig) -> DictConfig:
     if config.tuned == "race":
         hours = config.total_env_steps / RACE_SPEED / 3600
         print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
-    if config.env.num_envs == 1 and config.replay.held_out:
-        print("held out: nothing, because there is a single world (replay.held_out=0, schedule.wait_for_model=null)")
-        config.replay.held_out, config.schedule.wait_for_model = 0, None
+    if config.replay.held_out is None:
+        config.replay.held_out = int(config.env.num_envs >= FEW_WORLDS)
+        if not config.replay.held_out:
+            print(f"held out: nothing, because there are only {config.env.num_envs} worlds (replay.held_out=null)")
     return config
 
 

@@ -209,6 +209,7 @@ def make_sequence_replay(
 ) -> StreamReplay:
     """Make the replay of a world model, with the latents beside its records if they are kept."""
     asked = config.replay
+    assert asked.held_out is not None, "resolve() says"
     return make_run_replay(
         config,
         env,

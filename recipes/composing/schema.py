@@ -109,8 +109,8 @@ class ReplayConfig:
 class SequenceReplayConfig(ReplayConfig):
     """The replay buffer of a world model."""
 
-    # worlds whose records are never trained on, to measure the model; 0 of a single world
-    held_out: int = setting(1, NOT_NEGATIVE)
+    # worlds whose records are never trained on, to measure the model; null: one where four or more fly, else none
+    held_out: int | None = setting(None, NOT_NEGATIVE)
     recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
     recent_records: int = setting(20_000, COUNT)  # how many those are
     # windows go on from stored latents, refreshed at each update, instead of from none; null: where the recipe shortens

@@ -53,6 +53,7 @@ def share_of(config: DreamerConfig) -> DreamerConfig:
     for name in ROUNDED_DOWN:
         part, key = _place(own, name)
         setattr(part, key, getattr(part, key) // processes)
+    assert config.replay.held_out is not None, "resolve() says"
     if config.replay.held_out >= own.env.num_envs:
         raise ValueError(
             f"replay.held_out={config.replay.held_out} worlds are of the first process, which has {own.env.num_envs} "

@@ -157,12 +157,13 @@ def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
     assert OmegaConf.load(tmp_path / "config.yaml").model.batch_length == 16
 
 
-def test_a_single_world_holds_nothing_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[str]) -> None:
     dreamer = recipe_module("dreamer_v3")
-    for num_envs, held_out in ((1, 0), (2, 1)):
-        config = dreamer.resolve(compose("dreamer_v3", "model=debug", f"env.num_envs={num_envs}"))
+    for num_envs, asked, held_out in ((2, "null", 0), (2, "1", 1), (4, "null", 1), (4, "0", 0)):
+        given = (f"env.num_envs={num_envs}", f"replay.held_out={asked}")
+        config = dreamer.resolve(compose("dreamer_v3", "model=debug", *given))
         assert config.replay.held_out == held_out
-        assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 1)
+        assert ("held out: nothing" in capsys.readouterr().out) == (num_envs == 2 and asked == "null")
 
 
 @pytest.mark.parametrize(
