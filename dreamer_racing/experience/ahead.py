@@ -1,13 +1,30 @@
 """Rollouts that are collected while those before them are learned from."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from tensordict import TensorDictBase
 
 
 class RolloutsAhead(Iterator[TensorDictBase]):
-    """Rollouts ``[N, T]``, of which after each ``next()`` one more is under way."""
+    """Rollouts ``[N, T]``, of which after each ``next()`` one more is under way.
+
+    Who takes them learns from what was delivered before the next ``next()``.
+
+    Attributes:
+        has_worlds: Whether the worlds that are flown live in this process, and are saved with the run.
+        stopping: Whether to end soon, without what is under way if that takes long; settable.
+    """
+
+    has_worlds = True
+    stopping: Callable[[], bool] = staticmethod(lambda: False)
+
+    def metrics(self) -> dict[str, float]:
+        """Return what is to be said of the rollout that was delivered last."""
+        return {}
+
+    def begin_at(self, env_steps: int) -> None:
+        """Go on with a run that has made so many env_steps."""
 
     @abstractmethod
     def drain(self) -> TensorDictBase | None:

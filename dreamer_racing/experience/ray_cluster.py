@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
 import os
+import re
+import socket
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from torchrl.envs import EnvBase
@@ -23,6 +25,7 @@ if TYPE_CHECKING:  # which imports Ray where it is installed, and that takes a s
 
 SEEDS_APART = 1_000_000
 """Between the seeds of two workers."""
+KNOCK, TRY = 5.0, 120.0  # s to wait for an answer of a cluster's head, and of each node that a worker can be had there
 
 
 class Share(NamedTuple):
@@ -63,14 +66,22 @@ def join(address: str) -> bool:
         return False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     try:
+        _knock(address)
         ray.init(address=address, include_dashboard=False, logging_level=logging.WARNING)
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise ValueError(
-            f"workers.address={address}: no Ray cluster could be joined there ({_in_a_line(error)}). Start one of the "
+            f"workers.address={address}: no Ray cluster could be joined there ({in_a_line(error)}). Start one of the "
             "same versions of Python and Ray, ray start --head, and give its address, or have one started on this "
             "machine by workers.address=local."
         ) from error
     return True
+
+
+def _knock(address: str) -> None:
+    """Raise ``OSError`` if nobody answers at ``host:port``, where Ray would try for minutes."""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit() and "/" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), KNOCK).close()
 
 
 def leave() -> None:
@@ -80,21 +91,23 @@ def leave() -> None:
     ray.shutdown()
 
 
-def resources() -> tuple[dict[str, float], dict[str, float]]:
-    """Return what the cluster has in all, and what of it is free: ``CPU``, ``GPU`` and others."""
+def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Return what each node of the cluster has, and what of all of it is free: ``CPU``, ``GPU`` and others."""
     import ray
 
-    return ray.cluster_resources(), ray.available_resources()
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]], ray.available_resources()
 
 
-def check_resources(workers: int, share: Share, total: Mapping[str, float], free: Mapping[str, float]) -> None:
+def check_resources(
+    workers: int, share: Share, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
+) -> None:
     """Refuse to wait for what a cluster does not have.
 
     Args:
         workers: how many.
         share: of each.
-        total: resources of the cluster.
-        free: what of them nobody uses.
+        nodes: resources of each node.
+        free: what of them all nobody uses.
 
     Raises:
         ValueError: the message gives what is needed and what is there.
@@ -104,9 +117,31 @@ def check_resources(workers: int, share: Share, total: Mapping[str, float], free
         if needed > there:
             raise ValueError(
                 f"num_workers={workers} with {setting}={each:g} need {needed:g} {name}s, and the Ray cluster has "
-                f"{total.get(name, 0.0):g}, of which {there:g} are free: lower num_workers or {setting}, or add nodes "
-                "to the cluster."
+                f"{sum(node.get(name, 0.0) for node in nodes):g}, of which {there:g} are free: lower num_workers or "
+                f"{setting}, or add nodes to the cluster."
             )
+    if (room := sum(places(share, node) for node in nodes)) < workers:
+        raise ValueError(
+            f"num_workers={workers} with workers.cpus={share.cpus:g} and workers.gpus={share.gpus:g}: a worker cannot "
+            f"be spread over nodes or GPUs, and there is room for {room} of them on the cluster's {len(nodes)} nodes. "
+            "Lower num_workers, or the share of each so that several fit."
+        )
+
+
+def places(share: Share, node: Mapping[str, float]) -> int:
+    """How many workers a node with such resources can have, if nothing else is there.
+
+    Example:
+        >>> places(Share(cpus=2.0, gpus=0.6), {"CPU": 16.0, "GPU": 2.0})  # one on each GPU
+        2
+    """
+    cpus, gpus = (round(node.get(name, 0.0), 4) for name in ("CPU", "GPU"))
+    by_cpus = math.floor(cpus / share.cpus + 1e-6)
+    if not share.gpus:
+        return by_cpus
+    on_one = math.floor(1.0 / share.gpus + 1e-6)
+    by_gpus = math.floor(gpus) * on_one if on_one else math.floor(gpus / share.gpus)
+    return min(by_cpus, by_gpus)
 
 
 def start_workers(
@@ -140,7 +175,7 @@ def start_workers(
     from torchrl.collectors.distributed import RayCollector
 
     _await_room(workers, share)
-    check_nodes(make_env, policy)
+    check_nodes(share, make_env, policy)
     try:
         return RayCollector(
             make_env,
@@ -158,17 +193,16 @@ def start_workers(
             storing_device="cpu",
         )
     except ray.exceptions.RayActorError as error:
-        raise ValueError(
-            f"collector=ray: a worker could not begin ({_in_a_line(error, last=True)}). Its worlds are made there as "
-            "they would be here: look for what that node lacks, e.g. a renderer (env.renderer=)."
-        ) from error
+        raise ValueError(f"collector=ray: a worker could not begin ({in_a_line(error, last=True)}).") from error
 
 
-def check_nodes(*parts: object) -> None:
-    """Refuse nodes that could not have a worker: Ray would begin one there again and again.
+def check_nodes(share: Share, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
+    """Refuse nodes that could not have a worker: Ray would begin one there again and again, without a word.
 
     Args:
-        parts: what a worker is made of, which every node must be able to unpickle.
+        share: of each worker.
+        make_env: makes its worlds; every node must be able to.
+        policy: what flies them; every node must be able to unpickle it.
 
     Raises:
         ValueError: the message names the node, and what is wrong there.
@@ -176,19 +210,23 @@ def check_nodes(*parts: object) -> None:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    ask = ray.remote(num_cpus=0, max_retries=0)(_versions_with)
-    nodes = {node["NodeID"]: node["NodeManagerHostname"] for node in ray.nodes() if node["Alive"]}
-    there = {node: NodeAffinitySchedulingStrategy(node, soft=False) for node in nodes}
-    answers = {node: ask.options(scheduling_strategy=there[node]).remote(*parts) for node in nodes}
-    for node, name in nodes.items():
+    ask, here = ray.remote(max_retries=0)(_try_out), versions()
+    asked = []
+    for node in ray.nodes():
+        if node["Alive"] and places(share, node["Resources"]):
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            options = ask.options(num_cpus=share.cpus, num_gpus=share.gpus, scheduling_strategy=there)
+            asked.append((node["NodeManagerHostname"], options.remote(make_env, policy)))
+    for name, answer in asked:
         try:
-            found = ray.get(answers[node])
+            found = ray.get(answer, timeout=TRY)
         except ray.exceptions.RayError as error:
             raise ValueError(
-                f"collector=ray: node {name} cannot have a worker ({_in_a_line(error, last=True)}). Every node of the "
-                "cluster needs this project in the same version, at the same place or installed."
+                f"collector=ray: node {name} cannot have a worker ({in_a_line(error, last=True)}). Every node of the "
+                "cluster needs this project in the same version at the same path, and all that worlds are made of "
+                "here, e.g. a renderer (env.renderer=)."
             ) from error
-        check_versions(name, found, versions())
+        check_versions(name, found, here)
 
 
 def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str, str | None]) -> None:
@@ -209,21 +247,27 @@ def check_versions(node: str, found: Mapping[str, str | None], here: Mapping[str
         )
 
 
-def _versions_with(*parts: object) -> dict[str, str | None]:
-    """Return versions, where the parts could be unpickled."""
+def _try_out(make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> dict[str, str | None]:
+    """Make the worlds of a worker, where the policy could be unpickled, too; return versions."""
+    make_env().close()
     return versions()
 
 
 def _await_room(workers: int, share: Share) -> None:
     """Check resources, once those of a run that has just ended are back."""
-    for _ in range(10):
-        with suppress(ValueError):
-            return check_resources(workers, share, *resources())
-        time.sleep(0.5)
-    return check_resources(workers, share, *resources())
+    for left in reversed(range(10)):
+        try:
+            check_resources(workers, share, *resources())
+        except ValueError:
+            if not left:
+                raise
+            time.sleep(0.5)
+        else:
+            return
 
 
-def _in_a_line(error: Exception, last: bool = False) -> str:
+def in_a_line(error: Exception, last: bool = False) -> str:
     """The first words of an error's message, or its last line, where a traceback ends."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))  # colours
+    lines = [line.strip() for line in plain.splitlines() if line.strip()]
     return (lines[-1] if last else " ".join(lines))[:300].rstrip(".") if lines else type(error).__name__

@@ -42,11 +42,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LOOK = 1.0  # s between looks at whether workers have answered, or the run is to stop
 REMIND = 30.0  # s, after which it is said that workers are waited for
+FAREWELL = 10.0  # s that a run which is to stop waits for the round under way
 
 
-class WorkerLostError(RuntimeError):
-    """A worker is gone and does not come back; the message says what to do."""
+class WorkerError(RuntimeError):
+    """A worker failed, or is gone and does not come back: its round is given up, all before it was delivered."""
 
 
 class RayRollouts(RolloutsAhead):
@@ -59,19 +61,21 @@ class RayRollouts(RolloutsAhead):
         settings: Which those are, by dotted name.
         weight_interval: env_steps that weights may be old at most when the last frame flown with them is learned from,
             this rollout's counted. At least two rounds; new ones are sent no sooner than needed.
-        patience: s to wait for a worker that does not answer.
+        patience: s to wait for a round.
         leaves: Whether `close` parts from the cluster.
 
     Attributes:
         rounds: Delivered so far in the run.
         lost: How often a worker died in this process's time and another took its place.
-        weights_age: env_steps, of the round delivered last: of its oldest weights.
+        weights_age: env_steps, of the round delivered last: of its weights.
         processes: Host and process id of each worker, as of that round.
         seconds: Of that round, how long the slowest worker flew.
 
     Raises:
         ValueError: If no weights could be as new as ``weight_interval`` asks.
     """
+
+    has_worlds = False
 
     def __init__(
         self,
@@ -91,8 +95,8 @@ class RayRollouts(RolloutsAhead):
         self._interval, self._patience, self._leaves = weight_interval, patience, leaves
         self._asked: list[Any] = []  # references to flights, one of each worker
         self._weights: Any = None  # a reference
-        self._taken_at = 0
-        self._all_flew = False
+        self._taken_at = self._flown_with = 0  # env_steps learned from when weights were taken: newest, under way
+        self._all_flew = self._is_over = False
         self.rounds = self.lost = self.weights_age = 0
         self.processes: list[tuple[str, int]] = []
         self.seconds = 0.0
@@ -101,22 +105,27 @@ class RayRollouts(RolloutsAhead):
         """Return the round that was flown meanwhile, ``[N, T]``, and ask for the next.
 
         Raises:
-            WorkerLostError: It cannot be had.
+            WorkerError: It cannot be had.
+            StopIteration: It took too long for a run that is to stop, or one before was given up.
         """
-        if not self._asked:
+        if not self._asked and not self._is_over:
             self._ask(self.rounds)
         rollout = self._receive()
+        if rollout is None:
+            raise StopIteration
         self._ask(self.rounds + 1)
         self.rounds += 1
         return rollout
 
     def drain(self) -> TensorDictBase | None:
-        """Return the round under way, if there is one, and ask for no other."""
-        if not self._asked:
-            return None
+        """Return the round under way, if there is one and it does not take too long, and ask for no other."""
         rollout = self._receive()
-        self.rounds += 1
+        self.rounds += rollout is not None
         return rollout
+
+    def metrics(self) -> dict[str, float]:
+        """Return how old the weights of the round were."""
+        return {"collect/weights_age": float(self.weights_age)}
 
     def close(self) -> None:
         """End the workers."""
@@ -139,13 +148,18 @@ class RayRollouts(RolloutsAhead):
             self._taken_at = self.rounds * self._frames
         settings = {name: attrgetter(name)(self._env) for name in self._settings}
         request = Request(number, [self._weights], self._taken_at, settings)
-        self._asked = [worker.fly.remote(request) for worker in self._workers]
+        self._asked, self._flown_with = [worker.fly.remote(request) for worker in self._workers], self._taken_at
 
-    def _receive(self) -> TensorDictBase:
-        """Wait for the round under way."""
-        self._wait()
-        flights = [self._flight(worker, asked) for worker, asked in enumerate(self._asked)]
-        self._asked = []
+    def _receive(self) -> TensorDictBase | None:
+        """Wait for the round under way; None if there is none, or if it is given up because the run is to stop.
+
+        What workers have flown of a round that is given up is lost, so that there can be none after it.
+        """
+        asked, self._asked = self._asked, []
+        self._is_over = self._is_over or bool(asked)
+        if not asked or not self._wait(asked):
+            return None
+        flights = [_flight(worker, flight) for worker, flight in enumerate(asked)]
         for worker, flight in enumerate(flights):
             if flight.began and self._all_flew:
                 self.lost += 1
@@ -157,45 +171,55 @@ class RayRollouts(RolloutsAhead):
                     process,
                     host,
                 )
-        self._all_flew = True
+        self._all_flew, self._is_over = True, False
         self.processes = [flight.process for flight in flights]
         self.seconds = max(flight.seconds for flight in flights)
-        self.weights_age = (self.rounds + 1) * self._frames - min(flight.taken_at for flight in flights)
+        self.weights_age = (self.rounds + 1) * self._frames - self._flown_with
         return torch.cat([flight.rollout for flight in flights])
 
-    def _wait(self) -> None:
-        """Wait until every worker has answered.
+    def _wait(self, asked: list[Any]) -> bool:
+        """Wait until every worker has answered; return whether they have, rather than the run is to stop.
 
         Raises:
-            WorkerLostError: One has not for too long.
+            WorkerError: One has not for too long.
         """
         import ray
 
-        begun, pending = time.monotonic(), self._asked
-        while True:
-            _, pending = ray.wait(self._asked, num_returns=len(self._asked), timeout=min(REMIND, self._patience))
-            if not pending:
-                return
-            waited, late = time.monotonic() - begun, [self._asked.index(asked) for asked in pending]
-            if waited >= self._patience:
-                raise WorkerLostError(
-                    f"Of {len(self._asked)} workers, {_listed(late)} did not answer for {waited:.0f} s "
+        begun, reminded, pending = time.monotonic(), 0.0, asked
+        while pending:
+            _, pending = ray.wait(asked, num_returns=len(asked), timeout=min(LOOK, self._patience))
+            waited, late = time.monotonic() - begun, _listed([asked.index(flight) for flight in pending])
+            if pending and self.stopping() and waited >= FAREWELL:
+                logger.warning("worker %s did not answer for %.0f s: this round is given up", late, waited)
+                return False
+            if pending and waited >= self._patience:
+                raise WorkerError(
+                    f"Of {len(asked)} workers, {late} did not answer for {waited:.0f} s "
                     f"(workers.patience={self._patience:g}): {_room()}. Continue with fewer by num_workers=, or once "
                     "the cluster has room again."
                 )
-            logger.warning("waiting for worker %s since %.0f s; one that was lost needs room", _listed(late), waited)
+            if pending and waited - reminded >= REMIND:
+                logger.warning("waiting for worker %s since %.0f s; one that was lost needs room", late, waited)
+                reminded = waited
+        return True
 
-    def _flight(self, worker: int, asked: Any) -> Flight:
-        """Fetch what a worker answered; an error of its own is raised as it is."""
-        import ray
 
-        try:
-            return ray.get(asked)
-        except ray.exceptions.RayTaskError:
-            raise
-        except ray.exceptions.RayError as error:
-            first = next(iter(str(error).splitlines()), type(error).__name__)
-            raise WorkerLostError(f"Worker {worker} is lost and cannot be begun anew: {first}") from error
+def _flight(worker: int, asked: Any) -> Flight:
+    """Fetch what a worker answered.
+
+    Raises:
+        WorkerError: It failed, or is lost and does not come back.
+    """
+    import ray
+
+    try:
+        return ray.get(asked)
+    except ray.exceptions.RayTaskError as error:
+        logger.error("%s", error)  # with the traceback of over there
+        raise WorkerError(f"Worker {worker} failed ({ray_cluster.in_a_line(error, last=True)}).") from error
+    except ray.exceptions.RayError as error:
+        reason = ray_cluster.in_a_line(error, last=True)
+        raise WorkerError(f"Worker {worker} is lost and cannot be begun anew ({reason}).") from error
 
 
 def check_interval(weight_interval: int, frames: int) -> None:
@@ -222,6 +246,7 @@ def _listed(workers: Sequence[int]) -> str:
 
 def _room() -> str:
     """What the cluster has, in words."""
-    total, free = ray_cluster.resources()
-    has = ", ".join(f"{free.get(name, 0):g} of {total[name]:g} {name}s" for name in ("CPU", "GPU") if name in total)
+    nodes, free = ray_cluster.resources()
+    total = {name: sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU")}
+    has = ", ".join(f"{free.get(name, 0):g} of {there:g} {name}s" for name, there in total.items() if there)
     return f"the cluster has {has or 'nothing'} free"

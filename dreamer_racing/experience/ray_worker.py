@@ -44,14 +44,12 @@ class Flight(NamedTuple):
 
     Attributes:
         rollout: ``[N/W, T]``, on the CPU.
-        taken_at: that of the weights it was flown with.
         began: whether it is the worker's first, of worlds that begin anew.
         process: host and process id.
         seconds: that it took, of the worker's time.
     """
 
     rollout: TensorDictBase
-    taken_at: int
     began: bool
     process: tuple[str, int]
     seconds: float
@@ -73,9 +71,12 @@ class RayWorker(Collector):
         super().__init__(*args, **kwargs)
         self._seed = seed
         self._taken_at: int | None = None
+        self._flown: tuple[int, Flight] | None = None  # the last round
 
     def fly(self, request: Request) -> Flight:
-        """Fly a rollout."""
+        """Fly a rollout; one that was flown already, whose answer Ray lost and asks for again, is given again."""
+        if self._flown is not None and self._flown[0] == request.round:
+            return self._flown[1]
         start = time.perf_counter()
         for name, value in request.settings.items():
             *path, attribute = name.split(".")
@@ -89,7 +90,9 @@ class RayWorker(Collector):
             self.update_policy_weights_(ray.get(request.weights[0]))
             self._taken_at = request.taken_at
         rollout, process = self.next(), (socket.gethostname(), os.getpid())
-        return Flight(rollout, request.taken_at, began, process, time.perf_counter() - start)
+        flight = Flight(rollout, began, process, time.perf_counter() - start)
+        self._flown = request.round, flight
+        return flight
 
     def _begin(self, seed: int) -> None:
         """Let all worlds begin anew; the process is this worker's own, and so is its generator."""

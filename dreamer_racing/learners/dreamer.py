@@ -94,6 +94,12 @@ class DreamerLearner:
         self._graph = self._make_graph() if self.config.cuda_graph else None
 
     @property
+    def weights(self) -> list[Tensor]:
+        """All that is learned: networks, those of losses' own, averages."""
+        kept = [self.agent, self.losses] if self.averaged is None else [self.agent, self.losses, self.averaged]
+        return list(nn.ModuleList(kept).parameters())
+
+    @property
     def discount(self) -> float:
         """γ of the actor's loss, as it is now; reading it waits for the device."""
         return float(cast(ActorLoss, self.losses["actor"]).discount)

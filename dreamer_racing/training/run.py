@@ -22,6 +22,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
+from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
@@ -243,6 +244,8 @@ def train(run: Run) -> None:
     ):
         stop.say = progress.answer
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
+        if isinstance(run.rollouts, RolloutsAhead):
+            run.rollouts.stopping = lambda: stop.requested
         if leads and run.directory.finished_env_steps() > counters["env_steps"]:
             run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
         run.learn(None, stop)  # what an interrupted run still owes
@@ -253,10 +256,13 @@ def train(run: Run) -> None:
             if by_steps or by_minutes:
                 with run.attempt("checkpoint"):
                     run.save()
+                run.learn(None, stop)  # from what was taken in then
             if run.at_end or stop.requested:
                 break
             with run.clock.timed("collect"):
-                rollout = next(run.rollouts)
+                rollout = next(run.rollouts, None)
+                if rollout is None:  # it would not be there in time for a stop
+                    break
                 run.take_in(rollout)
             progress.advance(counters["env_steps"])
             run.learn(rollout, stop)

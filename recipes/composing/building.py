@@ -3,7 +3,7 @@
 import math
 import random
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -11,7 +11,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
@@ -23,9 +22,9 @@ from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.partial_reset import TransformedPixelEnv
-from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -275,13 +274,13 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
 def begin_anew(
     env: Environment,
     curriculum: BodyRateCurriculum | None,
-    rollouts: Iterator[TensorDictBase] | None,
+    rollouts: RolloutsAhead | None,
     env_steps: int,
 ) -> None:
     """Tell worlds that begin anew, in the midst of a run, how far it is."""
     if curriculum:
         env.body_rate_weight = curriculum.body_rate_weight
-    if isinstance(rollouts, RayRollouts):
+    if rollouts:
         rollouts.begin_at(env_steps)
 
 
@@ -294,7 +293,7 @@ def assemble(
     learner: Learner,
     collector: Collector,
     curriculum: BodyRateCurriculum | None,
-    rollouts: Iterator[TensorDictBase] | None = None,
+    rollouts: RolloutsAhead | None = None,
     **own: Any,
 ) -> R:
     """Put a run together in its directory, restored from a checkpoint if it continues one.
@@ -317,8 +316,8 @@ def assemble(
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
-    if isinstance(rollouts, RayRollouts):
-        del parts["env"], parts["collector"]  # workers have the worlds
+    if rollouts and not rollouts.has_worlds:
+        del parts["env"], parts["collector"]
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}

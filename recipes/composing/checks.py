@@ -5,6 +5,7 @@ Every message names the setting as the user writes it, its value, and what would
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -232,8 +233,7 @@ def check_workers(config: DreamerConfig) -> None:
         if workers is not None:
             raise ValueError(f"num_workers={workers} is for collector=ray: add that, or leave it out.")
         return
-    assert workers is not None, "resolve_workers() fills them in"
-    assert asked.weight_interval is not None
+    assert workers is not None, "resolve_workers() says how many"
     if parallel.asked_for() > 1:
         raise ValueError(
             f"WORLD_SIZE={parallel.asked_for()} with collector=ray: workers fly for a single learner. Start it without "
@@ -249,12 +249,12 @@ def check_workers(config: DreamerConfig) -> None:
             f"env.num_envs={num_envs} worlds cannot be shared equally by num_workers={workers}: make it a multiple, "
             f"e.g. env.num_envs={-(-num_envs // workers) * workers}, or choose another number of workers."
         )
-    if config.env.device != "cpu" and not asked.gpus:
+    if asked.gpus > 1 and asked.gpus % 1:
         raise ValueError(
-            f"env.device={config.env.device}, and workers.gpus=0 gives workers no GPU: give each one or a part of one, "
-            "e.g. workers.gpus=0.5, or set env.device=cpu."
+            f"workers.gpus={asked.gpus:g}: Ray gives a worker a part of one GPU or whole ones, e.g. "
+            f"workers.gpus={math.floor(asked.gpus)}."
         )
-    check_interval(asked.weight_interval, num_envs * config.rollout_steps)
+    check_interval(config.weight_interval, num_envs * config.rollout_steps)
 
 
 def check_imagination(config: DreamerConfig) -> None:

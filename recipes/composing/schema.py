@@ -185,10 +185,10 @@ class WorkersConfig:
     # local: a cluster started on this machine, for this run | auto: one that runs here | host:port of one
     address: str = "local"
     cpus: float = setting(1.0, POSITIVE)  # cores of each, may be a part of one; as many threads draw and step worlds
-    gpus: float = setting(0.0, NOT_NEGATIVE)  # of each, likewise; above 0 its policy and worlds live on a GPU
+    gpus: float = setting(0.0, NOT_NEGATIVE)  # of each, a part of one or whole ones; its policy and worlds live there
     # env_steps that weights are old at most when what was flown with them is learned from; null: two rounds, the least
     weight_interval: int | None = setting(None, COUNT)
-    patience: float = setting(600.0, POSITIVE)  # s to wait for a worker that was lost, before the run ends
+    patience: float = setting(600.0, POSITIVE)  # s to wait for a round, before the run is saved and ends
 
 
 @dataclass
@@ -252,6 +252,11 @@ class DreamerConfig(ReplayRunConfig):
         model = self.model
         records = model.batch_size * model.batch_length
         return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio")
+
+    @property
+    def weight_interval(self) -> int:
+        """How many env_steps old the weights of workers are at most."""
+        return self.workers.weight_interval or 2 * self.env.num_envs * self.rollout_steps
 
 
 @dataclass

@@ -28,32 +28,19 @@ OF_RACES = ("body_rate_weight", "worlds.start_on_line")
 
 
 def place_worlds(config: DictConfig) -> None:
-    """Choose where worlds live that do not live with the learner but with who flies them, and say so."""
-    if config.env.device != "auto":
-        return
-    if config.collection is Collection.overlapped:
+    """Choose where worlds live that are stepped beside the learner, and say so."""
+    if config.env.device == "auto" and config.collection is Collection.overlapped:
         config.env.device = "cpu"
-    elif config.collector is CollectorKind.ray:
-        config.env.device = worlds_device(torch.device("cuda" if config.workers.gpus else "cpu"), config.env)
-    else:
-        return
-    print(f"worlds: {config.env.device} (collection={config.collection.value}, collector={config.collector.value})")
+        print("worlds: cpu (collection=overlapped)")
 
 
 def resolve_workers(config: DictConfig) -> None:
-    """Fill in what is left open on workers, if there are any, and say what was chosen."""
-    if config.collector is not CollectorKind.ray:
-        return
-    asked = config.workers
-    if config.num_workers is None:
-        config.num_workers = NUM_WORKERS
-    if asked.weight_interval is None:
-        asked.weight_interval = 2 * config.env.num_envs * config.rollout_steps
-    print(
-        f"workers: {config.num_workers} on Ray (workers.address={asked.address}), each with "
-        f"{config.env.num_envs // config.num_workers} worlds, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at "
-        f"most {asked.weight_interval:,} env_steps old"
-    )
+    """Say how many workers there are, where that is left open; a run that goes on without any needs no number."""
+    if config.collector is CollectorKind.ray:
+        config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
+    elif config.resume and config.num_workers is not None:
+        print(f"workers: none (collector=local); num_workers={config.num_workers} is of the run before")
+        config.num_workers = None
 
 
 def make_own_env(config: DreamerConfig) -> Environment:
@@ -81,8 +68,12 @@ def make_rollouts(
 
 def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> tuple[Collector, RayRollouts]:
     """Start workers on a Ray cluster, each with its share of the worlds."""
-    asked, workers = config.workers, cast(int, config.num_workers)
-    own = share_of_worker(config)
+    asked, workers, own = config.workers, cast(int, config.num_workers), share_of_worker(config)
+    print(
+        f"workers: {workers} on Ray (workers.address={asked.address}), each with {own.env.num_envs} worlds on "
+        f"{own.env.device}, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at most {config.weight_interval:,} "
+        "env_steps old"
+    )
     with seeded(config.seed):
         agent = make_agent(own, Interface.of(env))  # its weights come with the first request
     flying = DreamerPolicy(agent.world_model, agent.actor)
@@ -101,7 +92,7 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
         policy,
         env,
         OF_RACES if is_race(config) else (),
-        weight_interval=cast(int, asked.weight_interval),
+        weight_interval=config.weight_interval,
         patience=asked.patience,
         leaves=joined,
     )
@@ -113,7 +104,7 @@ def share_of_worker(config: DreamerConfig) -> DreamerConfig:
     own = copy.deepcopy(config)
     own.env.num_envs = config.env.num_envs // cast(int, config.num_workers)
     own.device = "cpu"  # where its policy comes from; the collector takes it to the worker's device
-    own.env.device = "cpu" if config.env.device == "cpu" else "cuda"  # Ray shows a worker its own alone
+    own.env.device = worlds_device(torch.device("cuda" if config.workers.gpus else "cpu"), config.env)
     return own
 
 

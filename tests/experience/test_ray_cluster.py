@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import socket
 
 import pytest
 
@@ -29,6 +30,15 @@ def test_where_there_is_no_cluster_the_address_is_named(address: str, monkeypatc
         join(address)
 
 
+def test_where_nobody_answers_ray_does_not_try_for_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason="Ray, the extra `ray`, is not installed")
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # a port that is nobody's once it is closed
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(ValueError, match=rf"workers\.address={address}: no Ray cluster .*refused"):
+        join(address)
+
+
 @pytest.mark.parametrize(
     ("share", "words"),
     [
@@ -38,8 +48,24 @@ def test_where_there_is_no_cluster_the_address_is_named(address: str, monkeypatc
 )
 def test_what_a_cluster_does_not_have_is_not_waited_for(share: Share, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        check_resources(4, share, {"CPU": 3.0}, {"CPU": 2.0})
-    check_resources(2, Share(1.0, 0.0), {"CPU": 3.0}, {"CPU": 2.0})
+        check_resources(4, share, [{"CPU": 2.0}, {"CPU": 1.0}], {"CPU": 2.0})
+    check_resources(2, Share(1.0, 0.0), [{"CPU": 3.0}], {"CPU": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("share", "nodes", "room"),
+    [
+        (Share(1.0, 0.6), [{"CPU": 16.0, "GPU": 2.0}], 2),  # one on each GPU
+        (Share(2.0, 0.0), [{"CPU": 3.0}, {"CPU": 3.0}], 2),
+        (Share(1.0, 2.0), [{"CPU": 9.0, "GPU": 3.0}, {"CPU": 9.0, "GPU": 3.0}], 2),
+        (Share(0.1, 0.1), [{"CPU": 1.0, "GPU": 1.0}], 10),
+    ],
+)
+def test_a_worker_is_not_spread_over_nodes_or_gpus(share: Share, nodes: list[dict[str, float]], room: int) -> None:
+    free = {name: sum(node.get(name, 0.0) for node in nodes) + 9.0 for name in ("CPU", "GPU")}
+    check_resources(room, share, nodes, free)
+    with pytest.raises(ValueError, match=rf"there is room for {room} of them on the cluster's {len(nodes)} nodes"):
+        check_resources(room + 1, share, nodes, free)
 
 
 def test_nodes_of_other_versions_are_refused() -> None:

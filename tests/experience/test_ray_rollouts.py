@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -16,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.ray_cluster import Share, start_workers
-from dreamer_racing.experience.ray_rollouts import RayRollouts, check_interval
+from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
 from dreamer_racing.experience.ray_worker import RayWorker, Request
 from dreamer_racing.experience.replay import make_replay
 from dreamer_racing.modules import DreamerPolicy, Interface
@@ -30,6 +31,8 @@ SEED, ROUNDS, KILLED_AFTER = 3, 9, 4
 INTERVAL = 3 * FRAMES
 TAKEN_AT = [0, 0, 0, 2, 2, 4, 4, 6, 6]
 """Rounds learned from when the weights of each round were taken: at its end these are 3 rounds old at most."""
+AGES_LATER = [2 * FRAMES, 3 * FRAMES, 2 * FRAMES]
+"""Of the round under way in the end, and of two after it."""
 
 
 class Flown(NamedTuple):
@@ -40,6 +43,7 @@ class Flown(NamedTuple):
     processes: list[list[tuple[str, int]]]
     rollouts: RayRollouts
     drained: TensorDictBase | None
+    ages_later: list[int]
 
     @property
     def lost_in(self) -> int:
@@ -86,8 +90,12 @@ def flown(ray_cluster: None) -> Iterator[Flown]:
         if number == KILLED_AFTER - 1:
             os.kill(rollouts.processes[1][1], signal.SIGKILL)
         learn(policy, env)
-    drained = rollouts.drain()
-    yield Flown(rounds, ages, processes, rollouts, drained)
+    drained, ages_later = rollouts.drain(), [rollouts.weights_age]
+    for _ in AGES_LATER[1:]:
+        learn(policy, env)
+        next(rollouts)
+        ages_later.append(rollouts.weights_age)
+    yield Flown(rounds, ages, processes, rollouts, drained, ages_later)
     rollouts.close()
 
 
@@ -118,6 +126,42 @@ def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
         assert torch.equal(one[key], other[key]), key
 
 
+# --- before the workers of `flown` take all cores ---------------------------------------------------------------------
+
+
+def without_a_renderer() -> None:
+    raise RuntimeError("EGL is not there")
+
+
+def of_the_learner_alone() -> None:
+    """Not to be found where workers are."""
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+@pytest.mark.parametrize(
+    ("make_env", "words"),
+    [
+        (of_the_learner_alone, r"node .* cannot have a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
+        (without_a_renderer, r"node .* cannot have a worker \(RuntimeError: EGL is not there\)"),
+    ],
+)
+def test_what_workers_cannot_be_made_of_is_refused_at_once(
+    ray_cluster: None, make_env: Callable[[], None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(of_the_learner_alone, "__module__", "here_alone")
+    here_alone = ModuleType("here_alone")
+    here_alone.of_the_learner_alone = of_the_learner_alone  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "here_alone", here_alone)
+    with pytest.raises(ValueError, match=words):
+        start_workers(
+            make_env, policy_of(small_race(1)), workers=1, share=Share(1.0, 0.0), env_device="cpu", frames=1, seed=0
+        )
+
+
+# --- workers ----------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
 def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +170,9 @@ def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pyte
     with torch.random.fork_rng():
         survivor = twin(0)
         for number, request in enumerate(asked):
-            assert_same(flown.rounds[number][:worlds], survivor.fly(request).rollout)
+            flight = survivor.fly(request)
+            assert_same(flown.rounds[number][:worlds], flight.rollout)
+            assert survivor.fly(request) is flight, "asked again, it does not fly on"
         lost = twin(1)
         for number, request in enumerate(asked[: flown.lost_in]):
             assert_same(flown.rounds[number][worlds:], lost.fly(request).rollout)
@@ -138,10 +184,10 @@ def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pyte
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
 def test_a_worker_that_is_killed_is_replaced_and_no_frame_is_lost_or_counted_twice(flown: Flown) -> None:
-    assert flown.rollouts.lost == 1 and flown.rollouts.rounds == ROUNDS + 1
+    assert flown.rollouts.lost == 1 and flown.rollouts.rounds == ROUNDS + len(AGES_LATER)
     assert flown.lost_in in (KILLED_AFTER, KILLED_AFTER + 1)
     assert {processes[0] for processes in flown.processes} == {flown.processes[0][0]}, "the other one flew on"
-    assert flown.drained is not None and flown.rollouts.drain() is None
+    assert flown.drained is not None
     rounds = [*flown.rounds, flown.drained]
     assert all(rollout.shape == (N, T) for rollout in rounds)
     path = torch.cat(rounds, 1)  # [N, 10 T]
@@ -167,6 +213,7 @@ def test_a_worker_that_is_killed_is_replaced_and_no_frame_is_lost_or_counted_twi
 def test_weights_are_no_older_than_stated_and_sent_no_sooner_than_needed(flown: Flown) -> None:
     assert flown.ages == [FRAMES * (number + 1 - taken_at) for number, taken_at in enumerate(TAKEN_AT)]
     assert max(flown.ages) == INTERVAL
+    assert flown.ages_later == AGES_LATER, "what was under way is learned from before the next is asked"
 
 
 @pytest.mark.slow
@@ -184,42 +231,37 @@ def test_more_workers_than_there_is_room_for_are_refused(flown: Flown) -> None:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
-def test_an_error_in_flight_is_raised_as_it_is(flown: Flown) -> None:
+def test_an_error_in_flight_is_told_and_ends_the_rounds(flown: Flown) -> None:
     """And is no loss, after which Ray would ask again."""
-    ray = pytest.importorskip("ray")
-    wrong = Request(ROUNDS + 1, [], 0, {"nowhere.at_all": 1})
-    with pytest.raises(AttributeError, match="nowhere"):
-        ray.get(flown.rollouts._workers[0].fly.remote(wrong), timeout=60)
-
-
-def without_a_renderer() -> None:
-    raise RuntimeError("EGL is not there")
-
-
-def of_the_learner_alone() -> None:
-    """Not to be found where workers are."""
+    assert flown.rollouts.drain() is not None
+    wrong = Request(ROUNDS + len(AGES_LATER) + 1, [], 0, {"nowhere.at_all": 1})
+    flown.rollouts._asked = [worker.fly.remote(wrong) for worker in flown.rollouts._workers]
+    with pytest.raises(WorkerError, match=r"Worker 0 failed \(AttributeError: .*nowhere.*\)\."):
+        flown.rollouts.drain()
+    assert flown.rollouts.drain() is None and next(flown.rollouts, None) is None
 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
-@pytest.mark.parametrize(
-    ("make_env", "words"),
-    [
-        (of_the_learner_alone, r"node .* cannot have a worker \(ModuleNotFoundError: No module named 'here_alone'\)"),
-        (without_a_renderer, r"a worker could not begin \(.*EGL is not there\)"),
-    ],
-)
-def test_what_workers_cannot_be_made_of_is_refused_at_once(
-    ray_cluster: None, make_env: Callable[[], None], words: str, monkeypatch: pytest.MonkeyPatch
+def test_who_does_not_answer_is_waited_for_with_patience_and_shortly_by_a_run_that_stops(
+    ray_cluster: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(of_the_learner_alone, "__module__", "here_alone")
-    here_alone = ModuleType("here_alone")
-    here_alone.of_the_learner_alone = of_the_learner_alone  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "here_alone", here_alone)
-    with pytest.raises(ValueError, match=words):
-        start_workers(
-            make_env, policy_of(small_race(1)), workers=1, share=Share(0.0, 0.0), env_device="cpu", frames=1, seed=0
-        )
+    ray = pytest.importorskip("ray")
+    never = ray.remote(num_cpus=0)(lambda: time.sleep(1000.0))
+
+    def waiting() -> RayRollouts:
+        env = small_race(1)
+        collector = SimpleNamespace(remote_collectors=[None], frames_per_batch=FRAMES)
+        rollouts = RayRollouts(collector, policy_of(env), env, weight_interval=INTERVAL, patience=1.5)  # type: ignore[arg-type]
+        rollouts._asked = [never.remote()]
+        return rollouts
+
+    with pytest.raises(WorkerError, match=r"Of 1 workers, 0 did not answer .*workers\.patience=1\.5.*num_workers="):
+        next(waiting())
+    monkeypatch.setattr("dreamer_racing.experience.ray_rollouts.FAREWELL", 0.5)
+    stopped = waiting()
+    stopped.stopping = lambda: True
+    assert next(stopped, None) is None and stopped.drain() is None
 
 
 def test_weights_newer_than_a_round_ahead_are_refused() -> None:

@@ -90,8 +90,8 @@ def test_decoys_are_a_config_group() -> None:
         ("cuda", ["env=dmc"], "cpu"),
         ("cuda", ["env.device=cpu"], "cpu"),
         ("cuda", ["collection=overlapped"], "cpu"),
-        ("cuda", ["collector=ray"], "cpu"),
-        ("cuda", ["collector=ray", "workers.gpus=0.5"], "cuda"),
+        ("cpu", ["collector=ray", "workers.gpus=0.5"], "cpu"),  # the learner's own
+        ("cuda", ["collector=ray"], "cuda"),
     ],
 )
 def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from dreamer_racing.experience.ray_rollouts import WorkerError
 from dreamer_racing.training.directory import latest_checkpoint
 from dreamer_racing.training.run import graceful_exit, train
-from tests.running_recipes import TINY, compose, recipe_module, rows
+from tests.running_recipes import TINY, compose, recipe, recipe_module, rows
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.flown=64",
@@ -52,11 +53,18 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(ray_cluster
     again = make_run(f"resume={tmp_path}", "collector=ray", "num_workers=1", "total_env_steps=384")
     assert again.rollouts.rounds == 9 and again.counters == run.counters
     train(again)
-    again.close()
     assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))  # with the round that was under way
     assert 0 < float(rows(tmp_path)[-2]["collect/weights_age"]) <= 64
 
-    alone = make_run(f"resume={tmp_path}", "total_env_steps=480")
-    train(alone)
-    alone.close()
-    assert alone.counters["env_steps"] == 480 and latest_checkpoint(tmp_path).name.endswith("480")
+    again.rollouts._patience = 1e-6
+    with pytest.raises(WorkerError):
+        again.take_in(next(again.rollouts))
+    again.save()  # of what was delivered; nothing is waited for any more
+    again.close()
+    assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))
+
+    done = recipe("dreamer_v3", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
+    assert done.returncode == 0, done.stderr
+    assert "workers: none (collector=local); num_workers=1 is of the run before" in done.stdout
+    assert "does not hold env, collector: begun anew" in done.stdout + done.stderr
+    assert latest_checkpoint(tmp_path).name.endswith("480")
