@@ -33,7 +33,7 @@ SAME_CURVE = (
     "model.cuda_graph",
 )  # fmt: skip
 """Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
-IN_KEY = ("algorithm", "track")  # settings that every key names anyway
+IN_KEY = ("algorithm", "track", "task")  # settings that every key names anyway
 
 
 class Axis(NamedTuple):
@@ -68,7 +68,7 @@ def axis_of(name: str) -> Axis:
 class CurveKey(NamedTuple):
     """What the runs of one curve have in common."""
 
-    track: str
+    track: str  # or the task, of the Control Suite
     algorithm: str
     variant: str
     """Named by the run folder, ``<algorithm>_<track>_<variant>_seed<k>``, and by what `group_runs` adds; or empty."""
@@ -113,7 +113,8 @@ class RunData:
     def key(self) -> CurveKey:
         """Which curve the run belongs to, by its folder's name; `group_runs` looks at the settings, too."""
         algorithm = str(self.config.get("algorithm", DEFAULT_ALGORITHM))
-        track = Path(str(self.config.get("track", "unknown"))).stem
+        scene = "task" if self.config.get("env.suite") == "dmc" else "track"
+        track = Path(str(self.config.get(scene, "unknown"))).stem
         named = re.fullmatch(rf"{re.escape(f'{algorithm}_{track}')}(?:_(?P<variant>.+))?_seed\d+", self.name)
         return CurveKey(track, algorithm, (named and named["variant"]) or "")
 

@@ -273,6 +273,8 @@ def test_runs_are_found_but_not_inside_of_runs(tmp_path):
          ("figure8_decoys", "ppo", "no_noise")),
         ("sac_mine_seed0", {"algorithm": "sac", "track": "tracks/mine.yaml"}, ("mine", "sac", "")),
         ("dreamer_v3_circle_20260101-120000", {}, ("circle", "dreamer_v3", "")),
+        ("dreamer_v3_cartpole_swingup_wide_seed0", {"task": "cartpole_swingup", "env": {"suite": "dmc"}},
+         ("cartpole_swingup", "dreamer_v3", "wide")),
     ],
 )  # fmt: skip
 def test_names_say_the_variant(tmp_path, name, settings, key):

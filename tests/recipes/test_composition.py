@@ -129,6 +129,7 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -
         (["collection=overlapped"], ("size12m", 64, 16, True, False)),
         (["tuned=race"], ("cpu_small", 32, 16, True, True)),
         (["tuned=gpu"], ("cpu_small", 64, 16, True, True)),
+        (["tuned=suite", "env=dmc"], ("cpu_small", 16, 32, True, True)),
     ],
 )
 def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
@@ -216,14 +217,16 @@ def test_dreamer_as_published_is_one_word_away() -> None:
         (["model=ssm_cpu_small"], "none"),
         (["budget=smoke"], "none"),
         (["env.from_pixels=false"], "none"),
-        (["env=dmc", "task=walker_walk"], "none"),
+        (["env=dmc", "task=walker_walk"], "suite"),
+        (["env=dmc", "env.from_pixels=false"], "none"),
     ],
 )
-def test_what_races_is_chosen_where_it_does(
+def test_what_learns_is_chosen_where_it_does(
     overrides: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert recipe_module("dreamer_v3").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
-    assert ("tuned=race" in capsys.readouterr().out) == (expected == "race")
+    told = capsys.readouterr().out
+    assert all((f"settings: tuned={name}" in told) == (expected == name) for name in ("race", "suite"))
 
 
 def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
