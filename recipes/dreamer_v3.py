@@ -221,9 +221,10 @@ def resolve(config: DictConfig) -> DictConfig:
         hours = config.total_env_steps / RACE_SPEED / 3600
         print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
     if config.replay.held_out is None:
-        config.replay.held_out = int(config.env.num_envs >= FEW_WORLDS)
+        worlds = config.env.num_envs // parallel.asked_for()  # of the first process, which holds them out
+        config.replay.held_out = int(worlds >= FEW_WORLDS)
         if not config.replay.held_out:
-            print(f"held out: nothing, because there are only {config.env.num_envs} worlds (replay.held_out=null)")
+            print(f"held out: nothing, because there are only {worlds} worlds (replay.held_out=null)")
     return config
 
 

@@ -6,6 +6,10 @@ from collections.abc import Callable, Iterator
 from tensordict import TensorDictBase
 
 
+class WorkerError(RuntimeError):
+    """Who flies failed, or is gone and does not come back: what is under way is given up, all before was delivered."""
+
+
 class RolloutsAhead(Iterator[TensorDictBase]):
     """Rollouts ``[N, T]``, of which after each ``next()`` one more is under way.
 
@@ -13,7 +17,7 @@ class RolloutsAhead(Iterator[TensorDictBase]):
 
     Attributes:
         has_worlds: Whether the worlds that are flown live in this process, and are saved with the run.
-        stopping: Whether to end soon, without what is under way if that takes long; settable.
+        stopping: Whether the run is to end: what is under way may be given up if it takes long; settable.
     """
 
     has_worlds = True

@@ -23,6 +23,8 @@ from dreamer_racing.modules import DreamerPolicy
 if TYPE_CHECKING:  # which imports Ray where it is installed, and that takes a second
     from torchrl.collectors.distributed import RayCollector
 
+logger = logging.getLogger(__name__)
+
 SEEDS_APART = 1_000_000
 """Between the seeds of two workers."""
 KNOCK, TRY = 5.0, 120.0  # s to wait for an answer of a cluster's head, and of each node that a worker can be had there
@@ -220,6 +222,10 @@ def check_nodes(share: Share, make_env: Callable[[], EnvBase], policy: DreamerPo
     for name, answer in asked:
         try:
             found = ray.get(answer, timeout=TRY)
+        except ray.exceptions.GetTimeoutError:
+            ray.cancel(answer, force=True)
+            logger.warning("node %s had no room within %.0f s to see whether a worker can be had there", name, TRY)
+            continue
         except ray.exceptions.RayError as error:
             raise ValueError(
                 f"collector=ray: node {name} cannot have a worker ({in_a_line(error, last=True)}). Every node of the "

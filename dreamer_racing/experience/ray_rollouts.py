@@ -33,7 +33,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
-from dreamer_racing.experience.ahead import RolloutsAhead
+from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.ray_worker import Flight, Request
 from dreamer_racing.modules import DreamerPolicy
 
@@ -45,10 +45,6 @@ logger = logging.getLogger(__name__)
 LOOK = 1.0  # s between looks at whether workers have answered, or the run is to stop
 REMIND = 30.0  # s, after which it is said that workers are waited for
 FAREWELL = 10.0  # s that a run which is to stop waits for the round under way
-
-
-class WorkerError(RuntimeError):
-    """A worker failed, or is gone and does not come back: its round is given up, all before it was delivered."""
 
 
 class RayRollouts(RolloutsAhead):

@@ -292,8 +292,6 @@ def _load_sound(
     """Restores some parts of a checkpoint, or of what one process has there, whose files are known to be sound."""
     lacking = set(may_lack) - Checkpoint.manifest(source)["components"].keys()
     there = {name: part for name, part in components.items() if name not in lacking}
-    if begun := [name for name in components if name in lacking]:
-        logger.info("%s does not hold %s: begun anew", source.name, ", ".join(begun))
     return _restore(_bind(there), source, map_location)
 
 

@@ -22,7 +22,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
-from dreamer_racing.experience.ahead import RolloutsAhead
+from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
@@ -233,11 +233,11 @@ def train(run: Run) -> None:
     Raises:
         SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
         KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
+        WorkerError: what is collected elsewhere cannot be had; all that was delivered is saved.
         RunCheckpointError: at its end the run could not be saved.
         OSError: at its end metrics could not be written.
     """
     config, counters, leads = run.config, run.counters, parallel.is_first()
-    minutes = Interval(config.checkpoint.minutes)
     with (
         graceful_exit() as stop,
         Progress(config.total_env_steps, counters["env_steps"], shown=leads) as progress,
@@ -245,30 +245,14 @@ def train(run: Run) -> None:
         stop.say = progress.answer
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
         if isinstance(run.rollouts, RolloutsAhead):
-            run.rollouts.stopping = lambda: stop.requested
+            run.rollouts.stopping = lambda: stop.signal_name is not None
         if leads and run.directory.finished_env_steps() > counters["env_steps"]:
             run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
-        run.learn(None, stop)  # what an interrupted run still owes
-        while not stop.requested:
-            run.keep_up(progress)
-            by_steps = run.schedule.due("save", counters["env_steps"])
-            by_minutes = parallel.agreed(minutes.due())  # both take note
-            if by_steps or by_minutes:
-                with run.attempt("checkpoint"):
-                    run.save()
-                run.learn(None, stop)  # from what was taken in then
-            if run.at_end or stop.requested:
-                break
-            with run.clock.timed("collect"):
-                rollout = next(run.rollouts, None)
-                if rollout is None:  # it would not be there in time for a stop
-                    break
-                run.take_in(rollout)
-            progress.advance(counters["env_steps"])
-            run.learn(rollout, stop)
-        if not stop.requested:
-            run.settle()
-            run.write_row()  # of what settled
+        try:
+            collect_and_learn(run, stop, progress)
+        except WorkerError:
+            run.save()
+            raise
         saved = run.save()
         if stop.requested:
             at = f"at {counters['env_steps']:,} of {config.total_env_steps:,} env_steps"
@@ -279,6 +263,35 @@ def train(run: Run) -> None:
         progress.say(f"checkpoint: {saved}")
     if stop.signal_name:
         raise SystemExit(128 + signal.Signals[stop.signal_name])
+
+
+def collect_and_learn(run: Run, stop: GracefulExit, progress: Progress) -> None:
+    """Go on until all env_steps are made and learned from, or a stop is requested; `train` without its ends."""
+    config, counters = run.config, run.counters
+    minutes = Interval(config.checkpoint.minutes)
+    run.learn(None, stop)  # what an interrupted run still owes
+    while not stop.requested:
+        run.keep_up(progress)
+        by_steps = run.schedule.due("save", counters["env_steps"])
+        by_minutes = parallel.agreed(minutes.due())  # both take note
+        if by_steps or by_minutes:
+            run.settle()
+            run.learn(None, stop)
+            with run.attempt("checkpoint"):
+                run.save()
+        if run.at_end or stop.requested:
+            break
+        with run.clock.timed("collect"):
+            rollout = next(run.rollouts, None)
+            if rollout is None:  # only a stop ends them, if the next would not be there soon
+                break
+            run.take_in(rollout)
+        progress.advance(counters["env_steps"])
+        run.learn(rollout, stop)
+    if not stop.requested:
+        run.settle()
+        run.learn(None, stop)
+        run.write_row()  # of what settled
 
 
 def graceful_exit() -> GracefulExit:

@@ -18,7 +18,7 @@ from composing.command_line import follow_quietly, merge_overrides, override_key
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import RunConfig, is_race
 from composing.usage import command
-from dreamer_racing.experience.ray_rollouts import WorkerError
+from dreamer_racing.experience.ahead import WorkerError
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
@@ -84,9 +84,7 @@ def launch(
             f"{keep_batch(error, kept)}; {run.last_good}. Continue from there with a lower "
             f"{run.remedy}."
         ) from error
-    except WorkerError as error:  # which leaves the learner whole
-        with run.attempt("checkpoint"):
-            run.save()
+    except WorkerError as error:
         raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
         raise SystemExit(f"error: {error}. The run is not finished: {run.last_good}.") from error

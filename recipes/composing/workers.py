@@ -39,7 +39,7 @@ def resolve_workers(config: DictConfig) -> None:
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume and config.num_workers is not None:
-        print(f"workers: none (collector=local); num_workers={config.num_workers} is of the run before")
+        print(f"workers: none (collector=local), so num_workers={config.num_workers} is left out")
         config.num_workers = None
 
 

@@ -16,8 +16,9 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import newest_sound
+from dreamer_racing.training.checkpoint import load_components, newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
+from dreamer_racing.training.run import train
 from tests.running_recipes import AT_THE_END, SMALL, TINY, build, compose, recipe, recipe_module, rows, started
 
 SLOW_DISK = """
@@ -206,6 +207,21 @@ def test_an_overlapped_run(tmp_path: Path) -> None:
     assert [int(row["env_steps"]) for row in table] == [128, 224, 256]
     assert any(float(row["loss_image"] or "nan") > 0 for row in table)
     assert latest_checkpoint(tmp_path / "run").name.endswith("256")
+
+
+@pytest.mark.slow
+def test_what_is_learned_ahead_of_a_checkpoint_is_in_it(tmp_path: Path) -> None:
+    """Also of the rollout that was under way when the run ended: nothing is learned after the last checkpoint."""
+    dreamer = recipe_module("dreamer_v3")
+    overrides = [*TINY, "env.from_pixels=false", "collection=overlapped", "total_env_steps=192", "checkpoint.every=96",
+                 f"run_dir={tmp_path}"]  # fmt: skip
+    run = dreamer.build(OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *overrides))), overrides)
+    train(run)
+    run.close()
+    counters: dict[str, int] = {}
+    load_components(tmp_path, {"counters": counters})
+    assert counters == run.counters and run.updates_due == 0
+    assert env_steps_of(latest_checkpoint(tmp_path)) == 192 + 32
 
 
 @pytest.mark.slow

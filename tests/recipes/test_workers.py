@@ -31,7 +31,9 @@ def make_run(*overrides: str):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("ray")
-def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(ray_cluster: None, tmp_path: Path) -> None:
+def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
+    ray_cluster: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = f"run_dir={tmp_path}"
     run = make_run(folder, "collector=ray")
     assert run.env.batch_size == (1,) and run.replay.num_streams == 4, "the worlds are the workers'"
@@ -56,15 +58,23 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(ray_cluster
     assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))  # with the round that was under way
     assert 0 < float(rows(tmp_path)[-2]["collect/weights_age"]) <= 64
 
-    again.rollouts._patience = 1e-6
+    wait = again.rollouts._wait
+
+    def lose_the_next_but_one(asked: list) -> bool:
+        if again.rollouts.rounds == 14:
+            raise WorkerError("lost")
+        return wait(asked)
+
+    monkeypatch.setattr(again.rollouts, "_wait", lose_the_next_but_one)
+    again.config.total_env_steps = 1000
     with pytest.raises(WorkerError):
-        again.take_in(next(again.rollouts))
-    again.save()  # of what was delivered; nothing is waited for any more
+        train(again)
     again.close()
-    assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))
+    assert latest_checkpoint(tmp_path).name.endswith(str(384 + 2 * 32)), "what was delivered is saved"
 
     done = recipe("dreamer_v3", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
     assert done.returncode == 0, done.stderr
-    assert "workers: none (collector=local); num_workers=1 is of the run before" in done.stdout
-    assert "does not hold env, collector: begun anew" in done.stdout + done.stderr
+    assert "workers: none (collector=local), so num_workers=1 is left out" in done.stdout
+    assert "collector=local (was ray)" in done.stdout
+    assert f"at 448 env_steps, {again.counters['updates']:,} updates" in done.stdout, "all that was learned"
     assert latest_checkpoint(tmp_path).name.endswith("480")
