@@ -49,7 +49,7 @@ def test_whole_numbers_may_be_written_short(argument: str, taken: str) -> None:
         ("discont=0.9", "(did you mean loss.discount?)"),
         ("xyzzy=1", "xyzzy: there is no such setting of recipes/dreamer_v3.py. docs/options.md has them all."),
         ("model=cpu_smal", "(did you mean cpu_small?)."),
-        ("tuned=fast", "tuned=fast: there are auto, gpu, none, race."),
+        ("tuned=fast", "tuned=fast: there are auto, gpu, none, race, suite."),
         ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is no whole number."),
         ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is not a valid bool (type str)."),
         (
