@@ -189,8 +189,9 @@ def tune(config: DictConfig) -> str:
     meant = config.model.size in ("auto", "cpu_small") and config.budget not in ("smoke", "paper")
     if not on_cpu or not meant or not config.env.from_pixels:
         return "none"
-    print(RACE_SETTINGS if config.env.suite == "race" else SUITE_SETTINGS)
-    return "race" if config.env.suite == "race" else "suite"
+    name, settings = ("race", RACE_SETTINGS) if config.env.suite == "race" else ("suite", SUITE_SETTINGS)
+    print(settings)
+    return name
 
 
 def resolve(config: DictConfig) -> DictConfig:
