@@ -39,9 +39,18 @@
     document.dispatchEvent(new MouseEvent("mouseup", at));
   }
 
-  function seek(time) {
-    press(time); // pauses the viewer, which plays on for a moment
-    setTimeout(() => press(time), 150);
+  let lookedAt;
+
+  // A press pauses the viewer, but a frame of its playing may still come after it: press until the time stands still.
+  function seek(time, before) {
+    clearTimeout(lookedAt);
+    dashboard.ariaBusy = "true";
+    press(time);
+    lookedAt = setTimeout(() => requestAnimationFrame(() => {
+      const now = slider().ariaValueNow;
+      if (now !== before) return seek(time, now);
+      dashboard.ariaBusy = "false";
+    }), 150);
   }
 
   function seekHere(event) {

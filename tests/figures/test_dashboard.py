@@ -193,7 +193,8 @@ def test_the_page_is_one_file_of_bearable_size(page: Path):
 def test_the_panel_follows_the_scrubber_in_a_browser(page: Path):
     text = "document.querySelector('{}')?.textContent"
     with open_page(f"{page.as_uri()}#t=1.5") as browser:
-        browser.wait_for(f"{text.format('.dashboard [data-time]')} === '1.50 s'")  # the address names a moment
+        settled = "document.querySelector('.dashboard')?.ariaBusy === 'false' && "  # the viewer stands still there
+        browser.wait_for(f"{settled}{text.format('.dashboard [data-time]')} === '1.50 s'")  # the address names it
         slider = browser.evaluate("Number(document.querySelector('#root [role=slider]').ariaValueNow)")
         assert slider == pytest.approx(1.5, abs=0.001)
         style = "getComputedStyle(document.querySelector('{}')).getPropertyValue('{}')"
@@ -207,7 +208,7 @@ def test_the_panel_follows_the_scrubber_in_a_browser(page: Path):
         values = browser.evaluate("[...document.querySelectorAll('[data-of=value]')].map(cell => cell.textContent)")
         assert [float(value) for value in values] == [pytest.approx(10 * np.pi, abs=0.01)]
         browser.press(".")  # one step on
-        browser.wait_for(f"{text.format('.dashboard [data-time]')} === '1.55 s'")
+        browser.wait_for(f"{settled}{text.format('.dashboard [data-time]')} === '1.55 s'")
         picture = np.asarray(browser.screenshot())
         assert not browser.errors
         assert [address for address in browser.requests if not address.startswith(("file:", "data:", "blob:"))] == []
