@@ -4,22 +4,19 @@
 
 On its stand a vehicle shows an actor the first image again and again, until the loop sees that it moves: with poses
 that are late, and a vehicle that answers late, the actor's first action is flown for two or three ticks instead of one.
-`--lift 0` is that; with `--lift 1.15` the vehicle is lifted straight up with so many times its weight until it moves,
-and the actor's first action is its own. Poses are otherwise as `recipes/sim_to_real.py` has them.
+`--lift 0` is that; with `--lift 1.15`, the default of `recipes/hil.py`, it is lifted straight up with so many times its
+weight until it moves, and the actor begins then. Poses are otherwise as `recipes/sim_to_real.py` has them.
 """
 
 import argparse
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 from measuring import print_table, write_json
 
-from dreamer_racing.envs.drone.parameters import GRAVITY
-from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.chain import LIFT, ChainConfig
 from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.hil.safety_limits import SafetyLimits
-from dreamer_racing.hil.vehicle import Pose, Setpoint
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.study import LIMITS, USUAL
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -28,57 +25,32 @@ LATENCIES = (0.0, 0.005, 0.01, 0.02, 0.03)  # s, of poses
 LONGEST = 30.0  # s of a flight
 
 
-class LiftedFlyer(ActorFlyer):
-    """An actor that takes over once its vehicle has been lifted off the stand.
-
-    Args:
-        path: As of `ActorFlyer`.
-        lift: Thrust in weights until then.
-    """
-
-    def __init__(self, path: Path, lift: float) -> None:
-        super().__init__(path)
-        self._lift, self._on_stand = lift, True
-
-    def reset(self) -> None:
-        """Begin a flight, which the chain does at every tick until the vehicle moves."""
-        super().reset()
-        self._on_stand = True
-
-    def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
-        """Lift off at the first tick of a flight; choose by the image from the second on."""
-        if self._on_stand:
-            self._on_stand = False
-            return Setpoint(self._lift * GRAVITY, np.zeros(3))
-        return super().act(pose, image, target_gate)
-
-
 def main() -> None:
     """Fly every latency so often, from the stand as it is and lifted."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--actor", type=Path, required=True, help="folder of an agent or of an export")
     parser.add_argument("--preset", default="faithful", help="physics of the vehicle")
     parser.add_argument(
-        "--lift", type=float, nargs="+", default=[0.0, 1.15], help="weights; 0: the actor from the stand"
+        "--lift", type=float, nargs="+", default=[0.0, LIFT], help="weights; 0: the actor from the stand"
     )
     parser.add_argument("--flights", type=int, default=2, help="of each, with different noise")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for lift in arguments.lift:
-        flyer = LiftedFlyer(arguments.actor, lift) if lift else ActorFlyer(arguments.actor)
+        flyer = ActorFlyer(arguments.actor)
         for latency in LATENCIES:
-            gates = [fly(flyer, arguments.preset, latency, seed) for seed in range(arguments.flights)]
+            gates = [fly(flyer, arguments.preset, lift, latency, seed) for seed in range(arguments.flights)]
             records.append({"preset": arguments.preset, "lift": lift, "latency_s": latency, "gates": gates})
             print_table([records[-1]], list(records[-1]))
     write_json(records, arguments.json)
 
 
-def fly(flyer: ActorFlyer, preset: str, latency: float, seed: int) -> int:
+def fly(flyer: ActorFlyer, preset: str, lift: float, latency: float, seed: int) -> int:
     """Fly three laps; return the gates passed."""
     vehicle = PlantVehicle(flyer.contract["source"]["track"], preset)
     limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
-    chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=vehicle.track.laps, arm=True))
+    chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=vehicle.track.laps, arm=True, lift=lift))
     try:
         LockStep(vehicle, dataclasses.replace(USUAL, seed=seed, latency=latency)).fly(chain, flyer.rate, LONGEST)
     finally:

@@ -196,7 +196,8 @@ def replay(config: HilConfig) -> int:
     """Play a flight through the chain again; return 0 if every tick comes out as it was written, 1 otherwise."""
     assert config.replay is not None, "checked"
     flight = Flight(Path(config.replay))
-    flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), flight.about["config"]))
+    written = {"lift": 0.0, **flight.about["config"]}  # flights of old were not lifted
+    flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), written))
     settings = cast(HilConfig, flown)
     if not flight.holds_track:
         print("note: the recording does not hold its track: it is taken as it is now")

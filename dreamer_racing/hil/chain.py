@@ -22,7 +22,11 @@ from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
-from dreamer_racing.hil.vehicle import Pose, Setpoint
+from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
+
+LIFT = 1.15
+"""Weights of thrust by which a vehicle is lifted off its stand (`benchmarks/start_of_flight.py`): a margin for a thrust
+map that is off by a tenth, and 0.2 m/s after 0.14 s, one centimetre up."""
 
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
@@ -39,6 +43,7 @@ class ChainConfig(NamedTuple):
         laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
         arm: Whether it may arm at all.
         battery: What is known of it, where its voltage comes back and counts; None: nobody asks for it.
+        lift: Weights of thrust, straight up, until the vehicle is seen to move; 0: the flyer takes off by itself.
     """
 
     limits: SafetyLimits
@@ -47,6 +52,7 @@ class ChainConfig(NamedTuple):
     laps: int | None = None
     arm: bool = False
     battery: BatteryConfig | None = None
+    lift: float = LIFT
 
 
 class Inputs(NamedTuple):
@@ -74,7 +80,7 @@ class Outputs(NamedTuple):
 
     Args:
         verdict: State, command and reasons.
-        setpoint: What the flyer wanted; None without a pose, or if it was not asked: it is cut anyway.
+        setpoint: What the flyer wanted, or the lift off the stand; None without a pose, or if it is cut anyway.
         pose: For which it was chosen: the newest one, extrapolated to the tick.
         measured: When that was measured, s; not a number without a pose.
         image: What the flyer saw; None if it has no camera, or was not asked.
@@ -100,6 +106,10 @@ class Outputs(NamedTuple):
 class FlightChain:
     """Pose → image → flyer → safety.
 
+    A flyer's flight begins when its vehicle moves. On the stand it would be shown the first image again and again, and
+    its first action would fly for as many ticks as motion takes to be seen, which no episode of training begins with.
+    So the vehicle is lifted straight up first, and the flyer, which is asked all along, is begun anew when it moves.
+
     Args:
         flyer: Who flies.
         track: Where.
@@ -124,6 +134,8 @@ class FlightChain:
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
+        self._lifting = False  # whether the last tick's setpoint was the lift's
+        self._lift = Setpoint(config.lift * GRAVITY, np.zeros(3)) if config.lift else None
 
     def warm_up(self) -> None:
         """Do once what a tick does, before the first one: libraries take their time then."""
@@ -134,8 +146,10 @@ class FlightChain:
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
-        if not self._flying:  # until the vehicle moves or turns, each tick is the first of the flight
+        on_stand = not self._flying  # until the vehicle moves or turns, each tick is the first of the flight
+        if on_stand or self._lifting:
             self._flyer.reset()
+        if on_stand:
             self.progress.reset()
         for received in inputs.received:
             pose = self.clock.read(received)
@@ -159,6 +173,9 @@ class FlightChain:
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
         setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
+        self._lifting = on_stand and self._lift is not None
+        if self._lifting and setpoint is not None:
+            setpoint = self._lift
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
         self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
         measured = math.nan if self._newest is None else self._newest.time

@@ -14,7 +14,7 @@ from dreamer_racing.hil.battery import BatteryConfig
 from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import ChainConfig, FlightChain
+from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
 from dreamer_racing.hil.links import HEARING, LinkConfig
 from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
@@ -49,6 +49,7 @@ class HilConfig:
     arm: bool = False  # whether the vehicle may be armed at all
     laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
     duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
+    lift: float = setting(LIFT, Range(0, 3))  # weights of thrust until it moves; 0: the actor takes off by itself
     patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
     rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
     preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
@@ -106,6 +107,8 @@ def check(config: HilConfig) -> None:
             f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
             "agent that ships, actor=pilot track=kidney the scripted pilot."
         )
+    if 0.0 < config.lift <= 1.0:
+        raise ValueError(f"lift={config.lift:g}: lifts nothing; more than 1, or 0: the actor takes off by itself.")
     if config.operator not in ("auto", *OPERATORS):
         raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
     if config.operator == "timed" and config.link not in SIMULATED:
@@ -205,7 +208,9 @@ def pilot_contract(track: str) -> dict[str, Any]:
 def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     """Make the chain of a flyer."""
     limits = limits_of(config, track)
-    settings = ChainConfig(limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config))
+    settings = ChainConfig(
+        limits, stamping_of(config), config.latency, config.laps, config.arm, battery_config(config), config.lift
+    )
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
 

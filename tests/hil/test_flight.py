@@ -15,10 +15,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer
 from dreamer_racing.hil.loop import ENDING, FAREWELL
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
@@ -312,8 +313,38 @@ def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
     assert again.safety.state is State.CUT
 
 
-def test_what_is_held_fast_does_not_spin_for_ever():
-    plant = Watched(CIRCLE)
+@pytest.mark.parametrize("lift", [LIFT, 0.0])
+def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
+    class Noted(Hover):
+        """Turns; notes for which pose it chose first after it was begun."""
+
+        began: Pose | None = None
+        fresh = True
+
+        def reset(self):
+            self.fresh = True
+
+        def act(self, pose, image, target_gate):
+            if self.fresh:
+                self.began, self.fresh = pose, False
+            return Setpoint(14.0, np.array([0.0, 1.0, 0.0]))
+
+    flyer, plant = Noted(), Watched(CIRCLE)
+    config = ChainConfig(SafetyLimits.of_track(CIRCLE, arm_time=0.02), arm=True, lift=lift)
+    plant.fly(make_chain(flyer, plant.vehicle, config), flyer.rate, 1.5)
+    armed = [(moment, command.setpoint) for moment, command in plant.sent if command.armed]
+    lifted = [setpoint for _, setpoint in armed if setpoint.collective_thrust == pytest.approx(LIFT * GRAVITY)]
+    if not lift:
+        assert not lifted and armed[2][1].body_rates[1] > 0.0
+        return
+    assert len(lifted) > 5 and not any(setpoint.body_rates.any() for setpoint in lifted)
+    chosen = next(moment for moment, setpoint in armed if setpoint.body_rates.any())
+    assert flyer.began.time == pytest.approx(BEGAN + chosen, abs=0.001), "its first choice is the first that is sent"
+    assert 0.2 < flyer.began.linear_velocity[2] < 0.4
+
+
+def test_what_does_not_lift_off_does_not_spin_for_ever():
+    plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
     assert fly_hovering(plant).startswith("cut: it does not move")
     assert 3.0 < max(moment for moment, command in plant.sent if command.armed) < 4.0
 

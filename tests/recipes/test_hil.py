@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -32,6 +32,8 @@ flights = recipe_module("composing.flight")
         ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
         ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
+        ({"actor": "pilot", "lift": 0.9}, "lift=0.9: lifts nothing; more than 1, or 0"),
+        ({"actor": "pilot", "lift": 4.0}, "lift=4.0: must be at least 0 and at most 3"),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
     ],
 )
@@ -195,6 +197,27 @@ def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
     path.unlink()
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "run"))) == 0
     assert "does not hold its track" not in capsys.readouterr().out
+
+
+def test_a_flight_of_old_is_not_lifted_when_it_is_played_back(tmp_path):
+    config = hil.HilConfig(actor="circle", lift=0.0)
+    flyer, _ = hil.make_flyer(config)
+    written = hil.as_json(config)
+    del written["lift"]
+    inputs = hil.read_inputs(
+        {
+            "time": 10.0,
+            "received": [[10.0, 0, 0.0, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]],
+            "operator": [False, False],
+            "overrun": 0,
+        }
+    )
+    with (
+        closing(hil.make_chain(config, flyer, hil.load_track("circle"))) as chain,
+        FlightRecorder(tmp_path / FILE, {"config": written, "track": "circle"}) as recorder,
+    ):
+        recorder.tick(10.0, {"in": describe_inputs(inputs), "out": describe_outputs(chain.tick(inputs))})
+    assert hil.replay(hil.HilConfig(replay=str(tmp_path))) == 0
 
 
 def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
