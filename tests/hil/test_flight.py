@@ -365,9 +365,8 @@ def test_the_actor_forgets_until_the_vehicle_moves():
 
 @pytest.mark.parametrize("name", ["figure8", "kidney"])
 def test_shipped_agents_fly_a_lap_from_the_stand(name):
-    """They begin with a turn at 9.5 rad/s; one that remembers from 0.2 m/s on only, tilted by then, goes astray."""
     flyer = ActorFlyer(AGENTS / name)
-    plant = Watched(load_track(name))
+    plant = Watched(load_track(name), json.loads((AGENTS / name / "agent.json").read_text())["preset"])
     chain = chain_of(flyer, plant, laps=1)
     assert plant.fly(chain, flyer.rate, 10.0) == "disarmed: the flight is over"
     assert plant.vehicle.gates_passed == plant.vehicle.track.num_gates
