@@ -1,10 +1,11 @@
 """Flights of agents in real time against the plant in a process of its own: how many finish, how fast, how late.
 
     python benchmarks/flights.py --actors circle kidney figure8 --flights 10 --json flights.json
-    python benchmarks/flights.py --actors exports/paper_large --disarmed 15 --plant track=circle preset=easy
+    python benchmarks/flights.py --actors exports/paper_large --disarmed 15 --plant track=circle
 
 Each flight is what a person would type in two terminals, `recipes/plant.py` and `recipes/hil.py`, three laps long, with
-a seed of its own. By default poses are late by up to 2 ms, 1 % of them are lost, and they have 1 mm and 0.17° of noise.
+a seed of its own. The plant is the drone that the agent was trained on; by default poses are late by up to 2 ms, 1 % of
+them are lost, and they have 1 mm and 0.17° of noise.
 A flight counts as finished when every gate of its laps was passed. With --disarmed the loop sees, chooses and sends for
 so many seconds and never arms, which measures actors that cannot fly. Keep both cores idle meanwhile.
 """
@@ -20,8 +21,11 @@ from typing import Any
 
 from measuring import print_table, write_json
 
+from dreamer_racing.export.onnx_actor import read_contract
+
+AGENTS = Path(__file__).parents[1] / "agents"
 RECIPES = Path(__file__).parents[1] / "recipes"
-PLANT = ["preset=easy", "jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
+PLANT = ["jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
 COLUMNS = ("actor", "seed", "finished", "gates", "laps_s", "speed_max", "latency_p99_ms", "jitter_p99_ms", "overruns")
 LONGEST = 120  # s that a flight may take, start of both programs included
 
@@ -46,6 +50,14 @@ def main() -> None:
             write_json(records, arguments.json)
 
 
+def preset_of(actor: str) -> str:
+    """Physics that an actor was trained on; of the pilot the easy ones."""
+    if actor == "pilot":
+        return "easy"
+    folder = AGENTS / actor if (AGENTS / actor).is_dir() else Path(actor)
+    return str(read_contract(folder / "contract.json")["source"].get("preset", "easy"))
+
+
 def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Fly once; return what came of it.
 
@@ -55,6 +67,8 @@ def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> d
     plant = [*arguments.plant, f"seed={seed}"]
     if not any(option.startswith("track=") for option in plant):
         plant.append(f"track={Path(actor).name}")
+    if not any(option.startswith("preset=") for option in plant):
+        plant.append(f"preset={preset_of(actor)}")
     hil = [f"actor={actor}", f"run_dir={folder}", *arguments.hil]
     if arguments.disarmed:
         hil += ["arm=false", f"patience={arguments.disarmed:g}"]
