@@ -72,7 +72,8 @@ class Flown:
 
     def fly(self, ticks: int = 600) -> Path:
         limits = SafetyLimits.of_track(CIRCLE, **ACCUSTOMED)
-        chain = FlightChain(Wobble(), CIRCLE, ChainConfig(limits, self.stamping, WIRE, self.laps, self.arm), None)
+        config = ChainConfig(limits, self.stamping, WIRE, self.laps, self.arm, lift=0.0)  # it flies off by itself
+        chain = FlightChain(Wobble(), CIRCLE, config, None)
         settings = {"actor": "wobble", "track": None, "stamping": self.stamping.value, "latency": WIRE}
         about = {"config": settings, "rate": 1.0 / PERIOD, "contract": {"camera": {"width_px": 64}}, **self.about}
         random = np.random.default_rng(0)
