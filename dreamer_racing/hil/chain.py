@@ -20,13 +20,14 @@ from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
+from dreamer_racing.hil.reasons import Reason
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
 LIFT = 1.15
-"""Weights of thrust by which a vehicle is lifted off its stand (`benchmarks/start_of_flight.py`): a margin for a thrust
-map that is off by a tenth, and 0.2 m/s after 0.14 s, one centimetre up."""
+"""Weights of thrust by which a vehicle is lifted off its stand (`benchmarks/start_of_flight.py`): a margin for thrust
+that is a tenth less than believed; 0.2 m/s after 0.14 s, and 2 to 3 cm up when the flyer takes over."""
 
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
@@ -116,6 +117,9 @@ class FlightChain:
         config: The rest.
         camera: Draws what the flyer sees; None if it needs no image.
 
+    Raises:
+        ValueError: The lift lifts nothing, or is more than safety lets through.
+
     Attributes:
         progress: Which gates were passed.
         clock: Of the poses.
@@ -136,6 +140,11 @@ class FlightChain:
         self._flying = False  # whether the vehicle has been armed and has left the start
         self._lifting = False  # whether the last tick's setpoint was the lift's
         self._lift = Setpoint(config.lift * GRAVITY, np.zeros(3)) if config.lift else None
+        if self._lift is not None and not GRAVITY < self._lift.collective_thrust <= config.limits.thrust_max:
+            raise ValueError(
+                f"lift={config.lift:g} is {self._lift.collective_thrust:.1f} m/s²: it must be above {GRAVITY} and "
+                f"at most limits.thrust_max={config.limits.thrust_max:g}; 0: the flyer takes off by itself."
+            )
 
     def warm_up(self) -> None:
         """Do once what a tick does, before the first one: libraries take their time then."""
@@ -177,16 +186,19 @@ class FlightChain:
         if self._lifting and setpoint is not None:
             setpoint = self._lift
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
-        self._flying = finish or (verdict.command.armed and (self._flying or self._moves()))
+        sent = verdict.command.armed and Reason.ARMING not in verdict.reasons  # more than the least thrust
+        self._flying = finish or (verdict.command.armed and (self._flying or (sent and self._moves())))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
         voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
         return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s, voltage)
 
     def _moves(self) -> bool:
-        """Whether the newest pose is one of a vehicle that has left the start."""
+        """Whether the newest pose is one of a vehicle that has left the start: that rises, if it is being lifted."""
         if self._newest is None:
             return False
+        if self._lift is not None:
+            return float(self._newest.linear_velocity[2]) > self._config.limits.start_speed
         speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
         return speed > self._config.limits.start_speed or rate > START_RATE
 

@@ -22,6 +22,7 @@ from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer
 from dreamer_racing.hil.loop import ENDING, FAREWELL
+from dreamer_racing.hil.pose import Received, decode_pose
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
@@ -343,6 +344,39 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     assert 0.2 < flyer.began.linear_velocity[2] < 0.4
 
 
+@pytest.mark.parametrize(
+    ("velocity", "rates", "left"),
+    [((0.0, 0.0, 0.19), (0.0, 0.0, 0.0), False), ((0.0, 0.0, 0.21), (0.0, 0.0, 0.0), True),
+     ((0.5, 0.0, -0.5), (0.0, 9.0, 0.0), False)],
+)  # fmt: skip
+def test_what_is_lifted_has_left_when_it_rises(velocity, rates, left):
+    chain = chain_of(Hover(), Watched(CIRCLE))
+    chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
+    assert chain._moves() is left
+
+
+def test_a_lift_that_no_pose_shows_ends_low():
+    class Frozen(Watched):
+        def _deliver(self, data):
+            if self.elapsed < 0.4:
+                self.kept = decode_pose(data)
+            packet = decode_pose(data)._replace(position=self.kept.position, linear_velocity=np.zeros(3))
+            self.poses.arrived.append(Received(self.now(), packet))
+
+    plant = Frozen(CIRCLE)
+    heights = []
+    plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2])
+    assert "it does not move" in plant.fly(chain_of(Hover(), plant, lift_off_time=0.8), Hover.rate, 3.0)
+    assert max(heights) - heights[0] < 0.5
+
+
+@pytest.mark.parametrize(("lift", "limits"), [(0.9, {}), (-1.0, {}), (1.15, {"thrust_max": 11.0})])
+def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
+    config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
+    with pytest.raises(ValueError, match=rf"lift={lift:g} is .*limits.thrust_max="):
+        FlightChain(Hover(), CIRCLE, config, None)
+
+
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
     assert fly_hovering(plant).startswith("cut: it does not move")
@@ -379,7 +413,7 @@ def test_shipped_agents_fly_a_lap_from_the_stand(name):
      ((0.19, 0.0, 0.0), (0.0, 0.0, 0.0), False), ((0.21, 0.0, 0.0), (0.0, 0.0, 0.0), True)],
 )  # fmt: skip
 def test_what_counts_as_having_left_the_start(velocity, rates, left):
-    chain = chain_of(Hover(), Watched(CIRCLE))
+    chain = make_chain(Hover(), PlantVehicle(CIRCLE), ChainConfig(SafetyLimits.of_track(CIRCLE), lift=0.0))
     chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
     assert chain._moves() is left
 
