@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from dreamer_racing.envs.tracks import describe_track, load_track
 from dreamer_racing.evaluation.trajectory import Trajectory, write_trajectory
 from dreamer_racing.figures.hil import LATENCY, REPORT, TRACKING, TRAJECTORY, trajectory_of, write_report
 from dreamer_racing.figures.hil_numbers import Response, read_flown, tracking_error
+from dreamer_racing.hil import recording
 from dreamer_racing.hil.chain import ChainConfig, FlightChain, Inputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
@@ -77,7 +79,9 @@ class Flown:
         settings = {"actor": "wobble", "track": None, "stamping": self.stamping.value, "latency": WIRE}
         about = {"config": settings, "rate": 1.0 / PERIOD, "contract": {"camera": {"width_px": 64}}, **self.about}
         random = np.random.default_rng(0)
-        with FlightRecorder(self.folder / FILE, about) as recorder:
+        with patch.object(recording, "WAITING_MOST", ticks + 1):  # it flies faster than a disk may write
+            recorder = FlightRecorder(self.folder / FILE, about)
+        with recorder:
             flew = False
             for index in range(ticks):
                 now = BEGAN + PERIOD * index
