@@ -186,8 +186,8 @@ class FlightChain:
         if self._lifting and setpoint is not None:
             setpoint = self._lift
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
-        sent = verdict.command.armed and Reason.ARMING not in verdict.reasons  # more than the least thrust
-        self._flying = finish or (verdict.command.armed and (self._flying or (sent and self._moves())))
+        waits = self._lift is not None and Reason.ARMING in verdict.reasons  # the lift has not been sent yet
+        self._flying = finish or (verdict.command.armed and (self._flying or (not waits and self._moves())))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
         voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
