@@ -55,6 +55,8 @@ def preset_of(actor: str) -> str:
     if actor == "pilot":
         return "easy"
     folder = AGENTS / actor if (AGENTS / actor).is_dir() else Path(actor)
+    if folder.suffix == ".onnx":
+        folder = folder.parent
     return str(read_contract(folder / "contract.json")["source"].get("preset", "easy"))
 
 

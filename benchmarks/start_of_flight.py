@@ -4,8 +4,9 @@
 
 On its stand a vehicle shows an actor the first image again and again, until the loop sees that it moves: with poses
 that are late, and a vehicle that answers late, the actor's first action is flown for two or three ticks instead of one.
-`--lift 0` is that; with `--lift 1.15`, the default of `recipes/hil.py`, it is lifted straight up with so many times its
-weight until it moves, and the actor begins then. Poses are otherwise as `recipes/sim_to_real.py` has them.
+`--lift 0` is that; with `--lift 1.4`, the default of `recipes/hil.py`, it is lifted straight up with ever more thrust,
+up to so many times its weight, until it rises, and the actor begins then. Poses are otherwise as
+`recipes/sim_to_real.py` has them.
 """
 
 import argparse
@@ -40,22 +41,26 @@ def main() -> None:
     for lift in arguments.lift:
         flyer = ActorFlyer(arguments.actor)
         for latency in LATENCIES:
-            gates = [fly(flyer, arguments.preset, lift, latency, seed) for seed in range(arguments.flights)]
-            records.append({"preset": arguments.preset, "lift": lift, "latency_s": latency, "gates": gates})
-            print_table([records[-1]], list(records[-1]))
+            flights = [fly(flyer, arguments.preset, lift, latency, seed) for seed in range(arguments.flights)]
+            gates, ended = zip(*flights, strict=True)
+            records.append(
+                {"preset": arguments.preset, "lift": lift, "latency_s": latency, "gates": gates, "ended": ended}
+            )
+            print_table([records[-1]], list(records[-1])[:-1])
     write_json(records, arguments.json)
 
 
-def fly(flyer: ActorFlyer, preset: str, lift: float, latency: float, seed: int) -> int:
-    """Fly three laps; return the gates passed."""
+def fly(flyer: ActorFlyer, preset: str, lift: float, latency: float, seed: int) -> tuple[int, str]:
+    """Fly three laps; return the gates passed, and why the flight ended."""
     vehicle = PlantVehicle(flyer.contract["source"]["track"], preset)
     limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
     chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=vehicle.track.laps, arm=True, lift=lift))
     try:
-        LockStep(vehicle, dataclasses.replace(USUAL, seed=seed, latency=latency)).fly(chain, flyer.rate, LONGEST)
+        plant = LockStep(vehicle, dataclasses.replace(USUAL, seed=seed, latency=latency))
+        ended = plant.fly(chain, flyer.rate, LONGEST)
     finally:
         chain.close()
-    return vehicle.gates_passed
+    return vehicle.gates_passed, ended
 
 
 if __name__ == "__main__":

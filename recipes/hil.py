@@ -126,7 +126,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
         watchers.append(view.show)
     print(f"{config.actor} on {track.name} at {flyer.rate:g} Hz, link={config.link}, arm={config.arm}: {folder}")
     print(f"poses: {config.pose}, stamped by {config.stamping.value}")
-    lifted = f"straight up with {config.lift:g} of its weight until it moves, then by"
+    lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)

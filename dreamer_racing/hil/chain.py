@@ -21,13 +21,22 @@ from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.reasons import Reason
-from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
+from dreamer_racing.hil.safety import Safety, SafetyLimits, State, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
-LIFT = 1.15
-"""Weights of thrust by which a vehicle is lifted off its stand (`benchmarks/start_of_flight.py`): a margin for thrust
-that is a tenth less than believed; 0.2 m/s after 0.14 s, and 2 to 3 cm up when the flyer takes over."""
+LIFT = 1.4
+"""Weights of thrust that the lift off the stand grows to [choice]. It begins at one: a vehicle that is as believed
+rises gently, at 0.2 m/s after a third of a second and 2 to 3 cm, and so does a heavier one, later."""
+
+LIFT_TIME = 1.0
+"""s in which it grows to that [choice]; `benchmarks/start_of_flight.py` flies it."""
+
+LIFT_MOST = 1.5
+"""Weights: what needs more to rise cannot be flown by an actor that was trained on another drone [choice]."""
+
+RISING = 2
+"""Poses in a row by which a vehicle must rise before its flyer takes over: one may be wrong."""
 
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
@@ -44,7 +53,8 @@ class ChainConfig(NamedTuple):
         laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
         arm: Whether it may arm at all.
         battery: What is known of it, where its voltage comes back and counts; None: nobody asks for it.
-        lift: Weights of thrust, straight up, until the vehicle is seen to move; 0: the flyer takes off by itself.
+        lift: Weights of thrust, straight up, that it grows to until the vehicle is seen to rise; 0: the flyer takes off
+            by itself.
     """
 
     limits: SafetyLimits
@@ -109,7 +119,8 @@ class FlightChain:
 
     A flyer's flight begins when its vehicle moves. On the stand it would be shown the first image again and again, and
     its first action would fly for as many ticks as motion takes to be seen, which no episode of training begins with.
-    So the vehicle is lifted straight up first, and the flyer, which is asked all along, is begun anew when it moves.
+    So the vehicle is lifted straight up first, ever harder, and the flyer, which is asked all along, is begun anew when
+    it rises. What is not seen to rise is cut after `SafetyLimits.lift_off_time`.
 
     Args:
         flyer: Who flies.
@@ -118,7 +129,7 @@ class FlightChain:
         camera: Draws what the flyer sees; None if it needs no image.
 
     Raises:
-        ValueError: The lift lifts nothing, or is more than safety lets through.
+        ValueError: The lift lifts nothing, or is more than is sensible or safety lets through.
 
     Attributes:
         progress: Which gates were passed.
@@ -139,11 +150,13 @@ class FlightChain:
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
         self._lifting = False  # whether the last tick's setpoint was the lift's
-        self._lift = Setpoint(config.lift * GRAVITY, np.zeros(3)) if config.lift else None
-        if self._lift is not None and not GRAVITY < self._lift.collective_thrust <= config.limits.thrust_max:
+        self._armed_at: float | None = None
+        self._rising = 0  # poses in a row by which it rises
+        most = min(LIFT_MOST, config.limits.thrust_max / GRAVITY)
+        if config.lift and not 1.0 < config.lift <= most:
             raise ValueError(
-                f"lift={config.lift:g} is {self._lift.collective_thrust:.1f} m/s²: it must be above {GRAVITY} and "
-                f"at most limits.thrust_max={config.limits.thrust_max:g}; 0: the flyer takes off by itself."
+                f"lift={config.lift:g}: must be more than 1 weight and at most {LIFT_MOST:g}, within "
+                f"limits.thrust_max={config.limits.thrust_max:g} m/s²; 0: the flyer takes off by itself."
             )
 
     def warm_up(self) -> None:
@@ -165,6 +178,7 @@ class FlightChain:
             if pose is not None:
                 self.progress.update(pose)
                 self._newest = pose
+                self._rising = self._rising + 1 if pose.linear_velocity[2] > self._config.limits.start_speed else 0
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
         tick = Tick(
@@ -182,23 +196,35 @@ class FlightChain:
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
         setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
-        self._lifting = on_stand and self._lift is not None
+        self._lifting = on_stand and bool(self._config.lift) and self._armed_at is not None
         if self._lifting and setpoint is not None:
-            setpoint = self._lift
+            setpoint = self._lift(inputs.time)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
-        waits = self._lift is not None and Reason.ARMING in verdict.reasons  # the lift has not been sent yet
-        self._flying = finish or (verdict.command.armed and (self._flying or (not waits and self._moves())))
+        armed = verdict.command.armed
+        if not armed:
+            self._armed_at = None
+        elif self._armed_at is None:
+            self._armed_at = inputs.time
+        self._flying = finish or (armed and (self._flying or self._has_left(verdict)))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
         voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
         return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s, voltage)
 
-    def _moves(self) -> bool:
-        """Whether the newest pose is one of a vehicle that has left the start: that rises, if it is being lifted."""
+    def _lift(self, now: float) -> Setpoint:
+        """Return the lift at a tick: one weight when its first command is let through, and then ever more."""
+        assert self._armed_at is not None
+        share = (now - self._armed_at - self._config.limits.arm_time) / LIFT_TIME
+        weights = 1.0 + (self._config.lift - 1.0) * min(max(share, 0.0), 1.0)
+        return Setpoint(weights * GRAVITY, np.zeros(3))
+
+    def _has_left(self, verdict: Verdict) -> bool:
+        """Whether the vehicle has left the start: rises, where it is lifted, and is told to do so."""
         if self._newest is None:
             return False
-        if self._lift is not None:
-            return float(self._newest.linear_velocity[2]) > self._config.limits.start_speed
+        if self._config.lift:
+            lifted = verdict.state is State.FLYING and Reason.ARMING not in verdict.reasons
+            return lifted and self._rising >= RISING
         speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
         return speed > self._config.limits.start_speed or rate > START_RATE
 

@@ -29,6 +29,12 @@ logger = logging.getLogger(__name__)
 LIFT_OFF = 0.5
 """Share of its weight that a drone must be asked to carry before the stand lets go [choice]."""
 
+BEARS_ITSELF = 0.99
+"""Share of its weight that a drone is asked for when the stand bears nothing of it any more: hover, rounded."""
+
+STAND = 0.1
+"""m from its start, sideways, within which the stand bears a drone that it has let go [choice]."""
+
 SPIN_UP = 5.0
 """Motor lags for which it must be asked that: rotors then give 98.7 % of the thrust that they are to [choice]."""
 
@@ -62,8 +68,9 @@ class PlantVehicle:
 
     It begins on a stand at the track's start pose, which holds it until it has been armed and asked for more than half
     of its weight for as long as its rotors take to spin up (`LIFT_OFF`, `SPIN_UP`): at hover it then stays where it is.
-    A lap is timed from there. Passes and crashes are those of `Race`, judged once a control step of the preset; after a
-    crash the motors are off for good, and what is in the air falls to the ground and stays.
+    Until it is asked for all of its weight it may slide off the stand (`STAND`), but not sink through it. A lap is
+    timed from there. Passes and crashes are those of `Race`, judged once a control step of the preset; after a crash
+    the motors are off for good, and what is in the air falls to the ground and stays.
 
     Args:
         track: Name, path, or a `Track`.
@@ -143,7 +150,7 @@ class PlantVehicle:
         self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
-        self.on_stand, self.gates_passed = True, 0
+        self.on_stand, self._bears, self.gates_passed = True, True, 0
         self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:] = 0.0
@@ -224,6 +231,8 @@ class PlantVehicle:
             self._hold(self._start)
             self._maybe_let_go()
         elif self.crash is CrashCause.NONE:
+            if self._bears:
+                self._maybe_bear()
             self._judge()
         elif not self._qpos[2] > GROUND_HEIGHT:  # nor if it is no number
             self._lie()
@@ -247,10 +256,13 @@ class PlantVehicle:
         place = self._qpos if np.isfinite(self._qpos).all() else self._start
         self._hold(np.array((*place[:2], GROUND_HEIGHT, *place[3:])))
 
+    def _asked(self) -> float:
+        """Return the thrust that it is asked for, N."""
+        return float(self._setpoint[0] if self._target_speed is None else np.square(self._target_speed).sum())
+
     def _maybe_let_go(self) -> None:
         """Let the drone go once it has been asked to carry itself for long enough."""
-        asked = self._setpoint[0] if self._target_speed is None else float(np.square(self._target_speed).sum())
-        if not (self.armed and asked > LIFT_OFF * self.parameters.mass * GRAVITY):
+        if not (self.armed and self._asked() > LIFT_OFF * self.parameters.mass * GRAVITY):
             self._lift_off_step = None
             return
         if self._lift_off_step is None:
@@ -261,6 +273,13 @@ class PlantVehicle:
             position = torch.from_numpy(self._start[:3]).unsqueeze(0)
             self._race.begin(torch.tensor([True]), position, torch.tensor([0]))
             logger.info("plant: the stand let go at %.2f s", self.time)
+
+    def _maybe_bear(self) -> None:
+        """Keep what has been let go, and does not bear itself yet, from sinking through the stand."""
+        away = self._qpos[:3] - self._start[:3]
+        self._bears &= self._asked() < BEARS_ITSELF * self.parameters.mass * GRAVITY and math.hypot(*away[:2]) < STAND
+        if self._bears and away[2] < 0.0:
+            self._qpos[2], self._qvel[2] = self._start[2], max(self._qvel[2], 0.0)
 
     def _judge(self) -> None:
         """Keep the path of a control step, and at its end have it judged."""

@@ -19,10 +19,11 @@ from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, describe_outputs, read_inputs
+from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain, Inputs, describe_outputs, read_inputs
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer
 from dreamer_racing.hil.loop import ENDING, FAREWELL
-from dreamer_racing.hil.pose import Received, decode_pose
+from dreamer_racing.hil.operator import Operator
+from dreamer_racing.hil.pose import PosePacket, Received, decode_pose
 from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from dreamer_racing.hil.safety import SafetyLimits, State
 from dreamer_racing.hil.vehicle import Command, Pose, Setpoint, hover
@@ -334,53 +335,92 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, arm_time=0.02), arm=True, lift=lift)
     plant.fly(make_chain(flyer, plant.vehicle, config), flyer.rate, 1.5)
     armed = [(moment, command.setpoint) for moment, command in plant.sent if command.armed]
-    lifted = [setpoint for _, setpoint in armed if setpoint.collective_thrust == pytest.approx(LIFT * GRAVITY)]
+    turning = next(index for index, (_, setpoint) in enumerate(armed) if setpoint.body_rates.any())
     if not lift:
-        assert not lifted and armed[2][1].body_rates[1] > 0.0
+        assert turning == 2
         return
-    assert len(lifted) > 5 and not any(setpoint.body_rates.any() for setpoint in lifted)
-    chosen = next(moment for moment, setpoint in armed if setpoint.body_rates.any())
-    assert flyer.began.time == pytest.approx(BEGAN + chosen, abs=0.001), "its first choice is the first that is sent"
+    thrusts = [setpoint.collective_thrust / GRAVITY for _, setpoint in armed[2:turning]]
+    assert len(thrusts) > 10 and thrusts == sorted(thrusts) and thrusts[0] < 1.01 and 1.1 < thrusts[-1] < 1.2
+    began = armed[turning][0]
+    assert flyer.began.time == pytest.approx(BEGAN + began, abs=0.001), "its first choice is the first that is sent"
     assert 0.2 < flyer.began.linear_velocity[2] < 0.4
 
 
+SLOW, RISES, SINKS = (0.0, 0.0, 0.19), (0.0, 0.0, 0.21), (0.5, 0.0, -0.5)
+
+
 @pytest.mark.parametrize(
-    ("velocity", "rates", "left"),
-    [((0.0, 0.0, 0.19), (0.0, 0.0, 0.0), False), ((0.0, 0.0, 0.21), (0.0, 0.0, 0.0), True),
-     ((0.5, 0.0, -0.5), (0.0, 9.0, 0.0), False)],
+    ("lift", "poses", "left"),
+    [(LIFT, [(RISES, 0.0), (RISES, 0.0)], True), (LIFT, [(RISES, 0.0), (SLOW, 0.0), (RISES, 0.0)], False),
+     (LIFT, [(SLOW, 2.1)] * 3, False), (LIFT, [(SINKS, 9.0)] * 3, False),
+     (0.0, [(RISES, 0.0)], True), (0.0, [(SLOW, 1.9)], False), (0.0, [(SLOW, 2.1)], True)],
 )  # fmt: skip
-def test_what_is_lifted_has_left_when_it_rises(velocity, rates, left):
-    chain = chain_of(Hover(), Watched(CIRCLE))
-    chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
-    assert chain._moves() is left
+def test_what_counts_as_having_left_the_start(lift, poses, left):
+    limits = SafetyLimits.of_track(CIRCLE, arm_time=0.02, start_yaw_degrees=0.0)
+    config = ChainConfig(limits, arm=True, lift=lift)
+    chain = make_chain(Hover(), PlantVehicle(CIRCLE), config)
+    still = [((0.0, 0.0, 0.0), 0.0)] * 16
+    for count, (velocity, rate) in enumerate([*still, *poses]):
+        now = 10.0 + 0.02 * count
+        place, level = np.array(CIRCLE.start_position), np.array([1.0, 0.0, 0.0, 0.0])
+        packet = PosePacket(count, now, place, level, np.array(velocity), np.array((0.0, rate, 0.0)))
+        outputs = chain.tick(Inputs(now, [Received(now, packet)], Operator(count > 12, False), 0))
+        assert outputs.verdict.command.armed is (count > 12)
+    assert chain._flying is left
 
 
-def test_a_lift_that_no_pose_shows_ends_low():
-    class Frozen(Watched):
+def test_a_vehicle_that_is_not_armed_is_asked_for_what_its_flyer_wants():
+    class Turn(Hover):
+        def act(self, pose, image, target_gate):
+            return Setpoint(14.0, np.array([0.0, 1.0, 0.0]))
+
+    plant, wanted = Watched(CIRCLE), []
+    chain = chain_of(Turn(), plant, arm=False)
+    tick = chain.tick
+    chain.tick = lambda inputs: wanted.append(tick(inputs)) or wanted[-1]
+    plant.fly(chain, Hover.rate, 1.0)
+    assert {outputs.setpoint.collective_thrust for outputs in wanted if outputs.pose is not None} == {14.0}
+
+
+@pytest.mark.parametrize("changed", [{"thrust": 0.85}, {"mass": 1.1}, {"thrust": 1.2}, {"delay": 0.06}])
+def test_another_vehicle_than_believed_is_lifted_too(changed):
+    plant = Watched(CIRCLE, **changed)
+    heights = []
+    chain = chain_of(Hover(), plant)
+    plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2]) if not chain._flying else None
+    plant.fly(chain, Hover.rate, 2.0)
+    assert chain._flying and heights[-1] - heights[0] < 0.15
+
+
+@pytest.mark.parametrize("hidden", ["everything", "velocity"])
+def test_a_lift_that_no_pose_shows_ends_low(hidden):
+    class Blind(Watched):
         def _deliver(self, data):
+            packet = decode_pose(data)._replace(linear_velocity=np.zeros(3))
             if self.elapsed < 0.4:
-                self.kept = decode_pose(data)
-            packet = decode_pose(data)._replace(position=self.kept.position, linear_velocity=np.zeros(3))
+                self.kept = packet.position
+            if hidden == "everything":
+                packet = packet._replace(position=self.kept)
             self.poses.arrived.append(Received(self.now(), packet))
 
-    plant = Frozen(CIRCLE)
+    plant = Blind(CIRCLE)
     heights = []
     plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2])
-    assert "it does not move" in plant.fly(chain_of(Hover(), plant, lift_off_time=0.8), Hover.rate, 3.0)
-    assert max(heights) - heights[0] < 0.5
+    assert "it does not move" in plant.fly(chain_of(Hover(), plant), Hover.rate, 3.0)
+    assert max(heights) - heights[0] < 0.6
 
 
-@pytest.mark.parametrize(("lift", "limits"), [(0.9, {}), (-1.0, {}), (1.15, {"thrust_max": 11.0})])
+@pytest.mark.parametrize(("lift", "limits"), [(0.9, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
-    with pytest.raises(ValueError, match=rf"lift={lift:g} is .*limits.thrust_max="):
+    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be more than 1 weight.*limits.thrust_max="):
         FlightChain(Hover(), CIRCLE, config, None)
 
 
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
     assert fly_hovering(plant).startswith("cut: it does not move")
-    assert 3.0 < max(moment for moment, command in plant.sent if command.armed) < 4.0
+    assert 1.0 < max(moment for moment, command in plant.sent if command.armed) < 2.0
 
 
 def test_the_actor_forgets_until_the_vehicle_moves():
@@ -405,17 +445,6 @@ def test_shipped_agents_fly_a_lap_from_the_stand(name):
     assert plant.fly(chain, flyer.rate, 10.0) == "disarmed: the flight is over"
     assert plant.vehicle.gates_passed == plant.vehicle.track.num_gates
     chain.close()
-
-
-@pytest.mark.parametrize(
-    ("velocity", "rates", "left"),
-    [((0.0, 0.0, 0.0), (0.0, 1.9, 0.0), False), ((0.0, 0.0, 0.0), (0.0, 2.1, 0.0), True),
-     ((0.19, 0.0, 0.0), (0.0, 0.0, 0.0), False), ((0.21, 0.0, 0.0), (0.0, 0.0, 0.0), True)],
-)  # fmt: skip
-def test_what_counts_as_having_left_the_start(velocity, rates, left):
-    chain = make_chain(Hover(), PlantVehicle(CIRCLE), ChainConfig(SafetyLimits.of_track(CIRCLE), lift=0.0))
-    chain._newest = Pose(0.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.array(velocity), np.array(rates))
-    assert chain._moves() is left
 
 
 def test_after_a_stall_the_next_tick_is_late_and_those_after_it_are_on_the_grid():

@@ -21,6 +21,7 @@ LIMITS = SafetyLimits(
     start_position=(1, 0, 0),
     velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities
     turn_tolerance_degrees=180,  # and as they like, but for those of turns
+    lift_off_time=3.0,  # and they take their time
 )
 OFF, ON, KILL = Operator(False, False), Operator(True, False), Operator(True, True)
 SETPOINT = Setpoint(12.0, np.array([1.0, -2.0, 0.5]))
@@ -326,7 +327,7 @@ def test_a_pose_of_which_anything_changes_is_not_frozen(moved):
 
 
 def test_what_stands_on_the_ground_may_be_measured_the_same_again_and_again():
-    assert Flight(lift_off_time=3.0).flying().ticks(80).state is State.FLYING
+    assert Flight().flying().ticks(80).state is State.FLYING
 
 
 def test_tilt_counts_anew_after_being_upright():

@@ -156,6 +156,7 @@ def test_a_sample_passes_its_gradient_to_what_it_was_drawn_by() -> None:
 
 
 def test_weights_are_cast_by_one_kernel_and_come_back() -> None:
+    torch.manual_seed(0)
     module = nn.Sequential(nn.Linear(4, 8), LayerNorm(8), nn.Linear(8, 2))
     before, inputs = list(module.parameters()), torch.randn(3, 4)
 
@@ -172,7 +173,8 @@ def test_weights_are_cast_by_one_kernel_and_come_back() -> None:
 
     for one, other in zip(run(True), run(False), strict=True):
         assert one.dtype == torch.float32
-        torch.testing.assert_close(one, other, rtol=0.02, atol=0.02)
+        bound = 0.02 * float(other.abs().max())  # of 300 seeds the worst is 0.015; an element alone may cancel
+        torch.testing.assert_close(one, other, rtol=0.0, atol=bound)
     casts = {once: launches(lambda once=once: run(once)).kernels for once in (True, False)}
     assert casts[True]["_foreach_copy_"] == 2, "there and back"
     assert casts[True]["_to_copy"] < casts[False]["_to_copy"]

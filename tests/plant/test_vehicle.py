@@ -65,6 +65,20 @@ def test_the_stand_holds_until_it_is_armed_and_asked_for_half_of_its_weight(comm
     assert vehicle.on_stand is held
 
 
+@pytest.mark.parametrize(("rates", "sinks"), [((0.0, 0.0, 0.0), False), ((0.0, 1.0, 0.0), True)])
+def test_the_stand_bears_what_does_not_bear_itself_until_it_slides_off(rates: tuple[float, ...], sinks: bool) -> None:
+    vehicle = PlantVehicle("circle")
+    vehicle.command(armed(0.8 * GRAVITY))
+    vehicle.advance(0.3)
+    assert not vehicle.on_stand
+    vehicle.command(Command(True, Setpoint(0.8 * GRAVITY, np.array(rates))))
+    vehicle.advance(0.8)
+    pose = vehicle.pose()
+    assert bool(pose.position[2] < START[2] - 0.05) is sinks
+    if not sinks:
+        assert pose.position == pytest.approx(START) and pose.linear_velocity == pytest.approx(np.zeros(3), abs=1e-6)
+
+
 def test_a_moment_of_thrust_is_not_enough_to_leave_the_stand() -> None:
     vehicle = PlantVehicle("circle")
     for _ in range(5):
