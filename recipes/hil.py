@@ -128,6 +128,8 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     print(f"poses: {config.pose}, stamped by {config.stamping.value}")
     lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
+    if preset := contract["source"].get("preset"):
+        print(f"its drone: {config.actor} was trained on that of preset={preset}, and may not fly another")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 
