@@ -4,7 +4,7 @@
 
 On its stand a vehicle shows an actor the first image again and again, until the loop sees that it moves: with poses
 that are late, and a vehicle that answers late, the actor's first action is flown for two or three ticks instead of one.
-`--lift 0` is that; with `--lift 1.4`, the default of `recipes/hil.py`, it is lifted straight up with ever more thrust,
+`--lift 0` is that; with `--lift 1.35`, the default of `recipes/hil.py`, it is lifted straight up with ever more thrust,
 up to so many times its weight, until it rises, and the actor begins then. Poses are otherwise as
 `recipes/sim_to_real.py` has them.
 """

@@ -20,23 +20,23 @@ from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
-from dreamer_racing.hil.reasons import Reason
-from dreamer_racing.hil.safety import Safety, SafetyLimits, State, Tick, Verdict
+from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
 
-LIFT = 1.4
-"""Weights of thrust that the lift off the stand grows to [choice]. It begins at one: a vehicle that is as believed
-rises gently, at 0.2 m/s after a third of a second and 2 to 3 cm, and so does a heavier one, later."""
+LIFT = 1.35
+"""Weights of thrust that the lift off the stand grows to within `SafetyLimits.lift_time` [choice]. It begins at one: a
+vehicle that is as believed rises gently, at 0.2 m/s after a third of a second and 2 to 3 cm, a heavier one later."""
 
-LIFT_TIME = 1.0
-"""s in which it grows to that [choice]; `benchmarks/start_of_flight.py` flies it."""
+LIFT_LEAST, LIFT_MOST = 1.1, 1.5
+"""Weights: less would not be seen in time, and what needs more is another drone than its actor's [choice]."""
 
-LIFT_MOST = 1.5
-"""Weights: what needs more to rise cannot be flown by an actor that was trained on another drone [choice]."""
+RISE_TIME = 0.04
+"""s for which all poses must show that a vehicle rises before its flyer takes over [choice]: the velocity that follows
+from a jump of 0.1 m, the largest that safety lets pass, has decayed by then (`PoseConfig.smoothing`)."""
 
-RISING = 2
-"""Poses in a row by which a vehicle must rise before its flyer takes over: one may be wrong."""
+RISE_HEIGHT = 0.01
+"""m above its stand at which it must be by then [choice]."""
 
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
@@ -53,8 +53,8 @@ class ChainConfig(NamedTuple):
         laps: After which the flight is over and the vehicle is disarmed; None: when the operator says so.
         arm: Whether it may arm at all.
         battery: What is known of it, where its voltage comes back and counts; None: nobody asks for it.
-        lift: Weights of thrust, straight up, that it grows to until the vehicle is seen to rise; 0: the flyer takes off
-            by itself.
+        lift: Weights of thrust, straight up, that are sent at the most until the vehicle is seen to rise; 0: the flyer
+            takes off by itself.
     """
 
     limits: SafetyLimits
@@ -91,7 +91,7 @@ class Outputs(NamedTuple):
 
     Args:
         verdict: State, command and reasons.
-        setpoint: What the flyer wanted, or the lift off the stand; None without a pose, or if it is cut anyway.
+        setpoint: What the flyer wanted, be it lifted instead; None without a pose, or if it is cut anyway.
         pose: For which it was chosen: the newest one, extrapolated to the tick.
         measured: When that was measured, s; not a number without a pose.
         image: What the flyer saw; None if it has no camera, or was not asked.
@@ -120,7 +120,7 @@ class FlightChain:
     A flyer's flight begins when its vehicle moves. On the stand it would be shown the first image again and again, and
     its first action would fly for as many ticks as motion takes to be seen, which no episode of training begins with.
     So the vehicle is lifted straight up first, ever harder, and the flyer, which is asked all along, is begun anew when
-    it rises. What is not seen to rise is cut after `SafetyLimits.lift_off_time`.
+    it rises. What is not seen to rise is cut after `SafetyLimits.lift_time`.
 
     Args:
         flyer: Who flies.
@@ -149,13 +149,13 @@ class FlightChain:
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
         self._newest: Pose | None = None
         self._flying = False  # whether the vehicle has been armed and has left the start
-        self._lifting = False  # whether the last tick's setpoint was the lift's
-        self._armed_at: float | None = None
-        self._rising = 0  # poses in a row by which it rises
+        self._lifting = False  # whether the vehicle was being lifted at the last tick
+        self._stand_height = math.inf  # m, of the newest pose before it was
+        self._rises_since = math.inf  # s, measured: the first of the poses in a row by which it rises
         most = min(LIFT_MOST, config.limits.thrust_max / GRAVITY)
-        if config.lift and not 1.0 < config.lift <= most:
+        if config.lift and not LIFT_LEAST <= config.lift <= most:
             raise ValueError(
-                f"lift={config.lift:g}: must be more than 1 weight and at most {LIFT_MOST:g}, within "
+                f"lift={config.lift:g}: must be at least {LIFT_LEAST:g} weights and at most {LIFT_MOST:g}, within "
                 f"limits.thrust_max={config.limits.thrust_max:g} m/s²; 0: the flyer takes off by itself."
             )
 
@@ -178,7 +178,7 @@ class FlightChain:
             if pose is not None:
                 self.progress.update(pose)
                 self._newest = pose
-                self._rising = self._rising + 1 if pose.linear_velocity[2] > self._config.limits.start_speed else 0
+                self._look_for_a_rise(pose)
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
         tick = Tick(
@@ -192,39 +192,42 @@ class FlightChain:
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,
+            lift=self._lift(inputs.time) if on_stand else None,
         )
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
         setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
-        self._lifting = on_stand and bool(self._config.lift) and self._armed_at is not None
-        if self._lifting and setpoint is not None:
-            setpoint = self._lift(inputs.time)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
-        armed = verdict.command.armed
-        if not armed:
-            self._armed_at = None
-        elif self._armed_at is None:
-            self._armed_at = inputs.time
-        self._flying = finish or (armed and (self._flying or self._has_left(verdict)))
+        self._lifting = tick.lift is not None and self.safety.lets_through
+        self._flying = finish or (verdict.command.armed and (self._flying or self._has_left()))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
         voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
         return Outputs(verdict, setpoint, pose, measured, image, target, passes, render_s, act_s, voltage)
 
-    def _lift(self, now: float) -> Setpoint:
-        """Return the lift at a tick: one weight when its first command is let through, and then ever more."""
-        assert self._armed_at is not None
-        share = (now - self._armed_at - self._config.limits.arm_time) / LIFT_TIME
-        weights = 1.0 + (self._config.lift - 1.0) * min(max(share, 0.0), 1.0)
+    def _lift(self, now: float) -> Setpoint | None:
+        """Return the lift at a tick, one weight to begin with and ever more; None: the flyer takes off by itself."""
+        config = self._config
+        if not config.lift or not self.safety.armed:
+            return None
+        share = (now - self.safety.sends_from) / config.limits.lift_time
+        weights = 1.0 + (config.lift - 1.0) * min(max(share, 0.0), 1.0)
         return Setpoint(weights * GRAVITY, np.zeros(3))
 
-    def _has_left(self, verdict: Verdict) -> bool:
-        """Whether the vehicle has left the start: rises, where it is lifted, and is told to do so."""
+    def _look_for_a_rise(self, pose: Pose) -> None:
+        """Note since when poses show that the vehicle rises, of those that it was lifted in."""
+        if not self._lifting:
+            self._stand_height = float(pose.position[2])
+        rises = self._lifting and pose.linear_velocity[2] > self._config.limits.start_speed
+        self._rises_since = min(self._rises_since, pose.time) if rises else math.inf
+
+    def _has_left(self) -> bool:
+        """Whether the vehicle has left the start: has been seen to rise for long enough, where it is lifted."""
         if self._newest is None:
             return False
         if self._config.lift:
-            lifted = verdict.state is State.FLYING and Reason.ARMING not in verdict.reasons
-            return lifted and self._rising >= RISING
+            risen = self._newest.position[2] - self._stand_height
+            return self._lifting and bool(self._newest.time - self._rises_since >= RISE_TIME and risen >= RISE_HEIGHT)
         speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
         return speed > self._config.limits.start_speed or rate > START_RATE
 

@@ -3,7 +3,7 @@
 | `State` | what is sent | ends with |
 |---|---|---|
 | DISARMED | at rest | the operator's enable, given anew, and nothing that speaks against it → FLYING |
-| FLYING | what the actor wants, within limits | pose or setpoint not fresh → HOLD; any other finding → CUT |
+| FLYING | what the actor wants, or the lift, within limits | pose or setpoint not fresh → HOLD; else → CUT |
 | HOLD | level hover thrust, zero body rates | both fresh again → FLYING; lost, or any other finding → CUT |
 | CUT | at rest | as DISARMED: it is latched until a new flight is begun on purpose |
 
@@ -38,6 +38,8 @@ class State(enum.Enum):
 
 _HOLDING = {Reason.POSE_STALE, Reason.NO_SETPOINT}
 _OVER = "the flight is over"
+TIPPING = 2.0
+"""Times the tilt within which it may arm, above which what is lifted counts as tipping over [choice]."""
 # Rates of zero, not such as would level it: a hold lasts 0.1 s, in which levelling would save some decimetres a second,
 # and the attitude to level from is the very thing that is no longer known: after 0.05 s at 10 rad/s it is off by 30°.
 _HOVER: Vector = (hover().collective_thrust, 0.0, 0.0, 0.0)
@@ -57,6 +59,7 @@ class Tick(NamedTuple):
         loop_overrun: Deadlines that the tick before missed, as it took longer than its period.
         finish: Whether the flight is over.
         command_dropped: Whether the command of the tick before did not go out.
+        lift: What is sent in place of what the actor wants, if that is usable, until the vehicle is seen to rise.
     """
 
     now: float
@@ -69,6 +72,7 @@ class Tick(NamedTuple):
     loop_overrun: int = 0
     finish: bool = False
     command_dropped: bool = False
+    lift: Setpoint | None = None
 
 
 class Verdict(NamedTuple):
@@ -134,7 +138,7 @@ class Safety:
     def examine(self, tick: Tick) -> Findings:
         """Take in a tick, all of it but its setpoint: the first half of `step`, before the actor has chosen."""
         findings = self._check_clock(tick) | self._check_people(tick) | self._check_loop(tick)
-        return findings | self._take_pose(tick) | self._check_flight()
+        return findings | self._take_pose(tick) | self._check_flight() | self._check_lift(tick)
 
     def cuts(self, findings: Findings) -> bool:
         """Whether they cut a vehicle that flies, whatever it is that the actor would choose."""
@@ -155,6 +159,16 @@ class Safety:
         if self._arming:
             findings[Reason.ARMING] = f"armed: the least thrust for {self.limits.arm_time:g} s"
         return Verdict(self.state, self._command(tick), tuple(findings), tuple(findings.values()))
+
+    @property
+    def sends_from(self) -> float:
+        """When the least thrust after arming ends, and what is wanted is sent, s; of the last flight if not armed."""
+        return self._armed_at + self.limits.arm_time
+
+    @property
+    def lets_through(self) -> bool:
+        """Whether the last tick sent what was wanted: neither arming nor holding."""
+        return self.state is State.FLYING and not self._arming
 
     @property
     def _arming(self) -> bool:
@@ -187,6 +201,8 @@ class Safety:
             wanted = self._least
         elif self.state is State.HOLD or wanted is None:
             wanted = _HOVER
+        elif tick.lift is not None:
+            wanted = _read_setpoint(tick.lift) or _HOVER
         limits = self.limits
         low = self._least[0], *(-rate for rate in limits.rate_max)
         high = limits.thrust_max, *limits.rate_max
@@ -310,6 +326,18 @@ class Safety:
         has_left = math.isfinite(self._left_at)
         if now - self._moved_at > limits.still_time if has_left else now - self._armed_at > limits.lift_off_time:
             findings[Reason.STRANDED] = "it does not move: is it held fast, or lying somewhere?"
+        return findings
+
+    def _check_lift(self, tick: Tick) -> Findings:
+        """Find what tips over or does not rise while it is lifted, whatever else it seems to do: a lift is blind."""
+        limits, seen = self.limits, self._motion.newest
+        if tick.lift is None or not self.armed:
+            return {}
+        findings: Findings = {}
+        if seen is not None and seen.tilt_degrees > TIPPING * limits.start_tilt_degrees:
+            findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° while it is lifted"
+        if self._now - self.sends_from > limits.lift_time:
+            findings[Reason.STRANDED] = f"it was not seen to rise within {limits.lift_time:g} s: is it held fast?"
         return findings
 
     def _check_setpoint(self, tick: Tick) -> Findings:

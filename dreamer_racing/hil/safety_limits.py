@@ -34,7 +34,7 @@ class SafetyLimits:
         start_box: m, from the start along each axis, within which it may arm.
         start_yaw_tolerance_degrees: from its yaw, within which it may arm.
         start_tilt_degrees: from level, within which it may arm.
-        start_speed: m/s, above which it does not arm.
+        start_speed: m/s, above which it does not arm, and has left the start when it is armed.
         release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
         arm_time: s after arming in which the least thrust is sent: Betaflight arms at low throttle only.
         hold_after: s, age of a pose above which it holds.
@@ -53,8 +53,8 @@ class SafetyLimits:
         tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
         tilt_time: s.
         still_time: s without more than `start_speed` after which what has flown counts as crashed: racers never hover.
-        lift_off_time: s after arming by which it must have moved: what is held fast must not spin on, and what rises
-            unseen must not rise far: half a metre by the lift of `chain.LIFT`.
+        lift_off_time: s after arming by which it must have moved: what is held fast must not spin on.
+        lift_time: s of a lift off the stand by which it must have been seen to rise: until then the lift is blind.
         thrust_min: m/s², least collective thrust when armed.
         thrust_max: m/s², largest.
         thrust_slew: m/s³, how fast it may change; the default lets the shipped actors swing fully in a tick of 25 Hz.
@@ -87,7 +87,8 @@ class SafetyLimits:
     tilt_max_degrees: float = setting(100.0, _DEGREES)
     tilt_time: float = setting(0.2, _TOLERANCE)
     still_time: float = setting(1.0, Range(0, 3600, open_below=True))
-    lift_off_time: float = setting(1.0, Range(0, 3600, open_below=True))
+    lift_off_time: float = setting(3.0, Range(0, 3600, open_below=True))
+    lift_time: float = setting(0.9, Range(0.1, 2.0))
     thrust_min: float = setting(0.0, Range(0, 100))
     thrust_max: float = setting(30.0, Range(0, 1000, open_below=True))
     thrust_slew: float = setting(700.0, _MOST)

@@ -30,9 +30,9 @@ LIFT_OFF = 0.5
 """Share of its weight that a drone must be asked to carry before the stand lets go [choice]."""
 
 BEARS_ITSELF = 0.99
-"""Share of its weight that a drone is asked for when the stand bears nothing of it any more: hover, rounded."""
+"""Share of its weight that a drone must be asked for, as long, before the stand bears it no more: hover, rounded."""
 
-STAND = 0.1
+STAND_RADIUS = 0.1
 """m from its start, sideways, within which the stand bears a drone that it has let go [choice]."""
 
 SPIN_UP = 5.0
@@ -68,9 +68,9 @@ class PlantVehicle:
 
     It begins on a stand at the track's start pose, which holds it until it has been armed and asked for more than half
     of its weight for as long as its rotors take to spin up (`LIFT_OFF`, `SPIN_UP`): at hover it then stays where it is.
-    Until it is asked for all of its weight it may slide off the stand (`STAND`), but not sink through it. A lap is
-    timed from there. Passes and crashes are those of `Race`, judged once a control step of the preset; after a crash
-    the motors are off for good, and what is in the air falls to the ground and stays.
+    Until it has been asked for all of its weight for as long, it may slide off the stand (`STAND_RADIUS`), but not sink
+    through it. A lap is timed from there. Passes and crashes are those of `Race`, judged once a control step of the
+    preset; after a crash the motors are off for good, and what is in the air falls to the ground and stays.
 
     Args:
         track: Name, path, or a `Track`.
@@ -116,6 +116,7 @@ class PlantVehicle:
         self._nominal_mass = nominal.mass
         self._race = Race(self.track, num_envs=1, control_dt=self.control_dt)
         self._build()
+        self._spin_up_steps = round(SPIN_UP * self.parameters.motor_time_constant / self.parameters.physics_dt)
         self._steps = 0
         self._until = 0.0  # s, to which physics was asked to go
         self.reset()
@@ -150,7 +151,7 @@ class PlantVehicle:
         self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
-        self.on_stand, self._bears, self.gates_passed = True, True, 0
+        self.on_stand, self._bears, self._flies_for, self.gates_passed = True, True, 0, 0
         self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:] = 0.0
@@ -227,6 +228,9 @@ class PlantVehicle:
             self._by_commands.step(0)
         else:
             self._turn_and_step()
+        if self._bears:
+            flies = self.armed and self._asked() >= BEARS_ITSELF * self.parameters.mass * GRAVITY
+            self._flies_for = self._flies_for + 1 if flies else 0
         if self.on_stand:
             self._hold(self._start)
             self._maybe_let_go()
@@ -266,8 +270,7 @@ class PlantVehicle:
             self._lift_off_step = None
             return
         if self._lift_off_step is None:
-            lags = SPIN_UP * self.parameters.motor_time_constant
-            self._lift_off_step = self._steps + round(lags / self.parameters.physics_dt)
+            self._lift_off_step = self._steps + self._spin_up_steps
         if self._steps >= self._lift_off_step:
             self.on_stand = False
             position = torch.from_numpy(self._start[:3]).unsqueeze(0)
@@ -277,7 +280,7 @@ class PlantVehicle:
     def _maybe_bear(self) -> None:
         """Keep what has been let go, and does not bear itself yet, from sinking through the stand."""
         away = self._qpos[:3] - self._start[:3]
-        self._bears &= self._asked() < BEARS_ITSELF * self.parameters.mass * GRAVITY and math.hypot(*away[:2]) < STAND
+        self._bears = self._flies_for < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
         if self._bears and away[2] < 0.0:
             self._qpos[2], self._qvel[2] = self._start[2], max(self._qvel[2], 0.0)
 

@@ -346,43 +346,93 @@ def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     assert 0.2 < flyer.began.linear_velocity[2] < 0.4
 
 
-SLOW, RISES, SINKS = (0.0, 0.0, 0.19), (0.0, 0.0, 0.21), (0.5, 0.0, -0.5)
+SLOW, RISES, SINKS, STILL = (0.0, 0.0, 0.19), (0.0, 0.0, 0.21), (0.5, 0.0, -0.5), (0.0, 0.0, 0.0)
+
+
+class Scripted:
+    """Feeds a chain with a pose at each tick of 50 Hz, on the start or above it; armed from the 14th tick on."""
+
+    def __init__(self, lift, **limits):
+        chosen = SafetyLimits.of_track(CIRCLE, arm_time=0.02, start_yaw_degrees=0.0, **limits)
+        self.chain = make_chain(Hover(), PlantVehicle(CIRCLE), ChainConfig(chosen, arm=True, lift=lift))
+        self.now = 10.0
+        for count in range(14):
+            outputs = self.tick(enable=count == 13)
+        assert outputs.verdict.command.armed and not self.chain._flying
+
+    def tick(self, velocity=STILL, rate=0.0, height=0.0, poses=True, enable=True):
+        self.now += 0.02
+        place, level = np.array(CIRCLE.start_position), np.array([1.0, 0.0, 0.0, 0.0])
+        place[2] += height
+        packet = PosePacket(round(self.now * 50), self.now, place, level, np.array(velocity), np.array((0, rate, 0.0)))
+        received = [Received(self.now, packet)] if poses else []
+        return self.chain.tick(Inputs(self.now, received, Operator(enable, False), 0))
 
 
 @pytest.mark.parametrize(
-    ("lift", "poses", "left"),
-    [(LIFT, [(RISES, 0.0), (RISES, 0.0)], True), (LIFT, [(RISES, 0.0), (SLOW, 0.0), (RISES, 0.0)], False),
-     (LIFT, [(SLOW, 2.1)] * 3, False), (LIFT, [(SINKS, 9.0)] * 3, False),
-     (0.0, [(RISES, 0.0)], True), (0.0, [(SLOW, 1.9)], False), (0.0, [(SLOW, 2.1)], True)],
+    ("poses", "left"),
+    [([(RISES, 0.0, 0.011)] * 4, True), ([(RISES, 0.0, 0.011)] * 2, False), ([(RISES, 0.0, 0.009)] * 9, False),
+     ([(RISES, 0.0, 0.02)] * 2 + [(SLOW, 0.0, 0.02)] + [(RISES, 0.0, 0.02)] * 2, False),
+     ([(SLOW, 2.1, 0.02)] * 9, False), ([(SINKS, 9.0, 0.02)] * 2, False)],
 )  # fmt: skip
-def test_what_counts_as_having_left_the_start(lift, poses, left):
-    limits = SafetyLimits.of_track(CIRCLE, arm_time=0.02, start_yaw_degrees=0.0)
-    config = ChainConfig(limits, arm=True, lift=lift)
-    chain = make_chain(Hover(), PlantVehicle(CIRCLE), config)
-    still = [((0.0, 0.0, 0.0), 0.0)] * 16
-    for count, (velocity, rate) in enumerate([*still, *poses]):
-        now = 10.0 + 0.02 * count
-        place, level = np.array(CIRCLE.start_position), np.array([1.0, 0.0, 0.0, 0.0])
-        packet = PosePacket(count, now, place, level, np.array(velocity), np.array((0.0, rate, 0.0)))
-        outputs = chain.tick(Inputs(now, [Received(now, packet)], Operator(count > 12, False), 0))
-        assert outputs.verdict.command.armed is (count > 12)
-    assert chain._flying is left
+def test_a_flyer_takes_over_from_a_lift_when_poses_have_risen_for_long_enough(poses, left):
+    flight = Scripted(LIFT)
+    for _ in range(3):
+        flight.tick()
+    for velocity, rate, height in poses:
+        flight.tick(velocity, rate, height)
+    assert flight.chain._flying is left
 
 
-def test_a_vehicle_that_is_not_armed_is_asked_for_what_its_flyer_wants():
+@pytest.mark.parametrize(
+    ("velocity", "rate", "left"), [(RISES, 0.0, True), (SLOW, 1.9, False), (SLOW, 2.1, True), (SINKS, 0.0, True)]
+)
+def test_what_counts_as_having_left_the_start_without_a_lift(velocity, rate, left):
+    flight = Scripted(0.0)
+    flight.tick(velocity, rate)
+    assert flight.chain._flying is left
+
+
+def test_what_rose_before_it_was_lifted_does_not_count():
+    flight = Scripted(LIFT, hold_after=0.03, cut_after=0.15)
+    for _ in range(3):
+        flight.tick(RISES, 0.0, 0.02)  # of the first the least thrust was sent, and the second is the first lifted
+    assert not flight.chain._flying
+    holding = [flight.tick(poses=False).verdict.state for _ in range(3)][-1]
+    assert holding is State.HOLD
+    flight.tick(RISES, 0.0, 0.04)
+    assert not flight.chain._flying, "what rose before, or while it held, begins anew"
+    for _ in range(4):
+        flight.tick(RISES, 0.0, 0.06)
+    assert flight.chain._flying
+
+
+def test_a_second_flight_is_lifted_from_one_weight_again():
+    flight = Scripted(LIFT)
+    first = [flight.tick().verdict.command.setpoint.collective_thrust for _ in range(20)]
+    assert not flight.tick(enable=False).verdict.command.armed
+    for _ in range(14):
+        flight.tick(enable=False)
+    flight.chain.safety.state = State.DISARMED
+    flight.tick()
+    second = [flight.tick().verdict.command.setpoint.collective_thrust for _ in range(20)]
+    assert first == pytest.approx(second) and first[1] == pytest.approx(GRAVITY, rel=0.01) and first[-1] > 11.0
+
+
+def test_what_the_flyer_wants_is_shown_also_when_it_is_lifted():
     class Turn(Hover):
         def act(self, pose, image, target_gate):
             return Setpoint(14.0, np.array([0.0, 1.0, 0.0]))
 
-    plant, wanted = Watched(CIRCLE), []
-    chain = chain_of(Turn(), plant, arm=False)
+    plant, shown = Watched(CIRCLE), []
+    chain = chain_of(Turn(), plant)
     tick = chain.tick
-    chain.tick = lambda inputs: wanted.append(tick(inputs)) or wanted[-1]
+    chain.tick = lambda inputs: shown.append(tick(inputs)) or shown[-1]
     plant.fly(chain, Hover.rate, 1.0)
-    assert {outputs.setpoint.collective_thrust for outputs in wanted if outputs.pose is not None} == {14.0}
+    assert {outputs.setpoint.collective_thrust for outputs in shown if outputs.pose is not None} == {14.0}
 
 
-@pytest.mark.parametrize("changed", [{"thrust": 0.85}, {"mass": 1.1}, {"thrust": 1.2}, {"delay": 0.06}])
+@pytest.mark.parametrize("changed", [{"thrust": 0.87}, {"mass": 1.1}, {"thrust": 1.2}, {"delay": 0.06}])
 def test_another_vehicle_than_believed_is_lifted_too(changed):
     plant = Watched(CIRCLE, **changed)
     heights = []
@@ -392,35 +442,50 @@ def test_another_vehicle_than_believed_is_lifted_too(changed):
     assert chain._flying and heights[-1] - heights[0] < 0.15
 
 
-@pytest.mark.parametrize("hidden", ["everything", "velocity"])
-def test_a_lift_that_no_pose_shows_ends_low(hidden):
+@pytest.mark.parametrize(("thrust", "low", "high"), [(1.0, 0.3, 0.6), (1.1, 0.6, 1.2), (1.2, 1.0, 1.7)])
+@pytest.mark.parametrize("hidden", ["everything", "velocity", "noise"])
+def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
+    noise = np.random.default_rng(0)
+
     class Blind(Watched):
         def _deliver(self, data):
-            packet = decode_pose(data)._replace(linear_velocity=np.zeros(3))
+            packet = decode_pose(data)
             if self.elapsed < 0.4:
                 self.kept = packet.position
-            if hidden == "everything":
-                packet = packet._replace(position=self.kept)
-            self.poses.arrived.append(Received(self.now(), packet))
+            velocity = noise.normal(0.0, 0.08, 3) if hidden == "noise" else np.zeros(3)
+            place = packet.position if hidden == "velocity" else self.kept
+            if hidden == "noise":
+                place = place + noise.normal(0.0, 0.001, 3)
+            self.poses.arrived.append(Received(self.now(), packet._replace(position=place, linear_velocity=velocity)))
 
-    plant = Blind(CIRCLE)
+    plant = Blind(CIRCLE, thrust=thrust)
     heights = []
     plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2])
-    assert "it does not move" in plant.fly(chain_of(Hover(), plant), Hover.rate, 3.0)
-    assert max(heights) - heights[0] < 0.6
+    assert "it was not seen to rise within 0.9 s" in plant.fly(chain_of(Hover(), plant), Hover.rate, 3.0)
+    assert low < max(heights) - heights[0] < high
 
 
-@pytest.mark.parametrize(("lift", "limits"), [(0.9, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
+def test_a_flyer_that_wants_nothing_usable_is_not_lifted():
+    class Broken(Hover):
+        def act(self, pose, image, target_gate):
+            return Setpoint(np.nan, np.zeros(3))
+
+    plant = Watched(CIRCLE)
+    assert "no usable setpoint" in plant.fly(chain_of(Broken(), plant), Hover.rate, 3.0)
+    assert plant.vehicle.pose().position[2] == pytest.approx(CIRCLE.start_position[2], abs=0.02)
+
+
+@pytest.mark.parametrize(("lift", "limits"), [(1.05, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
-    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be more than 1 weight.*limits.thrust_max="):
+    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be at least 1.1 weights.*limits.thrust_max="):
         FlightChain(Hover(), CIRCLE, config, None)
 
 
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
-    assert fly_hovering(plant).startswith("cut: it does not move")
-    assert 1.0 < max(moment for moment, command in plant.sent if command.armed) < 2.0
+    assert fly_hovering(plant).startswith("cut: it was not seen to rise within 0.9 s")
+    assert 1.4 < max(moment for moment, command in plant.sent if command.armed) < 1.6
 
 
 def test_the_actor_forgets_until_the_vehicle_moves():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.safety import Reason, Safety, SafetyLimits, State, Tick
-from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
+from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint, hover
 
 PERIOD = 1 / 32  # s: exact in binary, as are the times below
 LIMITS = SafetyLimits(
@@ -21,7 +21,6 @@ LIMITS = SafetyLimits(
     start_position=(1, 0, 0),
     velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities
     turn_tolerance_degrees=180,  # and as they like, but for those of turns
-    lift_off_time=3.0,  # and they take their time
 )
 OFF, ON, KILL = Operator(False, False), Operator(True, False), Operator(True, True)
 SETPOINT = Setpoint(12.0, np.array([1.0, -2.0, 0.5]))
@@ -327,7 +326,39 @@ def test_a_pose_of_which_anything_changes_is_not_frozen(moved):
 
 
 def test_what_stands_on_the_ground_may_be_measured_the_same_again_and_again():
-    assert Flight().flying().ticks(80).state is State.FLYING
+    assert Flight(lift_off_time=3.0).flying().ticks(80).state is State.FLYING
+
+
+LIFTED = {"lift": Setpoint(11.0, np.zeros(3))}
+
+
+def test_a_lift_is_sent_in_place_of_a_setpoint_that_is_usable_and_of_no_other():
+    flight = Flight().flying()
+    command = flight.tick(**LIFTED).command
+    assert command.setpoint.collective_thrust == 11.0 and not command.setpoint.body_rates.any()
+    for unusable in (None, Setpoint(np.nan, np.zeros(3))):
+        verdict = flight.tick(setpoint=unusable, **LIFTED)
+        assert verdict.state is State.HOLD and verdict.command.setpoint.collective_thrust == hover().collective_thrust
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, -0.5)])
+def test_a_lift_is_cut_when_its_time_is_over_whatever_seems_to_move(velocity):
+    flight = Flight(arm_time=0.25, lift_time=0.5).ready()
+    verdict = flight.tick()
+    armed, shift = flight.now, 0.0
+    while verdict.state is State.FLYING:
+        shift += 1e-9  # no two measurements are the same
+        verdict = flight.tick(pose={"velocity": velocity, "position": (1.0, 0.0, shift)}, **LIFTED)
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.STRANDED,)
+    assert flight.now - armed == pytest.approx(0.75 + PERIOD)
+
+
+@pytest.mark.parametrize(("degrees", "state"), [(19.0, State.FLYING), (21.0, State.CUT)])
+def test_what_tips_over_while_it_is_lifted_is_cut(degrees, state):
+    flight = Flight(start_tilt_degrees=10.0).flying()
+    verdict = flight.tick(pose={"attitude": turned(0, degrees)}, **LIFTED)
+    assert verdict.state is state
+    assert (Reason.TILT in verdict.reasons) is (state is State.CUT)
 
 
 def test_tilt_counts_anew_after_being_upright():

@@ -199,23 +199,26 @@ def test_a_flight_depends_on_no_file_of_its_track(tmp_path, capsys):
 
 
 def test_a_flight_of_old_is_not_lifted_when_it_is_played_back(tmp_path):
-    config = hil.HilConfig(actor="circle", lift=0.0)
+    """It stands armed for two seconds, as flights might without a lift, of which its recording says nothing."""
+    config = hil.HilConfig(actor="circle", lift=0.0, arm=True)
     flyer, _ = hil.make_flyer(config)
     written = hil.as_json(config)
     del written["lift"]
-    inputs = hil.read_inputs(
-        {
-            "time": 10.0,
-            "received": [[10.0, 0, 0.0, 4, -2.5, 1.35, 1, 0, 0, 0, *[0] * 6]],
-            "operator": [False, False],
-            "overrun": 0,
-        }
-    )
+    armed = 0
     with (
         closing(hil.make_chain(config, flyer, hil.load_track("circle"))) as chain,
         FlightRecorder(tmp_path / FILE, {"config": written, "track": "circle"}) as recorder,
     ):
-        recorder.tick(10.0, {"in": describe_inputs(inputs), "out": describe_outputs(chain.tick(inputs))})
+        turned = 0.5**0.5
+        for count in range(70):
+            now = 10.0 + 0.04 * count
+            pose = [4, -2.5, 1.35, turned, 0, 0, turned, *[0] * 6]
+            message = {"received": [[now, count, now, *pose]], "operator": [count > 8, False], "overrun": 0}
+            inputs = hil.read_inputs({"time": now, **message})
+            outputs = chain.tick(inputs)
+            armed += outputs.verdict.command.armed
+            recorder.tick(now, {"in": describe_inputs(inputs), "out": describe_outputs(outputs)})
+    assert armed > 50
     assert hil.replay(hil.HilConfig(replay=str(tmp_path))) == 0
 
 
