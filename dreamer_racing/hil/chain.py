@@ -168,10 +168,8 @@ class FlightChain:
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
-        on_stand = not self._flying  # until the vehicle moves or turns, each tick is the first of the flight
-        if on_stand or self._lifting:
+        if not self._flying:  # each tick is the first of the flight
             self._flyer.reset()
-        if on_stand:
             self.progress.reset()
         for received in inputs.received:
             pose = self.clock.read(received)
@@ -179,6 +177,7 @@ class FlightChain:
                 self.progress.update(pose)
                 self._newest = pose
                 self._look_for_a_rise(pose)
+        self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
         tick = Tick(
@@ -192,14 +191,14 @@ class FlightChain:
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,
-            lift=self._lift(inputs.time) if on_stand else None,
+            lift=None if self._flying else self._lift(inputs.time),
         )
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
         setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
         self._lifting = tick.lift is not None and self.safety.lets_through
-        self._flying = finish or (verdict.command.armed and (self._flying or self._has_left()))
+        self._flying = finish or (verdict.command.armed and (self._flying or self._has_moved()))
         measured = math.nan if self._newest is None else self._newest.time
         target, passes = self.progress.target, len(self.progress.passes)
         voltage = None if self.battery is None else self.battery.update(inputs.time, inputs.voltages)
@@ -221,13 +220,17 @@ class FlightChain:
         rises = self._lifting and pose.linear_velocity[2] > self._config.limits.start_speed
         self._rises_since = min(self._rises_since, pose.time) if rises else math.inf
 
-    def _has_left(self) -> bool:
-        """Whether the vehicle has left the start: has been seen to rise for long enough, where it is lifted."""
-        if self._newest is None:
+    def _has_risen(self) -> bool:
+        """Whether the vehicle, which is lifted, has been seen to rise for long enough."""
+        if self._newest is None or not self._lifting:
             return False
-        if self._config.lift:
-            risen = self._newest.position[2] - self._stand_height
-            return self._lifting and bool(self._newest.time - self._rises_since >= RISE_TIME and risen >= RISE_HEIGHT)
+        risen = float(self._newest.position[2]) - self._stand_height
+        return self._newest.time - self._rises_since >= RISE_TIME and risen >= RISE_HEIGHT
+
+    def _has_moved(self) -> bool:
+        """Whether the vehicle, which is not lifted, has left the start."""
+        if self._newest is None or self._config.lift:
+            return False
         speed, rate = (float(np.linalg.norm(part)) for part in (self._newest.linear_velocity, self._newest.body_rates))
         return speed > self._config.limits.start_speed or rate > START_RATE
 
