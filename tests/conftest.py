@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import random
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from matplotlib.figure import Figure
 
 # For `forked`, and for good: its processes look there, too. Last, so that no benchmark stands in for another module.
@@ -18,6 +20,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests come first, so that no worker is left with a long one at the end."""
     slow = {item.path for item in items if "slow" in item.keywords}
     items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.fixture(autouse=True)
+def same_numbers_every_time() -> None:
+    """A test that draws random numbers without a seed of its own draws the same ones in every run of the suite."""
+    random.seed(0)
+    torch.manual_seed(0)
 
 
 @pytest.fixture

@@ -156,7 +156,6 @@ def test_a_sample_passes_its_gradient_to_what_it_was_drawn_by() -> None:
 
 
 def test_weights_are_cast_by_one_kernel_and_come_back() -> None:
-    torch.manual_seed(0)
     module = nn.Sequential(nn.Linear(4, 8), LayerNorm(8), nn.Linear(8, 2))
     before, inputs = list(module.parameters()), torch.randn(3, 4)
 
