@@ -129,7 +129,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     if preset := contract["source"].get("preset"):
-        print(f"its drone: {config.actor} was trained on that of preset={preset}, and may not fly another")
+        print(f"its drone: {config.actor} was trained on that of preset={preset}; a plant is one by preset={preset}")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 
@@ -177,7 +177,7 @@ def say(summary: dict[str, Any]) -> None:
     """Print what came of a flight."""
     laps = ", ".join(f"{lap:.2f} s" for lap in summary["laps"]) or "none"
     print(f"ended: {summary['ended']}")
-    print(f"gates passed: {len(summary['passes'])}, laps: {laps}")
+    print(f"gates passed: {len(summary['passes'])}, laps, from first gate to first gate: {laps}")
     for name, row in summary["loop"].items():
         if isinstance(row, dict):
             print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")

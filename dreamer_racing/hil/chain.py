@@ -155,8 +155,8 @@ class FlightChain:
         most = min(LIFT_MOST, config.limits.thrust_max / GRAVITY)
         if config.lift and not LIFT_LEAST <= config.lift <= most:
             raise ValueError(
-                f"lift={config.lift:g}: must be at least {LIFT_LEAST:g} weights and at most {LIFT_MOST:g}, within "
-                f"limits.thrust_max={config.limits.thrust_max:g} m/s²; 0: the flyer takes off by itself."
+                f"lift={config.lift:g}: must be {LIFT_LEAST:g} to {LIFT_MOST:g} weights of thrust, within "
+                f"limits.thrust_max={config.limits.thrust_max:g} m/s², or 0: the flyer takes off by itself."
             )
 
     def warm_up(self) -> None:

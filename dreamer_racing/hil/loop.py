@@ -37,6 +37,8 @@ LINES_MOST = 64
 LINES_PATIENCE = 1.0
 """s for which the end of a flight waits for them [choice]; motors are off by then."""
 
+OF_THE_ENABLE = (Reason.NO_ENABLE, Reason.NOT_RELEASED)
+
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""
 
@@ -177,10 +179,11 @@ class FlightLoop:
             self._clock.sleep_until(deadline)
             start = self._clock.now()
             outputs = self._tick(start, deadline, overrun, armed)
-            words = self._say_why_not(outputs)
+            words = self._say_why_not(outputs, flew)
             armed = outputs.verdict.command.armed
             if armed and not flew:
                 flew, began = True, start
+                self._log(logging.INFO, "armed")
             deadline, overrun = self._next(deadline)
             if self._watchdog.acted:
                 longest = self._chain.safety.limits.tick_max
@@ -192,12 +195,17 @@ class FlightLoop:
                 return f"{most:g} s are over" + ("" if flew else f"; not armed: {words}")
         return self._stop + ("" if flew else f"; not armed: {words}")
 
-    def _say_why_not(self, outputs: Outputs) -> str:
-        """Log what speaks against arming, when it changes; return it. In flight nothing is written."""
-        words = "; ".join(outputs.verdict.words)
-        if not outputs.verdict.command.armed and outputs.verdict.reasons != self._reasons:
-            self._log(logging.INFO, "not armed: %s", words)
-        self._reasons = outputs.verdict.reasons
+    def _say_why_not(self, outputs: Outputs, flew: bool) -> str:
+        """Log what speaks against arming, or ended the flight, when it changes; return it. In flight nothing is said.
+
+        An enable that comes and goes is no change as long as something else speaks against arming, too.
+        """
+        verdict = outputs.verdict
+        words = "; ".join(verdict.words)
+        reasons = tuple(reason for reason in verdict.reasons if reason not in OF_THE_ENABLE) or verdict.reasons
+        if not verdict.command.armed and reasons != self._reasons:
+            self._log(logging.INFO, "%s: %s", verdict.state.value if flew else "not armed", words)
+        self._reasons = reasons
         return words
 
     def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:

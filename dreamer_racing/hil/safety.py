@@ -337,7 +337,10 @@ class Safety:
         if seen is not None and seen.tilt_degrees > TIPPING * limits.start_tilt_degrees:
             findings[Reason.TILT] = f"it is tilted by {seen.tilt_degrees:.0f}° while it is lifted"
         if self._now - self.sends_from > limits.lift_time:
-            findings[Reason.STRANDED] = f"it was not seen to rise within {limits.lift_time:g} s: is it held fast?"
+            findings[Reason.STRANDED] = (
+                f"it was not seen to rise within limits.lift_time={limits.lift_time:g} s: it is held fast, or heavier "
+                "or weaker than believed, or its poses do not follow it"
+            )
         return findings
 
     def _check_setpoint(self, tick: Tick) -> Findings:

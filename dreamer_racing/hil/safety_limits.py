@@ -88,7 +88,7 @@ class SafetyLimits:
     tilt_time: float = setting(0.2, _TOLERANCE)
     still_time: float = setting(1.0, Range(0, 3600, open_below=True))
     lift_off_time: float = setting(3.0, Range(0, 3600, open_below=True))
-    lift_time: float = setting(0.9, Range(0.1, 2.0))
+    lift_time: float = setting(0.9, Range(0.5, 2.0))
     thrust_min: float = setting(0.0, Range(0, 100))
     thrust_max: float = setting(30.0, Range(0, 1000, open_below=True))
     thrust_slew: float = setting(700.0, _MOST)
@@ -120,7 +120,7 @@ class SafetyLimits:
         Raises:
             ValueError: The message gives the limit, its value, and what is allowed.
         """
-        check_settings(self)
+        check_settings(self, "limits.")
         for name in ("fence_low", "fence_high", "start_position", "rate_max"):
             if to_numbers(getattr(self, name), 3) is None:
                 raise ValueError(f"{name}={getattr(self, name)}: must be three finite numbers.")

@@ -300,4 +300,4 @@ class PlantVehicle:
         if self.crash is not CrashCause.NONE:
             words = self.crash.name.lower().replace("_", " ")
             self.fate = f"{words} at {self.time:.2f} s" + ("" if self.armed else ", when disarmed")
-            logger.info("plant: crash: %s", self.fate)
+            logger.info("plant: crash: %s; it stays there: start the plant again for the next flight", self.fate)

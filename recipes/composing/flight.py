@@ -14,7 +14,7 @@ from dreamer_racing.hil.battery import BatteryConfig
 from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
-from dreamer_racing.hil.chain import LIFT, LIFT_MOST, ChainConfig, FlightChain
+from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
 from dreamer_racing.hil.links import HEARING, LinkConfig
 from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
@@ -49,8 +49,7 @@ class HilConfig:
     arm: bool = False  # whether the vehicle may be armed at all
     laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
     duration: float | None = setting(None, POSITIVE)  # s after arming, at which it is disarmed; null: no end
-    # weights of thrust that it is lifted with at the most, until it rises; 0: the actor takes off by itself
-    lift: float = setting(LIFT, Range(0, LIFT_MOST))
+    lift: float = LIFT  # weights of thrust, 1.1 to 1.5, that it is lifted with until it rises; 0: the actor takes off
     patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
     rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
     preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful

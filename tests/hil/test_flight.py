@@ -286,7 +286,16 @@ def test_a_terminal_that_is_stopped_does_not_keep_disarm_frames_back():
         log.removeHandler(handler)
         log.setLevel(logging.NOTSET)
     assert all(in_time for _, in_time in waited), waited
-    assert any(said.startswith("not armed: the operator killed") for said, _ in waited)
+    assert any(said.startswith("cut: the operator killed") for said, _ in waited)
+
+
+def test_what_speaks_against_arming_is_said_when_it_changes_and_not_with_every_enable(caplog):
+    plant = Watched(CIRCLE)
+    plant.happens = lambda elapsed: setattr(plant, "enable_after", 0.0 if int(elapsed / 0.3) % 2 else 9.0)
+    with caplog.at_level(logging.INFO, "dreamer_racing.hil.loop"):
+        plant.fly(chain_of(Hover(), plant, arm=False), Hover.rate, 3.0)
+    said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("not armed")]
+    assert 1 <= len(said) <= 3 and "arm=true" in said[-1]
 
 
 def test_a_disk_that_is_full_does_not_end_a_flight():
@@ -461,7 +470,9 @@ def test_a_lift_that_no_pose_shows_ends_low(hidden, thrust, low, high):
     plant = Blind(CIRCLE, thrust=thrust)
     heights = []
     plant.happens = lambda elapsed: heights.append(plant.vehicle.pose().position[2])
-    assert "it was not seen to rise within 0.9 s" in plant.fly(chain_of(Hover(), plant), Hover.rate, 3.0)
+    assert "it was not seen to rise within limits.lift_time=0.9 s" in plant.fly(
+        chain_of(Hover(), plant), Hover.rate, 3.0
+    )
     assert low < max(heights) - heights[0] < high
 
 
@@ -478,13 +489,15 @@ def test_a_flyer_that_wants_nothing_usable_is_not_lifted():
 @pytest.mark.parametrize(("lift", "limits"), [(1.05, {}), (-1.0, {}), (1.6, {}), (1.4, {"thrust_max": 13.0})])
 def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
-    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be at least 1.1 weights.*limits.thrust_max="):
+    with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 weights.*limits.thrust_max="):
         FlightChain(Hover(), CIRCLE, config, None)
 
 
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
-    assert fly_hovering(plant).startswith("cut: it was not seen to rise within 0.9 s")
+    assert fly_hovering(plant).startswith(
+        "cut: it was not seen to rise within limits.lift_time=0.9 s: it is held fast, or"
+    )
     assert 1.4 < max(moment for moment, command in plant.sent if command.armed) < 1.6
 
 

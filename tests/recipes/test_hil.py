@@ -32,7 +32,6 @@ flights = recipe_module("composing.flight")
         ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
         ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
-        ({"actor": "pilot", "lift": 4.0}, "lift=4.0: must be at least 0 and at most 1.5"),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
     ],
 )
