@@ -129,7 +129,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     if preset := contract["source"].get("preset"):
-        print(f"its drone: {config.actor} was trained on that of preset={preset}; a plant is one by preset={preset}")
+        print(f"its drone: {config.actor} was trained on that of preset={preset}: a plant needs preset={preset}, too")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 

@@ -38,6 +38,7 @@ LINES_PATIENCE = 1.0
 """s for which the end of a flight waits for them [choice]; motors are off by then."""
 
 OF_THE_ENABLE = (Reason.NO_ENABLE, Reason.NOT_RELEASED)
+"""What speaks against arming as an operator's enable comes and goes, which is not said again each time."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end a flight: Ctrl-C, a service's stop, a closed terminal, Ctrl-\\ and Ctrl-Z."""

@@ -123,7 +123,7 @@ class SafetyLimits:
         check_settings(self, "limits.")
         for name in ("fence_low", "fence_high", "start_position", "rate_max"):
             if to_numbers(getattr(self, name), 3) is None:
-                raise ValueError(f"{name}={getattr(self, name)}: must be three finite numbers.")
+                raise ValueError(f"limits.{name}={getattr(self, name)}: must be three finite numbers.")
         for wrong, message in (
             (not self.hold_after < self.cut_after, f"hold_after={self.hold_after}: must be below cut_after"),
             (
@@ -139,7 +139,7 @@ class SafetyLimits:
             (not self.thrust_max > GRAVITY, f"thrust_max={self.thrust_max}: must be above {GRAVITY} (hover)"),
         ):
             if wrong:
-                raise ValueError(f"{message}.")
+                raise ValueError(f"limits.{message}.")
 
 
 def to_number(value: Any) -> float:

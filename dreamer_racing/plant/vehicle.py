@@ -151,7 +151,9 @@ class PlantVehicle:
         self._target_speed: np.ndarray | None = None  # (4,) √N, of rotors that another flight controller commands
         self._acceleration = np.zeros(3)
         self._lift_off_step: int | None = None
-        self.on_stand, self._bears, self._flies_for, self.gates_passed = True, True, 0, 0
+        self.on_stand, self.gates_passed = True, 0
+        self._bears = True  # whether the stand keeps it from sinking, be it let go
+        self._bore_itself = 0  # physics steps in a row in which it was asked for all of its weight
         self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
         self._rotor_speed[:] = 0.0
@@ -229,8 +231,8 @@ class PlantVehicle:
         else:
             self._turn_and_step()
         if self._bears:
-            flies = self.armed and self._asked() >= BEARS_ITSELF * self.parameters.mass * GRAVITY
-            self._flies_for = self._flies_for + 1 if flies else 0
+            bears_itself = self.armed and self._asked() >= BEARS_ITSELF * self.parameters.mass * GRAVITY
+            self._bore_itself = self._bore_itself + 1 if bears_itself else 0
         if self.on_stand:
             self._hold(self._start)
             self._maybe_let_go()
@@ -280,7 +282,7 @@ class PlantVehicle:
     def _maybe_bear(self) -> None:
         """Keep what has been let go, and does not bear itself yet, from sinking through the stand."""
         away = self._qpos[:3] - self._start[:3]
-        self._bears = self._flies_for < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
+        self._bears = self._bore_itself < self._spin_up_steps and math.hypot(*away[:2]) < STAND_RADIUS
         if self._bears and away[2] < 0.0:
             self._qpos[2], self._qvel[2] = self._start[2], max(self._qvel[2], 0.0)
 
