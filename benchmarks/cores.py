@@ -24,7 +24,7 @@ from measuring import print_table, write_json
 from dreamer_racing.training.directory import RunDirectory
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
-COLUMNS = ("cores", "threads", "collection", "env_steps_per_s", "least", "most", "times", "collect", "learn")
+COLUMNS = ("cores", "threads", "collector", "env_steps_per_s", "least", "most", "times", "collect", "learn")
 LEARNING = ("sample", "world_model", "imagine", "optimise", "improve")
 
 
@@ -34,15 +34,15 @@ class Way(NamedTuple):
     Attributes:
         cores: Cores it may run on.
         threads: Threads of torch.
-        collection: As the recipe's setting.
+        collector: As the recipe's setting.
     """
 
     cores: int
     threads: int
-    collection: str
+    collector: str
 
 
-WAYS = (Way(1, 1, "sync"), Way(2, 1, "sync"), Way(2, 2, "sync"), Way(2, 1, "overlapped"), Way(2, 2, "overlapped"))
+WAYS = (Way(1, 1, "local"), Way(2, 1, "local"), Way(2, 2, "local"), Way(2, 1, "overlapped"), Way(2, 2, "overlapped"))
 
 
 def main() -> None:
@@ -81,7 +81,7 @@ def measure(way: Way, cores: list[int], env_steps: int, overrides: list[str]) ->
             "device=cpu",
             f"run_dir={run_dir}",
             f"total_env_steps={env_steps}",
-            f"collection={way.collection}",
+            f"collector={way.collector}",
             "evaluation.every=0",
             "checkpoint.every=0",
             *overrides,

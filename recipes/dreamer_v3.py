@@ -27,7 +27,7 @@ from composing.devices import choose_device, computes_bfloat16
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
-from composing.schema import Collection, DreamerConfig, register
+from composing.schema import CollectorKind, DreamerConfig, register
 from composing.sharing import imagines, share_of
 from composing.workers import make_own_env, make_rollouts, place_worlds, resolve_workers
 from omegaconf import DictConfig, OmegaConf
@@ -251,7 +251,7 @@ def shorten_windows(config: DictConfig, device: Device) -> None:
 def captures(config: DictConfig, device: Device) -> bool:
     """Whether updates can be captured as a CUDA graph: not beside what acts meanwhile, or exchanges on the way."""
     alone = parallel.asked_for() == 1 or not imagines(config)
-    return device.type == "cuda" and config.collection is Collection.sync and alone
+    return device.type == "cuda" and config.collector is not CollectorKind.overlapped and alone
 
 
 def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:

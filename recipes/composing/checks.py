@@ -14,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
-    Collection,
     CollectorKind,
     DreamerConfig,
     ExperimentConfig,
@@ -205,19 +204,19 @@ def check_dreamer(config: DreamerConfig) -> None:
             f"{config.env.num_envs * model.batch_length}."
         )
     check_workers(config)
-    if config.collection is Collection.overlapped and not is_race(config):
+    if config.collector is CollectorKind.overlapped and not is_race(config):
         raise ValueError(
-            f"collection=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
-            "thread that made them. Use collection=sync."
+            f"collector=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to the "
+            "thread that made them. Use collector=local."
         )
-    if config.collection is Collection.overlapped and config.env.device != "cpu":
+    if config.collector is CollectorKind.overlapped and config.env.device != "cpu":
         raise ValueError(
-            "collection=overlapped steps worlds in a thread, and evaluation steps others meanwhile, which warp can do "
-            "on a CPU only: use env.device=cpu, or collection=sync."
+            "collector=overlapped steps worlds in a thread, and evaluation steps others meanwhile, which warp can do "
+            "on a CPU only: use env.device=cpu, or collector=local."
         )
-    if config.collection is Collection.overlapped and model.cuda_graph:
+    if config.collector is CollectorKind.overlapped and model.cuda_graph:
         raise ValueError(
-            "collection=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
+            "collector=overlapped acts on the device while model.cuda_graph=true captures updates there, which CUDA "
             "refuses: choose one of them."
         )
 
@@ -238,11 +237,6 @@ def check_workers(config: DreamerConfig) -> None:
         raise ValueError(
             f"WORLD_SIZE={parallel.asked_for()} with collector=ray: workers fly for a single learner. Start it without "
             "torchrun, or set collector=local."
-        )
-    if config.collection is not Collection.sync:
-        raise ValueError(
-            f"collection={config.collection.value} with collector=ray: workers fly during updates anyway. Leave one of "
-            "them out."
         )
     if num_envs % workers:
         raise ValueError(

@@ -164,17 +164,11 @@ LOSS_RAMPS = tuple(sorted({ramp.name for ramp in fields(ScheduleConfig)} & {loss
 """What of `ScheduleConfig` moves a number of the losses."""
 
 
-class Collection(Enum):
-    """How acting and learning share time."""
-
-    sync = "sync"
-    overlapped = "overlapped"
-
-
 class CollectorKind(Enum):
-    """Who flies to learn."""
+    """Who flies to learn, and when."""
 
     local = "local"
+    overlapped = "overlapped"
     ray = "ray"
 
 
@@ -238,8 +232,9 @@ class DreamerConfig(ReplayRunConfig):
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
-    collection: Collection = Collection.sync  # overlapped: act in a thread during updates, with the weights before them
-    collector: CollectorKind = CollectorKind.local  # ray: workers on a Ray cluster fly, also during updates
+    # local: fly in turns with updates; overlapped: in a thread during them, with the weights before them; ray: workers
+    # on a Ray cluster fly, also during updates
+    collector: CollectorKind = CollectorKind.local
     num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     model: ModelConfig = field(default_factory=ModelConfig)

@@ -12,7 +12,7 @@ from torchrl.envs import TensorDictPrimer
 from composing.arena import Environment, make_env, worlds_device
 from composing.building import make_collector, with_memory
 from composing.learners import make_agent
-from composing.schema import Collection, CollectorKind, DreamerConfig, is_race
+from composing.schema import CollectorKind, DreamerConfig, is_race
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
@@ -29,9 +29,9 @@ OF_RACES = ("body_rate_weight", "worlds.start_on_line")
 
 def place_worlds(config: DictConfig) -> None:
     """Choose where worlds live that are stepped beside the learner, and say so."""
-    if config.env.device == "auto" and config.collection is Collection.overlapped:
+    if config.env.device == "auto" and config.collector is CollectorKind.overlapped:
         config.env.device = "cpu"
-        print("worlds: cpu (collection=overlapped)")
+        print("worlds: cpu (collector=overlapped)")
 
 
 def resolve_workers(config: DictConfig) -> None:
@@ -39,7 +39,7 @@ def resolve_workers(config: DictConfig) -> None:
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume and config.num_workers is not None:
-        print(f"workers: none (collector=local), so num_workers={config.num_workers} is left out")
+        print(f"workers: none (collector={config.collector.value}), so num_workers={config.num_workers} is left out")
         config.num_workers = None
 
 
@@ -59,7 +59,7 @@ def make_rollouts(
     policy = learner.policy()
     if config.collector is CollectorKind.ray:
         return make_workers(config, env, policy)
-    if config.collection is Collection.sync:
+    if config.collector is CollectorKind.local:
         return make_collector(config, env, policy), None
     acting = acting_copy(policy)
     collector = make_collector(config, env, acting)

@@ -200,7 +200,7 @@ def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_overlapped_run(tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", *TINY, "collection=overlapped", "run_dir=run", cwd=tmp_path)
+    done = recipe("dreamer_v3", *TINY, "collector=overlapped", "run_dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     table = rows(tmp_path / "run")
     # The rollout that was under way at the end is kept too.
@@ -213,7 +213,7 @@ def test_an_overlapped_run(tmp_path: Path) -> None:
 def test_what_is_learned_ahead_of_a_checkpoint_is_in_it(tmp_path: Path) -> None:
     """Also of the rollout that was under way when the run ended: nothing is learned after the last checkpoint."""
     dreamer = recipe_module("dreamer_v3")
-    overrides = [*TINY, "env.from_pixels=false", "collection=overlapped", "total_env_steps=192", "checkpoint.every=96",
+    overrides = [*TINY, "env.from_pixels=false", "collector=overlapped", "total_env_steps=192", "checkpoint.every=96",
                  f"run_dir={tmp_path}"]  # fmt: skip
     run = dreamer.build(OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *overrides))), overrides)
     train(run)
