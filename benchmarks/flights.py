@@ -27,6 +27,7 @@ AGENTS = Path(__file__).parents[1] / "agents"
 RECIPES = Path(__file__).parents[1] / "recipes"
 PLANT = ["jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
 COLUMNS = ("actor", "seed", "finished", "gates", "laps_s", "speed_max", "latency_p99_ms", "jitter_p99_ms", "overruns")
+PILOT = "pilot"
 LONGEST = 120  # s that a flight may take, start of both programs included
 
 
@@ -50,9 +51,14 @@ def main() -> None:
             write_json(records, arguments.json)
 
 
+def given(options: list[str]) -> dict[str, str]:
+    """Return options by their names."""
+    return dict(option.split("=", 1) for option in options)
+
+
 def preset_of(actor: str) -> str:
     """Physics that an actor was trained on; of the pilot the easy ones."""
-    if actor == "pilot":
+    if actor == PILOT:
         return "easy"
     folder = AGENTS / actor if (AGENTS / actor).is_dir() else Path(actor)
     if folder.suffix == ".onnx":
@@ -66,12 +72,11 @@ def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> d
     Raises:
         RuntimeError: No flight came about; the message is the loop's own.
     """
-    plant = [*arguments.plant, f"seed={seed}"]
-    if not any(option.startswith("track=") for option in plant):
-        plant.append(f"track={Path(actor).name}")
-    if not any(option.startswith("preset=") for option in plant):
-        plant.append(f"preset={preset_of(actor)}")
+    own = {"track": "circle" if actor == PILOT else Path(actor).name, "preset": preset_of(actor)}
+    plant = [f"{name}={value}" for name, value in (own | {"seed": seed} | given(arguments.plant)).items()]
     hil = [f"actor={actor}", f"run_dir={folder}", *arguments.hil]
+    if actor == PILOT:  # it has no contract that says so
+        hil += [option for option in plant if option.startswith(("track=", "preset="))]
     if arguments.disarmed:
         hil += ["arm=false", f"patience={arguments.disarmed:g}"]
     else:

@@ -32,6 +32,7 @@ from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Agent, ModelSize
 from dreamer_racing.modules.layers import autocast
+from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
@@ -66,6 +67,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
     replay = restore_replay(config, checkpoint, learner, model.batch_size, model.batch_length)
     test = replay.held_out(HELD_OUT, LENGTH, RECENT)
     assert test is not None, "a replay with worlds held out"
+    test.pop(CONTEXT, None)
     torch.manual_seed(0)
     agent = Agent(size, learner.agent.interface, False, config.loss.min_std, config.loss.max_std)
     losses = make_losses(agent, config.loss)
@@ -73,6 +75,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
     context, seconds = autocast(torch.device("cpu"), bool(model.mixed_precision)), 0.0
     for number in range(1, updates + 1):
         batch = replay.sample()
+        batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
         begun = time.process_time()
         with context:
             metrics = loss(batch)

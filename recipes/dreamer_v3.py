@@ -46,6 +46,7 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.training import parallel
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.pass_share import PassShare
+from dreamer_racing.training.replay_ratio import UpdatesOwed
 from dreamer_racing.training.run import ReplayRun
 from dreamer_racing.training.schedule import RampClock
 from dreamer_racing.training.signals import GracefulExit
@@ -272,7 +273,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     latents = learner.latent_format if config.replay.context else None
     parts = {
         "replay": make_sequence_replay(own, env, curriculum, latents),
-        "ratio": config.replay_ratio,
+        "owed": UpdatesOwed(config.replay_ratio),
         "lag": ModelLag(config.schedule.wait_for_model),
         "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
     }

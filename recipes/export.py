@@ -29,7 +29,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import hash_track, load_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
@@ -128,6 +128,7 @@ def prepare(
         flight = record_flight(env, agent, config.steps)
     finally:
         env.close()
+    track = load_track(worlds_of(trained)["track"])
     contract = make_contract(
         step,
         env.worlds.parameters,
@@ -135,8 +136,8 @@ def prepare(
         checkpoint=checkpoint.name,
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
-        track=trained.track,
-        track_sha256=hash_track(load_track(worlds_of(trained)["track"])),
+        track=track.name if track.name in BUILTIN_TRACKS else trained.track,  # with the decoys of decoys=
+        track_sha256=hash_track(track),
         preset=trained.env.preset,
     )
     return step, contract, flight

@@ -2,7 +2,7 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
 
     python recipes/plant.py track=circle preset=easy                      # in one terminal: a vehicle
     python recipes/hil.py actor=circle arm=true laps=3                    # in another: an agent flies it
-    python recipes/hil.py actor=pilot track=circle arm=true laps=3        # or the scripted pilot
+    python recipes/hil.py actor=pilot track=circle preset=easy arm=true laps=3   # or the scripted pilot
     python recipes/hil.py actor=kidney arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
         mass=0.62 full_thrust=17 reference_voltage=15.2 voltage=15.8      # or a real vehicle, by a radio's receiver
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
@@ -129,7 +129,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     lifted = f"straight up, with up to {config.lift:g} of its weight until it rises, then by"
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     if preset := contract["source"].get("preset"):
-        print(f"its drone: {config.actor} was trained on that of preset={preset}: a plant needs preset={preset}, too")
+        print(f"its drone: {config.actor} flies that of preset={preset}: a plant needs preset={preset}, too")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 
@@ -182,6 +182,9 @@ def say(summary: dict[str, Any]) -> None:
         if isinstance(row, dict):
             print(f"{name:<9} p50 {row['p50_ms']:6.2f} ms   p99 {row['p99_ms']:6.2f} ms   max {row['max_ms']:6.2f} ms")
     print(f"ticks: {summary['loop']['ticks']}, overruns: {summary['loop']['overruns']}")
+    rejected, out_of_order = summary["poses"]["rejected"], summary["poses"]["out_of_order"]
+    if rejected or out_of_order:
+        print(f"poses left out: {rejected} messages that were none, {out_of_order} out of order")
     if summary["battery"] is not None:
         print(in_words(summary["battery"]))
 

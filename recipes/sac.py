@@ -29,6 +29,7 @@ from omegaconf import DictConfig
 
 from dreamer_racing.learners import SACLearner
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.replay_ratio import UpdatesOwed
 from dreamer_racing.training.run import ReplayRun
 
 NUM_ENVS = {"pixels": 64, "state": 256}
@@ -69,7 +70,16 @@ def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     curriculum = make_curriculum(config)
     replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
     return assemble(
-        SACRun, config, overrides, lock, env, learner, collector, curriculum, replay=replay, ratio=config.replay_ratio
+        SACRun,
+        config,
+        overrides,
+        lock,
+        env,
+        learner,
+        collector,
+        curriculum,
+        replay=replay,
+        owed=UpdatesOwed(config.replay_ratio),
     )
 
 

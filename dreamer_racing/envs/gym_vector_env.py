@@ -70,7 +70,8 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     ) -> None:
         self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
-            worlds["episode_steps"] = min(max_episode_steps, worlds.get("episode_steps") or max_episode_steps)
+            steps = worlds.get("episode_steps")
+            worlds["episode_steps"] = max_episode_steps if steps is None else min(max_episode_steps, steps)
         self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         own = {"render_fps": self.race.frames_per_second, "autoreset_mode": self.autoreset_mode}
         self.metadata = {**self.metadata, **own}

@@ -158,12 +158,13 @@ class RaceWorlds:
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
         """Make the rules, of training or of evaluation."""
-        episode_time = EVALUATION_TIME if self.evaluation else EPISODE_TIME
+        if episode_steps is None:
+            episode_steps = round((EVALUATION_TIME if self.evaluation else EPISODE_TIME) / self.parameters.control_dt)
         return Race(
             self.track,
             self.num_envs,
             weights=weights or RewardWeights(),
-            episode_steps=episode_steps or round(episode_time / self.parameters.control_dt),
+            episode_steps=episode_steps,
             laps=self.track.laps if self.evaluation else None,
             control_dt=self.parameters.control_dt,
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time

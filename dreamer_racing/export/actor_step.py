@@ -315,8 +315,10 @@ def export_actor(
         _write_json(partial / CONTRACT, full)
         for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
-        for name in PARTS if not parts else ():
-            (output.parent / f"{output.stem}_{name}.onnx").unlink(missing_ok=True)  # of an earlier export
+        kept = {path.name for path in written.values()}
+        ours = {program.name, WEIGHTS, *(f"{output.stem}_{name}.onnx" for name in PARTS)}
+        for name in ours - kept:  # of an earlier export
+            (output.parent / name).unlink(missing_ok=True)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return deviation

@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, Randomisation
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.export.actor_step import OUTPUTS, ActorStep
@@ -123,7 +123,7 @@ def _describe_vector() -> dict[str, Any]:
 
 
 def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
-    thrust = parameters.collective_thrust_scale
+    thrust, widths = parameters.collective_thrust_scale, parameters.randomisation
     return {
         "formula": "physical = offset + scale * action, action clipped to [-1, 1]",
         "channels": [
@@ -135,8 +135,14 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
         ],
         "hover": [parameters.hover_action, 0.0, 0.0, 0.0],
         "trained_mass_kg": parameters.mass,
-        "trained_command_delay_s": parameters.command_delay,
+        "trained_command_delay_s": parameters.command_delay if widths is None else [0.0, widths.delay_max],
+        **({} if widths is None else {"trained_half_widths": _half_widths(widths)}),
     }
+
+
+def _half_widths(widths: Randomisation) -> dict[str, float]:
+    """Return by how much drones differed in training, relative to the one described here."""
+    return {name: value for name, value in asdict(widths).items() if name != "delay_max"}
 
 
 def hash_weights(step: nn.Module) -> str:

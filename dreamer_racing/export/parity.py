@@ -122,6 +122,8 @@ class TorchActor(RecurrentActor):
 def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, seed: int = 0) -> dict[str, float]:
     """Fly actors through a recorded flight, each carrying its own state, and compare them with the first.
 
+    Where no latents are sampled, the first one is compared with what the policy did in that flight.
+
     Args:
         actors: By name; the first is the original.
         flight: What they see, and where episodes begin.
@@ -138,6 +140,8 @@ def check_parity(actors: Mapping[str, RecurrentActor], flight: RecordedFlight, s
     steps = len(flight.observations)
     noise = None if shape is None else np.random.default_rng(seed).random((steps, *shape), np.float32)
     flown = {name: _replay(actor, flight, noise) for name, actor in actors.items()}
+    if noise is None:
+        _compare("the policy", (flight.actions, flown[original][1]), original, flown[original])
     try:
         return {name: _compare(original, flown[original], name, flown[name]) for name in others}
     except ParityError as error:

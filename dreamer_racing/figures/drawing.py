@@ -67,7 +67,7 @@ def draw_flight(
     trajectory: Trajectory,
     speed: Normalize,
     plane: tuple[int, int] = (0, 1),
-    tilt: float = Camera.tilt,
+    tilt: float | None = None,
 ) -> None:
     """Draw a path coloured by speed, the camera's directions along it, its start, and its end if that is a crash.
 
@@ -76,10 +76,10 @@ def draw_flight(
         trajectory: the flight.
         speed: scale of the colours.
         plane: the two world axes that are seen.
-        tilt: of the camera, degrees.
+        tilt: of the camera, degrees; None for the flight's own.
     """
     _draw_path(axes, trajectory, plane, speed)
-    _draw_cameras(axes, trajectory, plane, tilt)
+    _draw_cameras(axes, trajectory, plane, tilt_of(trajectory) if tilt is None else tilt)
     _draw_ends(axes, trajectory, plane)
 
 
@@ -178,6 +178,11 @@ def from_zero(axes: Axes, least: float = 1.0) -> None:
     Left alone, the axis of a single 0, or of nothing but zeros, shows as much below 0 as above.
     """
     axes.set_ylim(0.0, max(least, axes.get_ylim()[1]))
+
+
+def tilt_of(trajectory: Trajectory) -> float:
+    """Return the tilt of the camera that a flight was flown by, degrees; the default one's where that is not known."""
+    return Camera.tilt if trajectory.camera_tilt is None else trajectory.camera_tilt
 
 
 def camera_directions(attitude: torch.Tensor, tilt: float = Camera.tilt) -> torch.Tensor:

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import Trajectory
-from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track
+from dreamer_racing.figures.drawing import CRASH_COLOR, INK, SPEED_COLORS, camera_directions, draw_track, tilt_of
 
 VIDEO_HEIGHT = 256  # pixels that a video has at least, unless its scale is given
 CONTEXT_COLOR = (64, 160, 80)  # the model sees the images
@@ -199,7 +199,10 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail:
         (K + 1, size, size, 3) uint8.
     """
     background, points = _map_of(track, 2 * size, trajectory.position[:, :2].numpy())
-    view = camera_directions(trajectory.attitude)[:, :2].numpy() * (1.0, -1.0)  # image rows go down
+    view = camera_directions(trajectory.attitude, tilt_of(trajectory))[:, :2].numpy() * (
+        1.0,
+        -1.0,
+    )  # image rows go down
     speed = trajectory.speed.numpy()
     colors = (255 * SPEED_COLORS(speed / max(1.0, float(np.nanmax(speed))))[:, :3]).astype(int)
     length = round(tail / trajectory.control_dt)

@@ -94,6 +94,7 @@ def trajectory_of(flight: FlownFlight) -> Trajectory | None:
     if not duration > 0.0:
         return None
     seen = torch.from_numpy(flight.seen[ticks]).float()
+    camera = (flight.about.get("contract") or {}).get("camera") or {}  # a pilot has none
     return Trajectory(
         position=seen[:, :3],
         attitude=seen[:, 3:7],
@@ -103,6 +104,7 @@ def trajectory_of(flight: FlownFlight) -> Trajectory | None:
         pixels=None,
         control_dt=duration / (len(ticks) - 1),
         outcome=flight.ended,
+        camera_tilt=camera.get("tilt_up_deg"),
     )
 
 

@@ -148,7 +148,7 @@ class FlightLoop:
         self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was
-        self._reasons: tuple[Reason, ...] = ()
+        self._said: tuple[object, ...] = ()
 
     def stop(self, reason: str) -> None:
         """End the flight after the tick that is under way."""
@@ -202,11 +202,13 @@ class FlightLoop:
         An enable that comes and goes is no change as long as something else speaks against arming, too.
         """
         verdict = outputs.verdict
-        words = "; ".join(verdict.words)
+        rejected = self._poses.rejected if Reason.POSE_LOST in verdict.reasons else 0
+        words = "; ".join(verdict.words) + (f"; {rejected} messages were no poses" if rejected else "")
         reasons = tuple(reason for reason in verdict.reasons if reason not in OF_THE_ENABLE) or verdict.reasons
-        if not verdict.command.armed and reasons != self._reasons:
+        said = *reasons, rejected > 0
+        if not verdict.command.armed and said != self._said:
             self._log(logging.INFO, "%s: %s", verdict.state.value if flew else "not armed", words)
-        self._reasons = reasons
+        self._said = said
         return words
 
     def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from dreamer_racing.hil.odometer import Odometer
+from dreamer_racing.hil.odometer import Odometer, TurnOdometer
 from dreamer_racing.hil.reasons import Findings, Reason
 from dreamer_racing.hil.safety_limits import SafetyLimits, Vector, to_number, to_numbers
 from dreamer_racing.hil.vehicle import Pose
@@ -18,6 +18,7 @@ class Seen(NamedTuple):
     position: Vector
     attitude: Vector
     velocity: Vector
+    body_rates: Vector
 
     @property
     def speed(self) -> float:
@@ -54,7 +55,7 @@ def read_pose(pose: Pose) -> Seen | None:
     length = math.hypot(*attitude)
     if not 0.9 < length < 1.1:
         return None
-    return Seen(time, position, tuple(value / length for value in attitude), velocity)
+    return Seen(time, position, tuple(value / length for value in attitude), velocity, rates)
 
 
 class Motion:
@@ -75,6 +76,7 @@ class Motion:
         self.changed_at = -math.inf
         self._limits = limits
         self._odometer = Odometer(limits.velocity_window)
+        self._turns = TurnOdometer(limits.velocity_window)
 
     def take(self, seen: Seen) -> Findings:
         """Take in a pose that is newer than the last; find what no vehicle does from one to the other."""
@@ -83,13 +85,18 @@ class Motion:
         if not self.repeats:
             self.changed_at = seen.time
         findings = {} if last is None else self._check_step(last, seen)
-        mismatch = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
-        if mismatch is not None and not mismatch <= self._limits.velocity_tolerance:
-            findings[Reason.POSE_CONTRADICTION] = (
-                f"velocities and positions of poses differ by {mismatch:.3g} m/s (allowed: "
-                f"{self._limits.velocity_tolerance:g})"
-            )
-        return findings
+        return findings | self._check_claims(seen)
+
+    def _check_claims(self, seen: Seen) -> Findings:
+        """Compare velocities and body rates, by which images are drawn, with where the poses themselves went."""
+        limits = self._limits
+        moved = self._odometer.mismatch(seen.time, seen.position, seen.velocity)
+        turned = self._turns.mismatch(seen.time, seen.attitude, seen.body_rates)
+        words = [
+            *_differ("velocities and positions", "m/s", moved, limits.velocity_tolerance),
+            *_differ("body rates and attitudes", "rad/s", turned, limits.rate_tolerance),
+        ]
+        return {Reason.POSE_CONTRADICTION: ", and ".join(words)} if words else {}
 
     def _check_step(self, last: Seen, seen: Seen) -> Findings:
         """Compare how far it went, and by how much it turned, with what is possible in the time between two poses."""
@@ -105,3 +112,9 @@ class Motion:
                 f"the attitude jumped by {turned:.0f}° (allowed since the last: {allowed:.0f})"
             )
         return findings
+
+
+def _differ(names: str, unit: str, mismatch: float | None, allowed: float) -> list[str]:
+    if mismatch is None or mismatch <= allowed:
+        return []
+    return [f"{names} of poses differ by {mismatch:.3g} {unit} (allowed: {allowed:g})"]

@@ -1,21 +1,21 @@
-"""Whether the velocities that a source of poses claims are those of its own positions."""
+"""Whether velocities and body rates that a source of poses claims are those of its own positions and attitudes."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from dreamer_racing.hil.safety_limits import Vector
 from dreamer_racing.hil.velocity import GAP
 
 
 class _Mark(NamedTuple):
-    """A pose, and how far the claimed velocities have led up to it."""
+    """A pose's position or attitude, the rate that is claimed there, and where the rates so far have led."""
 
     time: float
-    position: Vector
-    velocity: Vector
+    place: Vector
+    rate: Vector
     led: Vector
 
 
@@ -33,12 +33,19 @@ class Odometer:
         1.0
     """
 
+    _start: ClassVar[Vector] = (0.0, 0.0, 0.0)
+
     def __init__(self, window: float) -> None:
         self._window = window
         self._marks: deque[_Mark] = deque()
 
-    def mismatch(self, time: float, position: Vector, velocity: Vector) -> float | None:
-        """Take in a pose that is newer than the last; return by how much the mean velocities differ, m/s.
+    def mismatch(self, time: float, place: Vector, rate: Vector) -> float | None:
+        """Take in a pose that is newer than the last; return by how much the mean rates differ, m/s.
+
+        Args:
+            time: s.
+            place: Position, m.
+            rate: Velocity there, m/s.
 
         Returns:
             None as long as poses do not span the window, be it since the first one or since a gap.
@@ -47,18 +54,76 @@ class Odometer:
         last = marks[-1] if marks else None
         if last is None or time - last.time > GAP:
             marks.clear()
-            led: Vector = (0.0, 0.0, 0.0)
+            led = self._start
         else:
             half = 0.5 * (time - last.time)
-            led = tuple(
-                so_far + half * (old + new) for so_far, old, new in zip(last.led, last.velocity, velocity, strict=True)
-            )
-        marks.append(_Mark(time, position, velocity, led))
+            led = self._lead(last.led, tuple(half * (old + new) for old, new in zip(last.rate, rate, strict=True)))
+        marks.append(_Mark(time, place, rate, led))
         while len(marks) > 2 and time - marks[1].time >= self._window:
             marks.popleft()
         first, elapsed = marks[0], time - marks[0].time
         if elapsed < self._window or elapsed <= 0.0:
             return None
-        went = (here - there for here, there in zip(position, first.position, strict=True))
-        meant = (here - there for here, there in zip(led, first.led, strict=True))
-        return math.dist(tuple(went), tuple(meant)) / elapsed
+        return self._apart(self._change(first.place, place), self._change(first.led, led)) / elapsed
+
+    @staticmethod
+    def _lead(led: Vector, step: Vector) -> Vector:
+        """Return where a step leads from there."""
+        return tuple(here + more for here, more in zip(led, step, strict=True))
+
+    @staticmethod
+    def _change(first: Vector, last: Vector) -> Vector:
+        """Return what leads from one place to another."""
+        return tuple(there - here for here, there in zip(first, last, strict=True))
+
+    @staticmethod
+    def _apart(went: Vector, meant: Vector) -> float:
+        """Return how far two changes are apart."""
+        return math.dist(went, meant)
+
+
+class TurnOdometer(Odometer):
+    """The same of body rates, rad/s in the body frame, and attitudes, wxyz of unit length.
+
+    Rates about changing axes do not add up, so rotations are composed, and the angle between the two that come of it is
+    what they differ by.
+
+    Example:
+        >>> odometer = TurnOdometer(window=0.0625)
+        >>> odometer.mismatch(0.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 8.0)) is None
+        True
+        >>> round(odometer.mismatch(0.0625, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 8.0)), 6)  # it did not turn
+        8.0
+    """
+
+    _start: ClassVar[Vector] = (1.0, 0.0, 0.0, 0.0)
+
+    @staticmethod
+    def _lead(led: Vector, step: Vector) -> Vector:
+        angle = math.hypot(*step)
+        if not math.isfinite(angle):
+            return 4 * (math.nan,)
+        scale = math.sin(0.5 * angle) / angle if angle else 0.0
+        return _product(led, (math.cos(0.5 * angle), *(scale * part for part in step)))
+
+    @staticmethod
+    def _change(first: Vector, last: Vector) -> Vector:
+        w, x, y, z = first
+        turned = _product((w, -x, -y, -z), last)
+        return turned if turned[0] >= 0.0 else tuple(-part for part in turned)  # both are the same rotation
+
+    @staticmethod
+    def _apart(went: Vector, meant: Vector) -> float:
+        return 4.0 * math.asin(min(1.0, 0.5 * math.dist(went, meant)))
+
+
+def _product(first: Vector, second: Vector) -> Vector:
+    """Multiply two quaternions."""
+    a, b, c, d = first
+    w, x, y, z = second
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )

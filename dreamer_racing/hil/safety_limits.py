@@ -49,7 +49,8 @@ class SafetyLimits:
         turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
         turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
         velocity_tolerance: m/s by which the velocities that poses claim may differ from those of their positions.
-        velocity_window: s over which they are compared, see `hil.odometer`.
+        rate_tolerance: rad/s by which the body rates that poses claim may differ from those of their attitudes.
+        velocity_window: s over which both are compared, see `hil.odometer`.
         tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
         tilt_time: s.
         still_time: s without more than `start_speed` after which what has flown counts as crashed: racers never hover.
@@ -83,6 +84,7 @@ class SafetyLimits:
     turn_rate_max: float = setting(15.0, _MOST)
     turn_tolerance_degrees: float = setting(20.0, _DEGREES)
     velocity_tolerance: float = setting(4.0, _MOST)
+    rate_tolerance: float = setting(5.0, _MOST)
     velocity_window: float = setting(0.075, _SECONDS)
     tilt_max_degrees: float = setting(100.0, _DEGREES)
     tilt_time: float = setting(0.2, _TOLERANCE)

@@ -35,7 +35,8 @@ class PoseClock:
             than this accounts for: what grows faster is delay, and poses become that much older.
 
     Attributes:
-        out_of_order: Packets so far that were older than one before, or the same again; they are left out.
+        out_of_order: Packets so far that were older than one before, or the same again, or of a clock that was set back
+            more than once in half a second; they are left out.
     """
 
     def __init__(self, stamping: Stamping, latency: float, drift_max: float = SafetyLimits.clock_drift_max) -> None:
@@ -45,6 +46,7 @@ class PoseClock:
         self._drift_max = 1e-6 * drift_max
         self._offset = math.inf  # s, arrival less stamp of the least delayed packet
         self._newest: Received | None = None
+        self._set_back_at = -math.inf  # s, when the sender's clock was last
         self._latest = -math.inf  # s, of the poses so far
 
     def read(self, received: Received) -> Pose | None:
@@ -56,11 +58,17 @@ class PoseClock:
         if self._newest is not None:
             newer = 0 < (packet.sequence - self._newest.packet.sequence) % 2**32 < 2**31
             waited = received.time - self._newest.time
-            if waited < 0.0 or (not newer and waited < SILENCE):
+            set_back = newer and packet.stamp < self._newest.packet.stamp
+            again = set_back and received.time - self._set_back_at < SILENCE
+            if waited < 0.0 or ((again or not newer) and waited < SILENCE):
                 self.out_of_order += 1
                 return None
-            if waited >= SILENCE or packet.stamp < self._newest.packet.stamp:
+            if waited >= SILENCE:
                 self._offset = math.inf  # it may be another clock
+            elif set_back:
+                # What waits in a queue is as old as what came before it, until it shows to be less.
+                self._offset += self._newest.packet.stamp + waited - packet.stamp
+                self._set_back_at = received.time
             self._offset += self._drift_max * waited
         self._newest = received
         measured = self._measured(received)

@@ -125,6 +125,7 @@ class LiveView:
             "passes": int(outputs.passes),
             "speed": None if pose is None else math.hypot(*pose.linear_velocity.tolist()),
             "position": None if pose is None else pose.position.tolist(),
+            "body_rates": None if pose is None else pose.body_rates.tolist(),
             "render_ms": 1e3 * float(outputs.render_s),
             "act_ms": 1e3 * float(outputs.act_s),
             "shape": None if image is None else list(image.shape),
@@ -252,12 +253,14 @@ def described(frame: Frame | None) -> str:
     silent = time.monotonic() - numbers["time"]
     speed = "no pose" if numbers["speed"] is None else f"{numbers['speed']:.1f} m/s"
     position = ", ".join(f"{value:.2f}" for value in numbers["position"] or ()) or "unknown"
+    rates = ", ".join(f"{value:.1f}" for value in numbers["body_rates"] or ()) or "unknown"
     lines = [
         f"NO TICK FOR {silent:.0f} s" if silent > SILENCE else f"tick {numbers['tick']}",
         f"state     {numbers['state']}{', armed' if numbers['armed'] else ''}",
         f"gate      {numbers['target_gate']} comes next, {numbers['passes']} passed",
         f"speed     {speed}",
         f"position  {position} m",
+        f"turns at  {rates} rad/s about x, y, z",
         f"took      {numbers['render_ms']:.1f} ms to draw, {numbers['act_ms']:.1f} ms to choose",
         *("image     none: the flyer has no camera" for _ in range(numbers["shape"] is None)),
         *numbers["words"],

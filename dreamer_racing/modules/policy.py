@@ -88,12 +88,8 @@ class DreamerPolicy(TensorDictModuleBase):
         action = policy.mode() if self.deterministic else policy.sample()
         return policy, action.clamp(-1.0, 1.0), belief, state
 
-    def make_primer(self, device: torch.device | str = "cpu") -> TensorDictPrimer:
-        """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size.
-
-        Args:
-            device: The environment's.
-        """
+    def make_primer(self) -> TensorDictPrimer:
+        """Make the transform that adds the recurrent keys, zero at a reset, to an environment of any batch size."""
         size = {
             "belief": self.rssm.initial_belief.shape[-1],
             "state": self.rssm.latents * self.rssm.classes,

@@ -35,7 +35,7 @@ from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 from dreamer_racing.training.progress import Progress
-from dreamer_racing.training.replay_ratio import ReplayRatio
+from dreamer_racing.training.replay_ratio import UpdatesOwed
 from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
@@ -199,12 +199,12 @@ class ReplayRun(Run):
     """A run whose learner makes updates by the replay ratio, from a replay of what was collected."""
 
     replay: StreamReplay
-    ratio: ReplayRatio
+    owed: UpdatesOwed
 
     @property
     def updates_due(self) -> int:
         """Updates that the replay ratio still owes for the environment steps made since the prefill."""
-        return max(0, self.ratio.updates(self.counters["env_steps"]) - self.counters["updates"])
+        return max(0, self.owed.until(self.counters["env_steps"]) - self.counters["updates"])
 
     def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
         """Store a rollout too."""

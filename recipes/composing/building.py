@@ -315,7 +315,7 @@ def assemble(
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
-    parts |= {name: own[name] for name in ("replay", "lag", "passes") if name in own}
+    parts |= {name: own[name] for name in ("replay", "owed", "lag", "passes") if name in own}
     if rollouts and not rollouts.has_worlds:
         del parts["env"], parts["collector"]
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
@@ -325,10 +325,13 @@ def assemble(
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
-        saved = checkpoints.load(config.resume, may_lack=("lag", "passes", "journal", *OF_WORLDS))
+        saved = checkpoints.load(config.resume, may_lack=("owed", "lag", "passes", "journal", *OF_WORLDS))
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         begin_anew(env, curriculum, rollouts, counters["env_steps"])
+        if "owed" in own and own["owed"].go_on(counters["env_steps"]):
+            ratio = own["owed"].ratio
+            print(f"updates: from here on by {ratio.setting}={ratio.ratio:g}, {ratio.records} records each")
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -118,8 +119,38 @@ def check(config: HilConfig) -> None:
         raise ValueError(
             f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
         )
+    if operator_of(config) == "keyboard" and config.link not in SIMULATED and os.environ.get("SSH_CONNECTION"):
+        raise ValueError(
+            f"operator=keyboard over ssh: where the network drops, the enable stays and no kill arrives, and link="
+            f"{config.link} may be a real vehicle. Use operator=udp, which lapses, or a terminal of this machine."
+        )
     if config.against and not config.report:
         raise ValueError(f"against={config.against} is for report=.")
+    check_read(config)
+
+
+def check_read(config: HilConfig) -> None:
+    """Refuse settings that nothing would read, as another link or source of poses is chosen.
+
+    Raises:
+        ValueError: the message names the setting and what it is for.
+    """
+    for name, is_read, reader in (
+        ("baud", config.device is not None, "device="),
+        ("pose_device", config.pose == "mavlink", "pose=mavlink"),
+        ("pose_baud", config.pose_device is not None, "pose_device="),
+        ("pose_topic", config.pose == "ros2", "pose=ros2"),
+        ("pose_message", config.pose != "udp", "pose=mavlink or ros2"),
+    ):
+        if (value := getattr(config, name)) is not None and not is_read:
+            raise ValueError(f"{name}={value} is for {reader}, which is not given: add that, or leave {name}= out.")
+
+
+def operator_of(config: HilConfig) -> str:
+    """Return who answers for the flight, also where that is left open."""
+    if config.operator != "auto":
+        return config.operator
+    return "timed" if config.link in SIMULATED else "keyboard"
 
 
 def is_this_machine(host: str) -> bool:
@@ -144,7 +175,7 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
         if config.track is None:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
-        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config.track)
+        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
     path = agent_path(config.actor)
     flyer = ActorFlyer(path)
     return flyer, flyer.contract
@@ -191,7 +222,7 @@ def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
     return SafetyLimits.of_track(track, **given_limits(config))
 
 
-def pilot_contract(track: str) -> dict[str, Any]:
+def pilot_contract(config: HilConfig) -> dict[str, Any]:
     """Return what an actor's contract would say of the pilot."""
     drone = QuadrotorParameters()
     channels = [
@@ -200,7 +231,8 @@ def pilot_contract(track: str) -> dict[str, Any]:
     ]
     scale = drone.collective_thrust_scale
     thrust = {"name": "collective_thrust", "unit": "m/s^2", "offset": scale, "scale": scale}
-    return {"source": {"track": track}, "action": {"channels": [thrust, *channels]}}
+    source = {"track": config.track, "preset": config.preset}
+    return {"source": source, "action": {"channels": [thrust, *channels]}}
 
 
 def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
@@ -283,9 +315,8 @@ def pose_config(config: HilConfig) -> PoseConfig:
 
 def make_operator(config: HilConfig) -> OperatorSource:
     """Open where the operator's word comes from, and say which it is if that was left open."""
-    name = config.operator
-    if name == "auto":
-        name = "timed" if config.link in SIMULATED else "keyboard"
+    name = operator_of(config)
+    if config.operator == "auto":
         print(f"operator: {name} (operator=auto, link={config.link})")
     if name == "udp":
         return UdpOperator(config.operator_port, config.operator_host)

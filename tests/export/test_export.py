@@ -45,6 +45,7 @@ from dreamer_racing.export.shipped_agent import load_agent
 from dreamer_racing.modules import Interface, ModelSize, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.rssm import mix_uniform
+from tests.export.recorded import answered
 from tests.running_recipes import recipe
 
 pytest.importorskip("onnxscript")
@@ -78,7 +79,7 @@ def contract_of(step: ActorStep) -> dict:
 
 
 def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
-    """Observations that nobody flew, with a reset in every 40 steps and two next to each other."""
+    """Random observations, with a reset in every 40 steps and two next to each other, and the policy's answers."""
     random = np.random.default_rng(0)
     interface = agent.interface
     observations = (
@@ -88,7 +89,7 @@ def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
     )
     is_init = np.arange(steps) % 40 == 0
     is_init[121] = True
-    return RecordedFlight(observations, is_init, np.zeros((steps, interface.action_dim), np.float32))
+    return answered(agent, observations, is_init)
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +184,22 @@ def test_every_architecture_flies_alike(
     deviation = export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
     assert deviation.keys() == {"onnxruntime", "torch.export"} and max(deviation.values()) < 1e-5
     assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}
+
+
+def test_what_flies_otherwise_than_the_policy_did_is_refused(agent: Agent, tmp_path: Path) -> None:
+    flight, step = make_flight(agent), ActorStep(agent)
+    flight.actions[150, 0] += 1e-3
+    with pytest.raises(ParityError, match=r"^torch does not fly as the policy does: at step 150 of 200 .* 1 steps are"):
+        export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent: Agent, tmp_path: Path) -> None:
+    step, flight, kinds = make_step(agent, "mode"), make_flight(agent), [False, True, False]
+    for shared_weights in kinds:
+        export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx", shared_weights=shared_weights)
+        own = "weights.safetensors" if shared_weights else "actor.pt2"
+        assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "contract.json", own}
 
 
 @pytest.mark.parametrize(
@@ -617,7 +634,7 @@ def test_the_recipe_exports_a_run(run_dir: Path) -> None:
         assert words in done.stdout
     contract = json.loads((folder / "contract.json").read_text())
     assert contract["control"] == {"rate_hz": 40.0, "period_s": 0.025}
-    assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == 0.02
+    assert contract["camera"]["tilt_up_deg"] == 30.0 and contract["action"]["trained_command_delay_s"] == [0.0, 0.04]
     assert contract["source"]["env_steps"] == 160 and contract["verification"]["episodes"] >= 4
     assert (contract["camera"]["width_px"], contract["camera"]["height_px"]) == (32, 32)
     assert contract["camera"]["focal_length_px"] == pytest.approx(16.0)  # 90° of view: half the height

@@ -17,13 +17,14 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.actor_step import ActorStep, export_actor
 from dreamer_racing.export.contract import hash_weights, make_contract
 from dreamer_racing.export.onnx_actor import OnnxActor
-from dreamer_racing.export.parity import MIN_STEPS, RecordedFlight
+from dreamer_racing.export.parity import MIN_STEPS
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, choose_weights, is_agent, load_agent
 from dreamer_racing.export.weights_file import read_weights, write_weights
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.training.checkpoint import RunCheckpoints
 from tests.dreamers import learner_of
+from tests.export.recorded import answered
 
 pytestmark = pytest.mark.xdist_group("shipped")  # one worker makes what these tests share
 
@@ -52,7 +53,7 @@ def ship(agent: Agent, env: DroneRacingEnv, folder: Path) -> Path:
     pytest.importorskip("onnxruntime")
     side = agent.interface.image_size
     images = np.random.default_rng(0).integers(0, 256, (MIN_STEPS, side, side, 3), np.uint8)
-    flight = RecordedFlight(images, np.arange(MIN_STEPS) % 50 == 0, np.zeros((MIN_STEPS, 4), np.float32))
+    flight = answered(agent, images, np.arange(MIN_STEPS) % 50 == 0)
     step = ActorStep(agent)
     contract = make_contract(step, env.worlds.parameters, env.worlds.camera)
     export_actor(step, contract, flight, folder / "actor.onnx", shared_weights=True)

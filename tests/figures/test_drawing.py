@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve
+from dreamer_racing.figures.film import top_down_frames
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.training.metrics import read_metrics
 
@@ -114,6 +117,16 @@ def test_camera_looks_25_degrees_above_the_nose():
     cosine, sine = math.cos(math.radians(25)), math.sin(math.radians(25))
     expected = torch.tensor([[cosine, 0, sine], [1, 0, 0], [0, 0, -1], [0, cosine, sine]])
     torch.testing.assert_close(view, expected, atol=1e-6, rtol=0)
+
+
+def test_flights_are_drawn_with_the_cameras_that_they_were_flown_by(tmp_path):
+    track, pictures = load_track("circle"), {}
+    for tilt in (None, Camera.tilt, 60.0):
+        flight = replace(straight_flight(track), camera_tilt=tilt)
+        plot_top_down(track, flight, tmp_path / "plot.png")
+        pictures[tilt] = np.asarray(Image.open(tmp_path / "plot.png")), top_down_frames(track, flight, size=96)
+    for usual, same, other in zip(*pictures.values(), strict=True):
+        assert np.array_equal(usual, same) and not np.array_equal(usual, other)
 
 
 def test_lost_state_can_be_drawn(tmp_path):

@@ -298,6 +298,17 @@ def test_what_speaks_against_arming_is_said_when_it_changes_and_not_with_every_e
     assert 1 <= len(said) <= 3 and "arm=true" in said[-1]
 
 
+def test_messages_that_are_no_poses_are_said_where_there_is_none(caplog):
+    plant = Watched(CIRCLE)
+    plant.poses.poll = list
+    plant.happens = lambda elapsed: setattr(plant.poses, "rejected", int(10 * elapsed))
+    with caplog.at_level(logging.INFO, "dreamer_racing.hil.loop"):
+        ended = plant.fly(chain_of(Hover(), plant), Hover.rate, 1.0)
+    said = [record.getMessage() for record in caplog.records if "there is no pose" in record.getMessage()]
+    assert "messages" not in said[0] and said[-1].endswith("; 1 messages were no poses"), said
+    assert ended.endswith(" messages were no poses")
+
+
 def test_a_disk_that_is_full_does_not_end_a_flight():
     class Full:
         def tick(self, time, message):

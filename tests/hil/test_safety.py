@@ -19,7 +19,8 @@ LIMITS = SafetyLimits(
     fence_low=(-4, -4, -1),
     fence_high=(4, 4, 4),
     start_position=(1, 0, 0),
-    velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities
+    velocity_tolerance=1e3,  # poses of these tests stand where they like, but for those of velocities and rates
+    rate_tolerance=1e3,
     turn_tolerance_degrees=180,  # and as they like, but for those of turns
 )
 OFF, ON, KILL = Operator(False, False), Operator(True, False), Operator(True, True)
@@ -33,8 +34,10 @@ def turned(axis, degrees):
     return attitude
 
 
-def pose_at(time, position=(1.0, 0.0, 0.0), attitude=(1.0, 0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
-    return Pose(time, np.array(position), np.array(attitude), np.array(velocity), np.zeros(3))
+def pose_at(
+    time, position=(1.0, 0.0, 0.0), attitude=(1.0, 0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), rates=(0.0, 0.0, 0.0)
+):
+    return Pose(time, np.array(position), np.array(attitude), np.array(velocity), np.array(rates))
 
 
 class Flight:
@@ -232,6 +235,33 @@ def test_both_sides_of_what_velocities_may_differ_from_positions(claimed, state)
     assert verdict.state is state and verdict.command.armed == (state is State.FLYING)
     differ = f"{abs(claimed - 5.0):.3g} m/s (allowed: 4)"
     assert state is State.FLYING or verdict.words[0].endswith(differ), verdict.words
+
+
+def turning(went, claimed, count=6, **limits):
+    """The verdicts of ticks in which poses yaw at one rate and claim another, rad/s; their window is three ticks."""
+    flight = Flight(velocity_window=3 * PERIOD, **limits).flying()
+    return [
+        flight.tick(pose={"attitude": turned(2, math.degrees(went * PERIOD * (step - 0.5))), "rates": (0, 0, claimed)})
+        for step in range(1, count)
+    ]
+
+
+@pytest.mark.parametrize(("claimed", "state"), [(4.0, State.FLYING), (8.9, State.FLYING), (-0.9, State.FLYING),
+                                                (9.1, State.CUT), (-1.1, State.CUT), (-4.0, State.CUT)])  # fmt: skip
+def test_both_sides_of_what_body_rates_may_differ_from_attitudes(claimed, state):
+    verdict = turning(4.0, claimed, rate_tolerance=5.0)[-1]
+    assert verdict.state is state and verdict.command.armed == (state is State.FLYING)
+    assert state is State.FLYING or verdict.reasons[0] is Reason.POSE_CONTRADICTION
+    differ = f"body rates and attitudes of poses differ by {abs(claimed - 4.0):.3g} rad/s (allowed: 5)"
+    assert state is State.FLYING or verdict.words[0] == differ, verdict.words
+
+
+def test_degrees_a_second_for_radians_do_not_arm_where_somebody_turns_it_by_hand():
+    flight = Flight(rate_tolerance=5.0, start_yaw_tolerance_degrees=180).ready()
+    for step in range(6):
+        pose = {"attitude": turned(2, 20.0 * step * PERIOD), "rates": (0.0, 0.0, 20.0)}
+        verdict = flight.tick(pose=pose, operator=OFF)
+    assert Reason.POSE_CONTRADICTION in verdict.reasons, verdict.words
 
 
 def test_a_source_that_says_nothing_of_velocities_but_zeros_is_cut_within_its_window():

@@ -98,6 +98,25 @@ def test_a_delay_that_grows_is_seen_as_age_and_not_forgotten():
     assert ages[1500] == pytest.approx(0.3, abs=0.002) and ages[-1] == pytest.approx(0.3, abs=0.004)
 
 
+def test_a_clock_that_is_set_back_does_not_make_what_waits_look_fresh():
+    """In a queue of 120 ms; before the step and after it, and until packets wait less."""
+    clock = PoseClock(Stamping.sender, 0.0, drift_max=0.0)
+    ages = []
+    for k in range(100):
+        delay = 0.0 if k == 0 else 0.12 if k < 80 else 0.01
+        stamp = 0.01 * k - 0.02 * (k >= 50)
+        arrived = 50.0 + 0.01 * k + delay
+        (time,) = times(clock, [received(k, stamp, arrived)])
+        ages.append(None if time is None else round(arrived - time, 6))
+    assert ages[1:80] == [0.12] * 79 and ages[91:] == [0.01] * 9
+
+
+def test_a_clock_that_is_set_back_again_and_again_tells_nothing():
+    clock = PoseClock(Stamping.sender, 0.0)
+    packets = [received(k, 7.0 - 0.001 * k, 10.0 + 0.01 * k) for k in range(40)]
+    assert times(clock, packets)[:2] == [10.0, 10.01] and clock.out_of_order == 38
+
+
 def test_what_was_known_of_another_clock_is_forgotten_after_a_silence():
     clock = PoseClock(Stamping.sender, 0.0)
     assert times(clock, [received(0, 3.0, 10.0), received(1, 3.6, 10.9), received(2, 3.7, 11.0)]) == [10.0, 10.9, 11.0]

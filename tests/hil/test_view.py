@@ -55,13 +55,14 @@ def test_state_and_numbers_are_told_in_text(view):
     assert (state["state"], state["armed"], state["target_gate"], state["passes"]) == ("flying", True, 3, 8)
     assert state["speed"] == 5.0 and state["position"] == [1.0, 2.0, 3.0]
     lines = state["text"].splitlines()
-    assert lines[1:5] == [
+    assert lines[1:6] == [
         "state     flying, armed",
         "gate      3 comes next, 8 passed",
         "speed     5.0 m/s",
         "position  1.00, 2.00, 3.00 m",
+        "turns at  0.0, 0.0, 0.0 rad/s about x, y, z",
     ]
-    assert lines[5] == "took      1.5 ms to draw, 2.5 ms to choose"
+    assert lines[6] == "took      1.5 ms to draw, 2.5 ms to choose"
 
 
 def test_without_pose_and_camera_it_says_why(view):

@@ -33,6 +33,11 @@ flights = recipe_module("composing.flight")
         ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
+        ({"actor": "pilot", "baud": 9600}, "baud=9600 is for device=, which is not given"),
+        ({"actor": "pilot", "pose_device": "/dev/x"}, "pose_device=/dev/x is for pose=mavlink"),
+        ({"actor": "pilot", "pose_baud": 9600}, "pose_baud=9600 is for pose_device="),
+        ({"actor": "pilot", "pose_topic": "/p"}, "pose_topic=/p is for pose=ros2"),
+        ({"actor": "pilot", "pose_message": "ODOMETRY"}, "pose_message=ODOMETRY is for pose=mavlink or ros2"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changes, message):
@@ -50,6 +55,7 @@ def test_what_does_not_go_together_is_refused(changes, message):
         ({"actor": "nobody"}, "There is no file nobody"),
         ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
         ({"actor": "kidney", "link": "pigeon"}, "pigeon"),
+        ({"actor": "kidney", "device": "/dev/x"}, "device=/dev/x is for crsf, sbus, .* link=simulated goes over UDP"),
         ({"actor": "kidney", "pose": "stars"}, "stars.*udp, mavlink, ros2"),
         ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),
         (
@@ -68,6 +74,19 @@ def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, t
     hil.check(config)
     with ExitStack() as opened, pytest.raises((ValueError, OSError), match=message):
         hil.prepare(config, opened)
+
+
+@pytest.mark.parametrize("operator", ["auto", "keyboard"])
+def test_a_terminal_over_a_network_answers_for_no_real_vehicle(operator, monkeypatch):
+    """The enable would stay where the network drops."""
+    real = hil.HilConfig(actor="kidney", link="crsf", operator=operator)
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    hil.check(real)
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 50000 10.0.0.9 22")
+    with pytest.raises(ValueError, match=r"operator=keyboard over ssh.*operator=udp"):
+        hil.check(real)
+    hil.check(hil.HilConfig(actor="kidney", link="crsf", operator="udp"))
+    hil.check(hil.HilConfig(actor="kidney", operator=operator))  # simulated
 
 
 def test_a_port_in_use_is_said_and_nothing_else_happens(tmp_path):

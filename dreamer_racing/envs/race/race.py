@@ -100,7 +100,9 @@ class Race:
     ):
         self.track = track
         self.weights = weights or RewardWeights()
-        self.episode_steps = episode_steps or round(EPISODE_TIME / control_dt)
+        if episode_steps is not None and episode_steps < 1:
+            raise ValueError(f"episode_steps={episode_steps}: must be at least 1.")
+        self.episode_steps = round(EPISODE_TIME / control_dt) if episode_steps is None else episode_steps
         self.laps = laps
         self.control_dt = control_dt
         self._sweep = GateSweeper(track, device, dtype, miss_radius, reach=MAX_SPEED * control_dt)

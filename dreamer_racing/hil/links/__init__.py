@@ -75,6 +75,11 @@ def make_link(config: LinkConfig) -> TransportLink:
     """
     if config.name not in LINKS:
         raise ValueError(f"name={config.name}: the links are {', '.join(LINKS)}.")
+    if config.device is not None and config.name not in PROTOCOLS:
+        raise ValueError(
+            f"device={config.device} is for {', '.join(PROTOCOLS)}, and link={config.name} goes over UDP: choose one "
+            "of those, or leave device= out."
+        )
     link = LINKS[config.name](config)
     try:
         _check_speed(link, config)

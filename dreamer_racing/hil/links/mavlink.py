@@ -1,8 +1,10 @@
-"""MAVLink 2 (PX4, ArduPilot): SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
+"""MAVLink 2 to PX4: SET_ATTITUDE_TARGET with body rates and thrust, and the command that arms.
 
-The vehicle must be in the mode in which it obeys (PX4: offboard; ArduPilot: guided, no GPS); a person puts it there, by
-radio. Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does. Unlike that
-switch it counts in every mode, so none is sent before this link has armed the vehicle: whoever else flies it goes on.
+The vehicle must be in the mode in which it obeys (offboard); a person puts it there, by radio. Not for ArduPilot, which
+takes thrust for a climb rate unless its ``GUID_OPTIONS`` say otherwise, and hovers on where commands stop.
+
+Disarming is forced: it stops the motors in the air too, as the arm switch of the other links does. Unlike that switch
+it counts in every mode, so none is sent before this link has armed the vehicle: whoever else flies it goes on.
 
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
 

@@ -159,6 +159,12 @@ def test_time_limit_truncates():
     assert (outcome.truncated.item(), outcome.terminated.item(), outcome.finished.item()) == (True, False, False)
 
 
+@pytest.mark.parametrize("steps", [0, -3])
+def test_an_episode_of_no_steps_is_refused(steps):
+    with pytest.raises(ValueError, match=f"episode_steps={steps}: must be at least 1"):
+        Race(CIRCLE, 1, episode_steps=steps)
+
+
 def test_a_crash_in_the_last_step_is_terminated_only():
     race = begin(episode_steps=1)
     outcome = fly(race, HOVER, (0, 0, 0.01))
