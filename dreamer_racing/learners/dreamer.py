@@ -21,7 +21,7 @@ from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
-from dreamer_racing.learners.saved_dreamer import check_saved, own_state
+from dreamer_racing.learners.saved_dreamer import check_optimizers, check_saved, load_parameters, own_state
 from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys, set_number
@@ -341,24 +341,34 @@ class DreamerLearner:
             ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
                 changed then.
         """
-        self.adopt(state_dict)
+        check_saved(state_dict, self.agent, self.losses)
+        check_optimizers(state_dict, self._actor_optimizer is not None)
+        self.agent.load_state_dict(state_dict["agent"])
+        for name, loss in self.losses.items():
+            loss.load_state_dict(state_dict["losses"][name], strict=False)
+        if self.averaged is not None:
+            self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
         restore(self.optimizer, state_dict["optimizer"])
         if self._actor_optimizer is not None:
             restore(self._actor_optimizer, state_dict["actor_optimizer"])
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> None:
-        """Take over the weights of what another learner's ``state_dict`` returned: no optimiser, no counters.
+        """Take over the weights of what another learner's ``state_dict`` returned, and nothing else.
+
+        They are those that flew, so the averaged ones where it kept them. No optimiser, no counters, no bounds of the
+        actor's deviation, and nothing that losses keep from update to update: neither flown steps nor statistics.
 
         Raises:
-            ValueError: As `load_state_dict`.
+            ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
+                changed then.
         """
         check_saved(state_dict, self.agent, self.losses)
-        self.agent.load_state_dict(state_dict["agent"])
+        flying = state_dict.get("averaged", state_dict["agent"])
+        for agent in filter(None, (self.agent, self.averaged)):
+            load_parameters(agent, flying)
         for name, loss in self.losses.items():
-            loss.load_state_dict(state_dict["losses"][name], strict=False)
-        if self.averaged is not None:
-            self.averaged.load_state_dict(state_dict.get("averaged", state_dict["agent"]))
+            load_parameters(loss, state_dict["losses"][name])
 
     @property
     def _groups(self) -> list[dict[str, Any]]:

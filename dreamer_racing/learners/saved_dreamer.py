@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -52,6 +53,30 @@ def check_saved(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> N
     """
     check_size(saved["size"], agent.size)
     _check_parts(saved, agent, losses)
+
+
+def check_optimizers(saved: dict[str, Any], of_actor: bool) -> None:
+    """Refuse the state of a learner whose actor learned by the other kind of optimiser.
+
+    Args:
+        saved: ``state_dict()`` of a learner.
+        of_actor: Whether the one that is to load it has an optimiser for its actor alone.
+
+    Raises:
+        ValueError: If they differ.
+    """
+    if ("actor_optimizer" in saved) is not of_actor:
+        there, here = ("none", "an optimiser of its own") if of_actor else ("an optimiser of its own", "none")
+        raise ValueError(
+            f"The checkpoint's actor learned with {there}, and this learner's has {here}: choose the loss.actor that it "
+            "was trained with, or begin a run with its weights (init_from=)."
+        )
+
+
+def load_parameters(module: nn.Module, saved: Mapping[str, Tensor]) -> None:
+    """Load the parameters of a module from a state, and leave its buffers alone."""
+    own = dict(module.named_parameters())
+    module.load_state_dict({name: value for name, value in saved.items() if name in own}, strict=False)
 
 
 def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:

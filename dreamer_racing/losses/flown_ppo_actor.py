@@ -144,6 +144,8 @@ class FlownPPOActorLoss(ClippedActorLoss):
         length, number = steps["reward"].shape[:2]
         room = length * math.ceil(self.ppo.flown / (length * number))
         if self.reward.shape[:2] == (room, number):
+            if self._flown % length:  # rollouts of another length, which do not make whole ones of this
+                self._count(0)
             return
         for name, value in steps.items():
             self.register_buffer(name, value.new_zeros(room, *value.shape[1:]))

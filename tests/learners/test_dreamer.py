@@ -408,6 +408,28 @@ def test_a_discount_of_zero_leaves_only_the_next_reward():
     assert returns.mean().item() == pytest.approx(imagined["imagined_reward"].item(), abs=1e-5)
 
 
+def test_another_learner_s_weights_are_those_that_flew_and_nothing_that_it_kept():
+    saved = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
+    for _ in range(3):
+        saved.update(make_batch())
+    saved.adjust(max_std=0.3)
+    learner = learner_of(seed=1, **CONFIG | {"average_rate": 0.25})
+    kept = {name: value.clone() for name, value in learner.losses.named_buffers()}
+    learner.adopt(copy.deepcopy(saved.state_dict()))
+    flew = dict(saved.averaged.named_parameters())
+    for agent in (learner.agent, learner.averaged):
+        assert all(torch.equal(value, flew[name]) for name, value in agent.named_parameters())
+    assert all(torch.equal(value, kept[name]) for name, value in learner.losses.named_buffers())
+    assert learner.updates == 0 and not learner.optimizer.state
+
+
+@pytest.mark.parametrize(("first", "second"), [("reinforce", "ppo"), ("ppo", "reinforce")])
+def test_state_of_an_actor_that_learned_otherwise_is_refused_before_anything_changes(first, second):
+    saved, learner = (learner_of(seed=seed, **CONFIG | {"actor": kind}) for seed, kind in ((0, first), (1, second)))
+    saved.update(make_batch())
+    assert_refused(saved, learner, "loss.actor|trained with another loss")
+
+
 def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
     learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
     assert learner.evaluation_policy().actor is learner.averaged.actor

@@ -185,6 +185,13 @@ def test_flights_of_another_number_of_environments_begin_anew():
     assert actor_loss(learner).improve(1)
 
 
+def test_flights_of_another_length_begin_anew_where_they_do_not_add_up_to_whole_ones():
+    learner = make_learner()
+    learner.watch(make_rollout(learner, steps=4))
+    learner.watch(make_rollout(learner, steps=8))  # room for 8 steps either way, and 4 are kept
+    assert actor_loss(learner).improve(1)
+
+
 def test_a_rollout_without_the_policy_is_refused():
     learner = make_learner()
     with pytest.raises(KeyError, match=r"FlownPPOActorLoss needs \['loc'\]"):
