@@ -60,7 +60,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
     """Yield a record for each measurement of a variant."""
     trained = trained_config(RunDirectory.of(checkpoint).path)
     assert isinstance(trained, DreamerConfig), "a run of recipes/dreamer_v3.py"
-    trained.device, trained.replay.device, trained.replay.context = "cpu", "auto", False
+    trained.device, trained.replay.device = "cpu", "auto"
     learner, counters = restore(trained, checkpoint)
     config, size = varied(trained, variant)
     model = config.model

@@ -182,6 +182,12 @@ class StreamReplay(TensorDictReplayBuffer):
         for field in state["fields"]:
             field["key"] = field["key"] if isinstance(field["key"], str) else tuple(field["key"])
         self._check_fields([field["key"] for field in state["fields"]], state["fields"])
+        has, wants = (any(field["key"][0] == CONTEXT for field in state["fields"]), self.latents is not None)
+        if state["fields"] and has is not wants:
+            raise ValueError(
+                f"The saved replay was recorded {'with' if has else 'without'} the latents of its records, and this "
+                f"one keeps {'them' if wants else 'none'}: resume with replay.context={str(has).lower()}."
+            )
         self._check_frames(path, state)
         return state
 

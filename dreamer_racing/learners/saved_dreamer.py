@@ -68,8 +68,8 @@ def check_optimizers(saved: dict[str, Any], of_actor: bool) -> None:
     if ("actor_optimizer" in saved) is not of_actor:
         there, here = ("none", "an optimiser of its own") if of_actor else ("an optimiser of its own", "none")
         raise ValueError(
-            f"The checkpoint's actor learned with {there}, and this learner's has {here}: choose the loss.actor that it "
-            "was trained with, or begin a run with its weights (init_from=)."
+            f"The checkpoint's actor learned with {there}, and this learner's has {here}: choose the loss.actor that "
+            "it was trained with, or begin a run with its weights (init_from=)."
         )
 
 

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dreamer_racing.modules.deferred import autocast_type
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.interface import PIXELS, VECTOR, Interface
 from dreamer_racing.modules.layers import NORMS, NormedLinear, initialize_convolution
@@ -62,6 +63,14 @@ def unfold_patches(maps: Tensor, patch: int) -> Tensor:
     count, rows, columns, channels = maps.shape
     blocks = maps.reshape(count, rows, columns, patch, channels // patch)
     return blocks.transpose(2, 3).reshape(count, rows * patch, columns * patch, channels // patch**2)
+
+
+def _centred(images: Tensor) -> Tensor:
+    """Map uint8 to [−0.5, 0.5], in float32, or where autocast computes in bfloat16, rounded to that."""
+    if autocast_type(images.device.type) is torch.bfloat16:
+        # x − 127.5 is exact in its 8 bits, so that this rounds once, as the cast of float32 would.
+        return images.to(torch.bfloat16).sub_(127.5).mul_(1.0 / 255.0)
+    return images.float().div_(255.0).sub_(0.5)
 
 
 class ImageEncoder(nn.Module):
@@ -121,7 +130,7 @@ class ImageEncoder(nn.Module):
         """
         batch = pixels.shape[:-3]
         # Channels-last throughout: (N, H, W, C) in memory, (N, C, H, W) to the convolutions.
-        images = fold_patches(pixels.flatten(0, -4), self.patch).float().div_(255.0).sub_(0.5)
+        images = _centred(fold_patches(pixels.flatten(0, -4), self.patch))
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             maps = self.pool(convolution(images.permute(0, 3, 1, 2)))
             images = F.silu(norm(maps.permute(0, 2, 3, 1)))

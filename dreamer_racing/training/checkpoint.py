@@ -241,17 +241,20 @@ class BestCheckpoint:
     Args:
         run_dir: folder of the run.
         components: as of `RunCheckpoints`.
+        env_steps: where the run goes on. What is kept of a later evaluation is of a run that this one replaces: the
+            next evaluation replaces it.
 
     Attributes:
         score: of the evaluation whose parts are kept; None before the first.
     """
 
-    def __init__(self, run_dir: str | Path, components: Mapping[str, Any]) -> None:
+    def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
         self.score: float | None = None
         with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
-            self.score = Checkpoint.manifest(newest_sound(self.directory))["metadata"]["score"]
+            kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
+            self.score = kept["score"] if kept["env_steps"] <= env_steps else None
 
     def offer(self, score: float, env_steps: int) -> bool:
         """Save the parts if the score beats that of the kept ones; return whether it did."""

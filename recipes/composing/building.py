@@ -336,7 +336,7 @@ def assemble(
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
     flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
-    best = BestCheckpoint(directory.path, flown)
+    best = BestCheckpoint(directory.path, flown, counters["env_steps"])
     parallel.together(lambda: None)  # all have read what is written anew now
     if parallel.is_first():
         write_configuration(directory, config, overrides, counters["env_steps"])

@@ -29,7 +29,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
-from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, find_loss
+from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, LossConfig, find_loss
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
@@ -44,6 +44,8 @@ RACE_ONLY = (
     "env.start_at_gate",
     "env.start_on_line",
     "env.miss_radius",
+    "env.preset",
+    "env.camera_tilt",
     "evaluation.start_noise",
 )
 """Settings that other suites have no use for, and that must be left at their defaults."""
@@ -251,20 +253,31 @@ def check_workers(config: DreamerConfig) -> None:
     check_interval(config.weight_interval, num_envs * config.rollout_steps)
 
 
+OF_IMAGINATION = ("continuation", "return_decay")
+"""Numbers of losses that only imagined rollouts read."""
+
+
 def check_imagination(config: DreamerConfig) -> None:
     """Refuse to imagine from the newest windows where there are none, or from all records anyway.
+
+    And where nothing is imagined, numbers that nothing but imagination reads.
 
     Raises:
         ValueError: the message names the settings.
     """
     model, share = config.model, config.replay.recent_share
+    if not getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True):
+        for name, own, default in (
+            ("model.imagine_recent", model.imagine_recent, False),
+            *((f"loss.{name}", getattr(config.loss, name), getattr(LossConfig, name)) for name in OF_IMAGINATION),
+        ):
+            if own != default:
+                raise ValueError(
+                    f"{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it out, or "
+                    "choose another loss."
+                )
     if not model.imagine_recent:
         return
-    if not getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True):
-        raise ValueError(
-            f"model.imagine_recent=true, and loss.actor={config.loss.actor} imagines nothing: leave it out, or choose "
-            "another loss."
-        )
     if not round(share * model.batch_size):
         raise ValueError(
             f"model.imagine_recent=true, and replay.recent_share={share:g} draws none of model.batch_size="

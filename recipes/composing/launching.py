@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import cast
 
@@ -16,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from composing.checks import check_overrides
 from composing.command_line import follow_quietly, merge_overrides, override_key, plain_errors, start_logging
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
-from composing.schema import RunConfig, is_race
+from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
 from dreamer_racing.experience.ahead import WorkerError
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
@@ -29,8 +30,15 @@ from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train
+from dreamer_racing.training.schedule import Ramp, RampClock
 
-TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
+TRAINED_ON = (
+    "track",
+    "task",
+    "decoys",
+    "env.control_rate",
+    "replay.context",
+)  # what a run that is resumed cannot change
 
 
 def launch(
@@ -173,10 +181,19 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         "evaluate it": f"{command('evaluate')} checkpoint={place} episodes=100",
         "watch it fly": f"{command('fly')} agent={place}" if is_race(config) else "",
         "draw it": f"{command('plot')} runs={place} output=figures",
-        "go on": f"{command(config.algorithm)} resume={place} total_env_steps={longer}",
+        "go on": f"{command(config.algorithm)} resume={place} total_env_steps={longer}{_rising(config)}",
     }
     files = {what: _from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)
+
+
+def _rising(config: RunConfig) -> str:
+    """Return what to know before a run is made longer: what has fallen by its share of the run rises again."""
+    if not isinstance(config, DreamerConfig):
+        return ""
+    ramps = {ramp.name: getattr(config.schedule, ramp.name) for ramp in fields(config.schedule)}
+    by_run = [name for name, ramp in ramps.items() if isinstance(ramp, Ramp) and ramp.to and ramp.by is RampClock.run]
+    return f"  # goes back in {', '.join(by_run)}, which move with the share of the run" if by_run else ""
 
 
 def _from_here(path: Path) -> str:

@@ -541,3 +541,13 @@ def test_samples_are_delivered_where_the_learner_is():
     replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
     assert replay.records(0)["pixels"].device.type == "cpu"
     assert {value.device.type for value in replay.sample().values()} == {"meta"}
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_replay_with_latents_and_one_without_are_told_apart(kept, tmp_path):
+    saved, other = (make_replay(60, 3, 6, 4, latents=FORMAT if latents else None) for latents in (kept, not kept))
+    rollout = collect(CountingEnv(3), steps=5, batches=1)[0]
+    saved.extend(with_latents(rollout, first=1) if kept else rollout)
+    saved.dump(tmp_path)
+    with pytest.raises(ValueError, match=f"resume with replay.context={str(kept).lower()}"):
+        other.load(tmp_path)

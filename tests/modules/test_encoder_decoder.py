@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from dreamer_racing.modules.decoder import ImageDecoder
-from dreamer_racing.modules.encoder import ImageEncoder, fold_patches, smallest_map, unfold_patches
+from dreamer_racing.modules.encoder import ImageEncoder, _centred, fold_patches, smallest_map, unfold_patches
+from dreamer_racing.modules.layers import autocast
 
 VARIANTS = [
     {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": False, "norm": "rms"},
@@ -75,3 +76,11 @@ def test_embedding_depends_on_every_region_of_the_image():
             spotted = black.clone()
             spotted[:, row : row + 4, column : column + 4] = 255
             assert not torch.allclose(encoder(spotted), encoder(black))
+
+
+def test_images_are_centred_under_autocast_as_in_float32_and_rounded_once():
+    images = torch.arange(256, dtype=torch.uint8).view(1, 16, 16, 1)
+    exact = _centred(images)
+    assert exact.dtype == torch.float32 and (exact.min(), exact.max()) == (-0.5, 0.5)
+    with autocast(torch.device("cpu"), enabled=True):
+        assert torch.equal(_centred(images), exact.to(torch.bfloat16))

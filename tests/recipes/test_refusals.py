@@ -85,6 +85,10 @@ REFUSED = [
         ["model.imagine_recent=true", "replay.recent_share=0.5", "loss=privileged", "loss.actor=asymmetric_ppo"],
         ["model.imagine_recent=true, and loss.actor=asymmetric_ppo imagines nothing"],
     ),
+    (
+        ["loss.continuation=false", "loss=privileged", "loss.actor=asymmetric_ppo"],
+        ["loss.continuation=false, and loss.actor=asymmetric_ppo imagines nothing"],
+    ),
     (["env=dmc", "loss.actor=asymmetric_ppo"], ["loss.actor=asymmetric_ppo: read", "loss.actor=reinforce"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),

@@ -127,8 +127,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     assert learner_updates(whole) - learner_updates(before) >= 100
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {
-        "learner", "replay", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes", "journal",
-        "random_state",
+        "learner", "replay", "owed", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes",
+        "journal", "random_state",
     }  # fmt: skip
     assert_same(whole, resumed, "checkpoint")
     assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")

@@ -508,7 +508,7 @@ def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved, checksums)
 
 def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
     counters = {"env_steps": 10}
-    best = BestCheckpoint(tmp_path, {"counters": counters})
+    best = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     best.offer(1.0, 10)
     counters["env_steps"] = 20
 
@@ -522,7 +522,7 @@ def test_the_old_best_stays_until_the_new_one_is_there(tmp_path, monkeypatch):
     restored: dict[str, int] = {}
     assert load_components(tmp_path / "best", {"counters": restored})["score"] == 1.0 and restored["env_steps"] == 10
     assert best.score == 1.0 and best.offer(2.0, 20)
-    assert BestCheckpoint(tmp_path, {"counters": counters}).score == 2.0
+    assert BestCheckpoint(tmp_path, {"counters": counters}, 1000).score == 2.0
 
 
 def test_a_signal_is_taken_where_nobody_reads_what_it_says(monkeypatch):
@@ -538,11 +538,11 @@ def test_a_signal_is_taken_where_nobody_reads_what_it_says(monkeypatch):
 
 def test_a_damaged_best_is_replaced_by_the_next_evaluation(tmp_path):
     counters = {"env_steps": 10}
-    BestCheckpoint(tmp_path, {"counters": counters}).offer(5.0, 10)
+    BestCheckpoint(tmp_path, {"counters": counters}, 1000).offer(5.0, 10)
     flip(next((tmp_path / "best").rglob("value.json")))
-    again = BestCheckpoint(tmp_path, {"counters": counters})
+    again = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     assert again.score is None and again.offer(1.0, 20)
-    assert BestCheckpoint(tmp_path, {"counters": counters}).score == 1.0
+    assert BestCheckpoint(tmp_path, {"counters": counters}, 1000).score == 1.0
 
 
 def test_handlers_return_after_an_exception():
@@ -554,7 +554,7 @@ def test_handlers_return_after_an_exception():
 
 def test_the_best_is_kept_and_only_the_best(tmp_path):
     counters = {"env_steps": 10}
-    best = BestCheckpoint(tmp_path, {"counters": counters})
+    best = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     assert best.score is None
     assert best.offer(1.0, 10)
     counters["env_steps"] = 20
@@ -562,10 +562,11 @@ def test_the_best_is_kept_and_only_the_best(tmp_path):
     restored: dict[str, int] = {}
     assert load_components(tmp_path / "best", {"counters": restored})["score"] == 1.0
     assert restored == {"env_steps": 10}
-    resumed = BestCheckpoint(tmp_path, {"counters": counters})
+    resumed = BestCheckpoint(tmp_path, {"counters": counters}, 1000)
     assert resumed.score == 1.0
-    counters["env_steps"] = 5  # resumed from before the best
-    assert resumed.offer(2.0, 5)
+    counters["env_steps"] = 5  # resumed from before the best, which is of what is given up, whatever its score
+    resumed = BestCheckpoint(tmp_path, {"counters": counters}, 5)
+    assert resumed.score is None and resumed.offer(0.5, 5)
     load_components(tmp_path / "best", {"counters": restored})
     assert restored == {"env_steps": 5}
     assert len(list((tmp_path / "best").glob("checkpoints/checkpoint-*"))) == 1
