@@ -23,10 +23,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
-from dreamer_racing.evaluation.evaluate import Trajectory
 from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
 from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import check_settings
 from dreamer_racing.training.directory import replace_text

@@ -24,7 +24,7 @@ from dreamer_racing.modules.decoder import VectorDecoder
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.worlds import RaceWorlds
-    from dreamer_racing.evaluation.evaluate import Trajectory
+    from dreamer_racing.evaluation.trajectory import Trajectory
     from dreamer_racing.learners.dreamer import DreamerLearner
 
 Painter = Callable[[Tensor, Tensor, Tensor], Tensor]

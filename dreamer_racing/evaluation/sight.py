@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
+from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 
 NEXT_GATE, NEAREST_VISIBLE_GATE = "next gate", "nearest visible gate"
 QUANTILES = (5, 25, 50, 75, 95)  # percent
@@ -116,37 +116,9 @@ def measure_sight(
     return sights
 
 
-def points_in_camera(position: Tensor, attitude: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return points in the camera's own axes.
-
-    Args:
-        position: of the drone, (M, 3), m.
-        attitude: of the drone, (M, 4) wxyz, body → world.
-        points: in the world, (L, 3), m.
-        camera: the nose camera.
-
-    Returns:
-        (M, L, 3) m: along the camera's axis, to the left, and up in the image.
-    """
-    mount = torch.tensor(camera.position, dtype=position.dtype)
-    eye = position + rotate(attitude, mount.expand_as(position))  # (M, 3)
-    body = rotate_inverse(attitude.unsqueeze(1).expand(-1, len(points), 4), points - eye.unsqueeze(1))  # (M, L, 3)
-    x, left, z = body.unbind(-1)
-    cosine, sine = math.cos(math.radians(camera.tilt)), math.sin(math.radians(camera.tilt))
-    return torch.stack((cosine * x + sine * z, left, cosine * z - sine * x), dim=-1)
-
-
 def angles(points: Tensor) -> Tensor:
     """Return the angles between the camera's axis and points (..., 3) in its axes, (...), degrees."""
     return torch.rad2deg(torch.atan2(points[..., 1:].norm(dim=-1), points[..., 0]))
-
-
-def is_in_view(points: Tensor, camera: Camera) -> Tensor:
-    """Tell which points (..., 3) in the camera's axes project into the image, (...) bool."""
-    up = math.tan(math.radians(camera.field_of_view) / 2)
-    left = up * camera.width / camera.height
-    depth = points[..., 0]
-    return (depth > 0) & (points[..., 1].abs() <= left * depth) & (points[..., 2].abs() <= up * depth)
 
 
 def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:

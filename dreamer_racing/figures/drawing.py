@@ -25,7 +25,7 @@ from matplotlib.ticker import EngFormatter, MultipleLocator
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.training.metrics import read_metrics
 
 GATE_COLOR = "#e8590c"

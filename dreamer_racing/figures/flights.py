@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.dreams import Dream
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import (
     INK,
     SPEED_COLORS,

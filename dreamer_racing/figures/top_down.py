@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import (
     BADGE,
     BOX,

@@ -10,11 +10,12 @@ import torch
 from PIL import Image
 
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
+from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds
-from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.evaluation.sight import Sight, angles, is_in_view, measure_sight, points_in_camera, sight_table
+from dreamer_racing.evaluation.sight import Sight, angles, measure_sight, sight_table
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 
 LEVEL = Camera(tilt=0.0, position=(0.0, 0.0, 0.0))

@@ -16,7 +16,7 @@ from PIL import Image
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve
 from dreamer_racing.figures.film import top_down_frames
 from dreamer_racing.figures.top_down import plot_top_down

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.evaluate import Trajectory
+from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures import film
 from dreamer_racing.figures.film import (
     CONTEXT_COLOR,

@@ -14,8 +14,13 @@ from matplotlib.figure import Figure
 
 from dreamer_racing.envs.tracks import Gate, load_track
 from dreamer_racing.evaluation.dreams import PREDICTED_FRAMES, SEEN_FRAMES, STRIDE, Dream, record_dream
-from dreamer_racing.evaluation.evaluate import Trajectory
-from dreamer_racing.evaluation.trajectory import read_flight, read_trajectory, write_flight, write_trajectory
+from dreamer_racing.evaluation.trajectory import (
+    Trajectory,
+    read_flight,
+    read_trajectory,
+    write_flight,
+    write_trajectory,
+)
 from dreamer_racing.figures.drawing import CRASH_COLOR, GATE_COLOR, left_out_of, speed_scale
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR, film_strip, shown_frames
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset, without_randomisation
-from dreamer_racing.envs.drone.rotation import rotate_inverse
 from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.race.race import EVALUATION_TIME, RaceStep
+from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import RaceWorlds
 
@@ -100,14 +100,9 @@ def _fly(worlds: RaceWorlds, pilot: ScriptedPilot) -> list[_Step]:
 
 def _in_view(worlds: RaceWorlds, position: Tensor, attitude: Tensor) -> Tensor:
     """Whether the centre of the target gate (N,) is inside the nose camera's image; gates in front are not minded."""
-    camera = worlds.camera
-    gates = worlds.track.gate_positions(position.device, position.dtype)
-    view = rotate_inverse(attitude, gates[worlds.race.target_gate] - position) - position.new_tensor(camera.position)
-    tilt = math.radians(camera.tilt)
-    depth = view[:, 0] * math.cos(tilt) + view[:, 2] * math.sin(tilt)
-    up = view[:, 2] * math.cos(tilt) - view[:, 0] * math.sin(tilt)
-    reach = depth * math.tan(math.radians(camera.field_of_view) / 2.0)
-    return (up.abs() < reach) & (view[:, 1].abs() < reach * camera.width / camera.height)
+    gates = worlds.track.gate_positions(position.device, position.dtype)[worlds.race.target_gate]
+    seen = points_in_camera(position, attitude, gates.unsqueeze(1), worlds.camera)  # (N, 1, 3)
+    return is_in_view(seen, worlds.camera).squeeze(1)
 
 
 def _summarise(steps: list[_Step], num_gates: int, laps: int) -> FlownLaps:
