@@ -29,7 +29,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, hash_track, load_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
@@ -136,11 +136,17 @@ def prepare(
         checkpoint=checkpoint.name,
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
-        track=track.name if track.name in BUILTIN_TRACKS else trained.track,  # with the decoys of decoys=
+        track=name_of(track, trained.track),
         track_sha256=hash_track(track),
         preset=trained.env.preset,
     )
     return step, contract, flight
+
+
+def name_of(track: Track, given: str) -> str:
+    """Return a name by which a track is found: that of a built-in one that is the same, with its decoys, or as given."""
+    same = track.name in BUILTIN_TRACKS and hash_track(load_track(track.name)) == hash_track(track)
+    return track.name if same else given
 
 
 def check_agent(config: ExportConfig, checkpoint: Path) -> None:

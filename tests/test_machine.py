@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dreamer_racing import machine
-from dreamer_racing.machine import available_memory, check_fits, keep_freed_memory, out_of_memory_advice
+from dreamer_racing.machine import KeptMemory, available_memory, check_fits, keep_freed_memory, out_of_memory_advice
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,6 +63,24 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
     assert int(done.stdout) < 100, "16 million numbers are 15,625 pages, and the last ones need no new page"
 
 
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep freed memory")
+def test_what_is_kept_beyond_what_is_used_is_given_back() -> None:
+    """Of 40 blocks of 4 MB each second one is freed: there is no end of the heap to give back."""
+    code = """
+import torch
+from dreamer_racing.machine import KeptMemory, keep_freed_memory, resident_memory
+assert keep_freed_memory()
+kept = KeptMemory(growth=40_000_000)
+print(kept.trim(), end=" ")
+blocks = [torch.ones(1_000_000) for _ in range(40)]
+largest = resident_memory()
+del blocks[::2]
+print(kept.trim(), largest - resident_memory() > 70_000_000, kept.trim(), torch.stack(blocks).sum().item())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True", "True", "False", "20000000.0"]
+
+
 def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: object())
-    assert not keep_freed_memory()
+    assert not keep_freed_memory() and not KeptMemory(growth=-1).trim()

@@ -199,10 +199,8 @@ def top_down_frames(track: Track, trajectory: Trajectory, size: int = 256, tail:
         (K + 1, size, size, 3) uint8.
     """
     background, points = _map_of(track, 2 * size, trajectory.position[:, :2].numpy())
-    view = camera_directions(trajectory.attitude, tilt_of(trajectory))[:, :2].numpy() * (
-        1.0,
-        -1.0,
-    )  # image rows go down
+    view = camera_directions(trajectory.attitude, tilt_of(trajectory))[:, :2].numpy()
+    view = view * (1.0, -1.0)  # image rows go down
     speed = trajectory.speed.numpy()
     colors = (255 * SPEED_COLORS(speed / max(1.0, float(np.nanmax(speed))))[:, :3]).astype(int)
     length = round(tail / trajectory.control_dt)

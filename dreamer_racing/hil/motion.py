@@ -76,7 +76,7 @@ class Motion:
         self.changed_at = -math.inf
         self._limits = limits
         self._odometer = Odometer(limits.velocity_window)
-        self._turns = TurnOdometer(limits.velocity_window)
+        self._turns = TurnOdometer(limits.velocity_window, gap=limits.hold_after)
 
     def take(self, seen: Seen) -> Findings:
         """Take in a pose that is newer than the last; find what no vehicle does from one to the other."""

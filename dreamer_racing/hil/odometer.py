@@ -24,6 +24,7 @@ class Odometer:
 
     Args:
         window: s, that is looked back, at least; up to a pose more.
+        gap: s between two poses beyond which nothing is known of what was between, and it begins anew.
 
     Example:
         >>> odometer = Odometer(window=0.0625)
@@ -35,8 +36,8 @@ class Odometer:
 
     _start: ClassVar[Vector] = (0.0, 0.0, 0.0)
 
-    def __init__(self, window: float) -> None:
-        self._window = window
+    def __init__(self, window: float, gap: float = GAP) -> None:
+        self._window, self._gap = window, gap
         self._marks: deque[_Mark] = deque()
 
     def mismatch(self, time: float, place: Vector, rate: Vector) -> float | None:
@@ -52,7 +53,7 @@ class Odometer:
         """
         marks = self._marks
         last = marks[-1] if marks else None
-        if last is None or time - last.time > GAP:
+        if last is None or time - last.time > self._gap:
             marks.clear()
             led = self._start
         else:
@@ -114,7 +115,8 @@ class TurnOdometer(Odometer):
 
     @staticmethod
     def _apart(went: Vector, meant: Vector) -> float:
-        return 4.0 * math.asin(min(1.0, 0.5 * math.dist(went, meant)))
+        distance = math.dist(went, meant)
+        return 4.0 * math.asin(min(1.0, 0.5 * distance)) if math.isfinite(distance) else math.inf
 
 
 def _product(first: Vector, second: Vector) -> Vector:

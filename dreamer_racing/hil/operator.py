@@ -1,8 +1,17 @@
-"""The person who answers for the flight: who lets the vehicle fly, and may stop it at any time."""
+"""The person who answers for the flight: who lets the vehicle fly, and may stop it at any time.
+
+A switch for a flight with ``operator=udp``, in a terminal of the machine that the person sits at:
+
+    python -m dreamer_racing.hil.operator --host 192.168.1.20       # e: the enable; any other key, or Ctrl-C: kill
+"""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import logging
 import os
+import socket
 import struct
 import sys
 import time
@@ -18,8 +27,15 @@ _CHECK = struct.Struct("<I")
 PACKET_SIZE = _BODY.size + _CHECK.size
 """Bytes of a packet: 14, little endian: ``b"DRO1"``, sequence u32, enable u8, kill u8, CRC-32 u32 of all before it."""
 
+PORT = 9102
 DEAD_MAN = 0.5
 """s without a packet after which the enable counts as released [choice]; send ten a second or more."""
+SEND_RATE = 20.0
+"""Hz at which the switch of this file sends [choice]."""
+KILLS = 20
+"""Packets of a kill that it sends before it ends [choice]: radios lose some."""
+
+logger = logging.getLogger(__name__)
 
 
 class Operator(NamedTuple):
@@ -153,6 +169,56 @@ class KeyboardOperator:
             self._before = None
 
 
+def is_remote_terminal() -> bool:
+    """Whether the terminal seems to be at the other end of a network; ``sudo`` and ``tmux`` may hide it."""
+    return bool(os.environ.get("SSH_CONNECTION"))
+
+
+def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Callable[[float], None]) -> None:
+    """Send what an operator wants until that is a kill, and the kill for a while; Ctrl-C is one, too.
+
+    Args:
+        source: Who is asked.
+        send: Takes the packets, which are numbered by the clock: a switch that is begun anew goes on counting.
+        sleep: Waits for so many s.
+    """
+    number, left, will, said = int(SEND_RATE * time.time()), KILLS, Operator(False, False), ""
+    while left:
+        try:
+            will = will if will.kill else source.poll()
+            word = "kill" if will.kill else "the enable is given" if will.enable else "no enable"
+            try:
+                send(encode_operator(number, will))
+            except OSError as error:  # the network may come back; the enable lapses meanwhile
+                word = f"{word}, which is not sent: {error}"
+            if word != said:
+                logger.info(word)
+                said = word
+            number, left = number + 1, left - will.kill
+            sleep(1.0 / SEND_RATE)
+        except KeyboardInterrupt:
+            will = Operator(False, True)
+
+
+def main() -> None:
+    """Send the enable, and a kill, of the keyboard here to a flight with operator=udp."""
+    parser = argparse.ArgumentParser(prog="python -m dreamer_racing.hil.operator", description=main.__doc__)
+    parser.add_argument("--host", required=True, help="where recipes/hil.py runs, with operator_host= of that machine")
+    parser.add_argument("--port", type=int, default=PORT, help="its operator_port=")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    if is_remote_terminal():
+        parser.exit(2, "This terminal is at the other end of an ssh connection, which may drop: sit at this machine.\n")
+    try:
+        address = socket.gethostbyname(arguments.host), arguments.port
+        keyboard = KeyboardOperator()
+    except OSError as error:
+        parser.exit(2, f"{arguments.host}: {error}\n")
+    logger.info("e: the enable, and again to take it back; any other key: kill. To %s:%d", *address)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as switch, contextlib.closing(keyboard):
+        send_will(keyboard, lambda data: switch.sendto(data, address), time.sleep)
+
+
 class TimedOperator:
     """Enables by itself, again and again until the vehicle is armed: for one that is simulated, never for a real one.
 
@@ -176,3 +242,7 @@ class TimedOperator:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+if __name__ == "__main__":
+    main()

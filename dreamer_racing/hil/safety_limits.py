@@ -49,7 +49,8 @@ class SafetyLimits:
         turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
         turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
         velocity_tolerance: m/s by which the velocities that poses claim may differ from those of their positions.
-        rate_tolerance: rad/s by which the body rates that poses claim may differ from those of their attitudes.
+        rate_tolerance: rad/s by which the body rates that poses claim may differ from those of their attitudes, as long
+            as no two poses are more than ``hold_after`` apart.
         velocity_window: s over which both are compared, see `hil.odometer`.
         tilt_max_degrees: from level, that may be exceeded for `tilt_time` only.
         tilt_time: s.

@@ -58,7 +58,7 @@ class PoseClock:
         if self._newest is not None:
             newer = 0 < (packet.sequence - self._newest.packet.sequence) % 2**32 < 2**31
             waited = received.time - self._newest.time
-            set_back = newer and packet.stamp < self._newest.packet.stamp
+            set_back = self.stamping is Stamping.sender and newer and packet.stamp < self._newest.packet.stamp
             again = set_back and received.time - self._set_back_at < SILENCE
             if waited < 0.0 or ((again or not newer) and waited < SILENCE):
                 self.out_of_order += 1

@@ -34,6 +34,7 @@ from dreamer_racing.training.directory import (
     PREFIX,
     PROCESS,
     PROCESSES,
+    REPLACED,
     RunDirectory,
     complete_checkpoints,
     ensure_writable,
@@ -241,8 +242,8 @@ class BestCheckpoint:
     Args:
         run_dir: folder of the run.
         components: as of `RunCheckpoints`.
-        env_steps: where the run goes on. What is kept of a later evaluation is of a run that this one replaces: the
-            next evaluation replaces it.
+        env_steps: where the run goes on. What is kept of a later evaluation is of flights that are to be flown again,
+            perhaps otherwise: it is moved to ``<run_dir>/best.replaced``.
 
     Attributes:
         score: of the evaluation whose parts are kept; None before the first.
@@ -254,7 +255,23 @@ class BestCheckpoint:
         self.score: float | None = None
         with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
             kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
-            self.score = kept["score"] if kept["env_steps"] <= env_steps else None
+            if kept["env_steps"] > env_steps:
+                self._set_aside(kept)
+            else:
+                self.score = kept["score"]
+
+    def _set_aside(self, kept: Mapping[str, Any]) -> None:
+        """Move away the best of evaluations after the one that the run goes on from."""
+        if not parallel.is_first():
+            return
+        aside = self.directory.with_name(self.directory.name + REPLACED)
+        shutil.rmtree(aside, ignore_errors=True)
+        self.directory.rename(aside)
+        logger.warning(
+            "the best policy so far, of %s env_steps, is from after where the run goes on: it is in %s",
+            f"{kept['env_steps']:,}",
+            aside,
+        )
 
     def offer(self, score: float, env_steps: int) -> bool:
         """Save the parts if the score beats that of the kept ones; return whether it did."""

@@ -38,29 +38,35 @@ class UpdatesOwed:
         ratio: That holds now.
 
     Example:
-        >>> owed = UpdatesOwed(ReplayRatio(4.0, 64, 100, "model.replay_ratio"))
-        >>> resumed = UpdatesOwed(ReplayRatio(8.0, 64, 100, "model.replay_ratio"))
-        >>> resumed.load_state_dict(owed.state_dict())
-        >>> resumed.go_on(env_steps=180)
+        >>> before = ReplayRatio(4.0, 64, 100, "model.replay_ratio")
+        >>> owed = UpdatesOwed(before._replace(ratio=8.0))
+        >>> owed.go_on(180, before)
         True
-        >>> resumed.until(180), resumed.until(196)
+        >>> owed.until(180), owed.until(196)
         (5, 7)
     """
 
     def __init__(self, ratio: ReplayRatio) -> None:
         self.ratio = ratio
         self._since, self._before = 0, 0  # env_steps from which it holds, and updates that were asked for until there
-        self._earlier: UpdatesOwed | None = None
+        self._saved: UpdatesOwed | None = None
 
     def until(self, env_steps: int) -> int:
         """Updates that are to be made until then, from the run's beginning."""
         return self._before + self.ratio.updates(env_steps, self._since)
 
-    def go_on(self, env_steps: int) -> bool:
-        """Let the ratio hold from here on, if it is another one than was saved; return whether it is."""
-        if self._earlier is None:
+    def go_on(self, env_steps: int, trained: ReplayRatio) -> bool:
+        """Go on where a run was saved, after ``load_state_dict``; return whether another ratio holds from here on.
+
+        Args:
+            env_steps: Of the run until there.
+            trained: By which it was trained, for a checkpoint of an older version, which does not say.
+        """
+        earlier, self._saved = self._saved or UpdatesOwed(trained), None
+        if earlier.ratio[:3] == self.ratio[:3]:
+            self._since, self._before = earlier._since, earlier._before
             return False
-        self._since, self._before, self._earlier = env_steps, self._earlier.until(env_steps), None
+        self._since, self._before = env_steps, earlier.until(env_steps)
         return True
 
     def state_dict(self) -> dict[str, Any]:
@@ -69,10 +75,6 @@ class UpdatesOwed:
         return {"ratio": ratio, "records": records, "prefill": prefill, "since": self._since, "before": self._before}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over since when it holds, or if it is another ratio, what was asked for by that one."""
-        saved = UpdatesOwed(ReplayRatio(state["ratio"], state["records"], state["prefill"], self.ratio.setting))
-        saved._since, saved._before = state["since"], state["before"]
-        if saved.ratio == self.ratio:
-            self._since, self._before = saved._since, saved._before
-        else:
-            self._earlier = saved
+        """Take note of what ``state_dict`` returned."""
+        self._saved = UpdatesOwed(ReplayRatio(state["ratio"], state["records"], state["prefill"], self.ratio.setting))
+        self._saved._since, self._saved._before = state["since"], state["before"]

@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.machine import KeptMemory
 from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
@@ -78,6 +79,7 @@ class Run:
     counters: dict[str, int]  # env_steps, updates, episodes
     clock: RunClock
     lock: RunLock | LockHeldByFirst
+    memory: KeptMemory = field(default_factory=KeptMemory, init=False)
     unsaved: dict[str, int] = field(default_factory=dict, init=False)  # since which env_steps what cannot be written
     say: Callable[[str], None] = field(default=logger.info, init=False)  # says a line of its own
 
@@ -142,6 +144,8 @@ class Run:
         env_steps = self.counters["env_steps"]
         due = self.schedule.due("log", env_steps, self.at_end)
         evaluates = self.schedule.due("evaluate", env_steps, self.at_end)
+        if due:
+            self.memory.trim()
         if not parallel.is_first():
             return
         if evaluates:

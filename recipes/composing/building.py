@@ -18,7 +18,7 @@ from composing.arena import Environment, crash_causes, make_report, reward_terms
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
-from composing.saved import flat_settings
+from composing.saved import flat_settings, saved_config
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
@@ -46,6 +46,7 @@ from dreamer_racing.training.following import LockHeldByFirst, NoReport, Unwritt
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
+from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
@@ -284,6 +285,12 @@ def begin_anew(
         rollouts.begin_at(env_steps)
 
 
+def ratio_of(directory: RunDirectory, config: RunConfig) -> ReplayRatio:
+    """Return the replay ratio that a run was trained with before it is resumed, by its configuration."""
+    saved = OmegaConf.to_object(saved_config(config.algorithm, directory.path))
+    return cast(ReplayRunConfig, saved).replay_ratio
+
+
 def assemble(
     kind: type[R],
     config: RunConfig,
@@ -329,7 +336,7 @@ def assemble(
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         begin_anew(env, curriculum, rollouts, counters["env_steps"])
-        if "owed" in own and own["owed"].go_on(counters["env_steps"]):
+        if "owed" in own and own["owed"].go_on(counters["env_steps"], ratio_of(directory, config)):
             ratio = own["owed"].ratio
             print(f"updates: from here on by {ratio.setting}={ratio.ratio:g}, {ratio.records} records each")
         if not journal.restored:

@@ -267,14 +267,12 @@ def check_imagination(config: DreamerConfig) -> None:
     """
     model, share = config.model, config.replay.recent_share
     if not getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True):
-        for name, own, default in (
-            ("model.imagine_recent", model.imagine_recent, False),
-            *((f"loss.{name}", getattr(config.loss, name), getattr(LossConfig, name)) for name in OF_IMAGINATION),
-        ):
+        unread = {f"loss.{name}": (getattr(config.loss, name), getattr(LossConfig, name)) for name in OF_IMAGINATION}
+        for name, (own, default) in {"model.imagine_recent": (model.imagine_recent, False), **unread}.items():
             if own != default:
                 raise ValueError(
-                    f"{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it out, or "
-                    "choose another loss."
+                    f"{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it at "
+                    f"{str(default).lower()}, or choose another loss."
                 )
     if not model.imagine_recent:
         return

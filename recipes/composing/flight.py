@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,7 +17,14 @@ from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
 from dreamer_racing.hil.links import HEARING, LinkConfig
-from dreamer_racing.hil.operator import KeyboardOperator, OperatorSource, TimedOperator, UdpOperator
+from dreamer_racing.hil.operator import (
+    PORT,
+    KeyboardOperator,
+    OperatorSource,
+    TimedOperator,
+    UdpOperator,
+    is_remote_terminal,
+)
 from dreamer_racing.hil.pose_sources import PoseConfig
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
@@ -29,6 +35,8 @@ PILOT = "pilot"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
 OPERATORS = ("keyboard", "udp", "timed")
+MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages that have none
+MOST = 1e4  # rad/s: as good as no limit
 
 
 LimitsConfig = make_dataclass(
@@ -73,7 +81,7 @@ class HilConfig:
 
     operator: str = "auto"  # keyboard | udp | timed (enables by itself); auto: timed where the link is simulated
     operator_host: str = "127.0.0.1"  # to listen on
-    operator_port: int = setting(9102, Range(1, 65535))
+    operator_port: int = setting(PORT, Range(1, 65535))
 
     link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
     link_host: str = "127.0.0.1"  # to send to
@@ -119,10 +127,12 @@ def check(config: HilConfig) -> None:
         raise ValueError(
             f"link_host={config.link_host} is another machine, where a real vehicle may be: operator=keyboard or udp."
         )
-    if operator_of(config) == "keyboard" and config.link not in SIMULATED and os.environ.get("SSH_CONNECTION"):
+    remote = operator_of(config) == "keyboard" and is_remote_terminal()
+    if config.arm and remote and config.link not in SIMULATED:
         raise ValueError(
             f"operator=keyboard over ssh: where the network drops, the enable stays and no kill arrives, and link="
-            f"{config.link} may be a real vehicle. Use operator=udp, which lapses, or a terminal of this machine."
+            f"{config.link} may be a real vehicle. Use operator=udp, which lapses, with python -m "
+            "dreamer_racing.hil.operator at the other end, or a terminal of this machine."
         )
     if config.against and not config.report:
         raise ValueError(f"against={config.against} is for report=.")
@@ -219,7 +229,7 @@ def given_limits(config: HilConfig) -> dict[str, Any]:
 
 def limits_of(config: HilConfig, track: Track) -> SafetyLimits:
     """Return the limits of safety."""
-    return SafetyLimits.of_track(track, **given_limits(config))
+    return SafetyLimits.of_track(track, **tolerances_of(config) | given_limits(config))
 
 
 def pilot_contract(config: HilConfig) -> dict[str, Any]:
@@ -243,6 +253,15 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
     )
     camera = None if flyer.camera is None else NoseCamera(track, flyer.camera, config.renderer)
     return FlightChain(flyer, track, settings, camera)
+
+
+def tolerances_of(config: HilConfig) -> dict[str, float]:
+    """Return limits of safety that follow from where poses come from, unless they are given.
+
+    Body rates that are made from attitudes cannot contradict them, but lag behind.
+    """
+    made = config.pose_message in MADE_RATES or (config.pose == "ros2" and config.pose_message is None)
+    return {"rate_tolerance": MOST} if made else {}
 
 
 def stamping_of(config: HilConfig) -> Stamping:

@@ -32,13 +32,7 @@ from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest
 from dreamer_racing.training.run import train
 from dreamer_racing.training.schedule import Ramp, RampClock
 
-TRAINED_ON = (
-    "track",
-    "task",
-    "decoys",
-    "env.control_rate",
-    "replay.context",
-)  # what a run that is resumed cannot change
+TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
 
 
 def launch(
@@ -192,8 +186,12 @@ def _rising(config: RunConfig) -> str:
     if not isinstance(config, DreamerConfig):
         return ""
     ramps = {ramp.name: getattr(config.schedule, ramp.name) for ramp in fields(config.schedule)}
-    by_run = [name for name, ramp in ramps.items() if isinstance(ramp, Ramp) and ramp.to and ramp.by is RampClock.run]
-    return f"  # goes back in {', '.join(by_run)}, which move with the share of the run" if by_run else ""
+    by_run = [
+        name
+        for name, ramp in ramps.items()
+        if isinstance(ramp, Ramp) and ramp.to is not None and ramp.by is RampClock.run
+    ]
+    return f"  # sets back what moves with the share of the run: {', '.join(by_run)}" if by_run else ""
 
 
 def _from_here(path: Path) -> str:

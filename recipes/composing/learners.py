@@ -78,7 +78,8 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
         state, metadata = load_state(folder, "learner")
         learner.adopt(state)
-        return f"weights: all those of {folder} at {metadata['env_steps']:,} env_steps (init_from=)"
+        kind = "the averaged ones" if "averaged" in state else "all those"
+        return f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=)"
     contract = read_contract(folder / CONTRACT)
     check_size(contract["model"], learner.size)
     if not isinstance(env, DroneRacingEnv):

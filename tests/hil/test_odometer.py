@@ -91,3 +91,12 @@ def test_rates_beyond_all_numbers_are_no_match(huge):
     for step in range(4):
         said = odometer.mismatch(0.04 * step, (1.0, 0.0, 0.0, 0.0), 3 * (huge,))
     assert said is not None and not said <= 5.0
+
+
+def test_a_gap_in_which_a_vehicle_may_have_turned_there_and_back_says_nothing():
+    odometer = TurnOdometer(0.075, gap=0.05)
+    level = (1.0, 0.0, 0.0, 0.0)
+    for step in range(6):
+        odometer.mismatch(0.02 * step, level, (0.0, 0.0, 0.0))
+    said = [odometer.mismatch(0.18 + 0.02 * step, level, (10.0 * (step == 0), 0.0, 0.0)) for step in range(4)]
+    assert said == [None] * 4

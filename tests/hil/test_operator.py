@@ -11,6 +11,7 @@ import pytest
 
 from dreamer_racing.hil.operator import (
     DEAD_MAN,
+    KILLS,
     PACKET_SIZE,
     KeyboardOperator,
     Operator,
@@ -18,6 +19,7 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     decode_operator,
     encode_operator,
+    send_will,
 )
 
 
@@ -129,3 +131,51 @@ def test_a_timed_operator_enables_by_itself(clock):
     assert given == [False, False, True, True, False, True, False]
     assert operator.poll(armed=True) == Operator(True, False)
     assert operator.poll(armed=False) == Operator(True, False)
+
+
+class Will:
+    """An operator whose will is a list, tick by tick; None is Ctrl-C."""
+
+    def __init__(self, *wills: Operator | None) -> None:
+        self.wills = list(wills)
+
+    def poll(self, armed: bool = False) -> Operator:
+        will = self.wills.pop(0)
+        if will is None:
+            raise KeyboardInterrupt
+        return will
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("last", [Operator(True, True), None])
+def test_the_switch_of_a_terminal_is_heard_and_ends_with_a_kill(last, clock, switch, caplog):
+    """A kill is repeated, for packets are lost; a network that is gone for a packet is waited for."""
+    gone = iter([False, True, False])
+    heard = []
+
+    def send(data: bytes) -> None:
+        if next(gone, False):
+            raise OSError("Network is unreachable")
+        switch.say(data)
+        heard.append(switch.poll())
+
+    with caplog.at_level("INFO", "dreamer_racing.hil.operator"):
+        send_will(
+            Will(Operator(False, False), Operator(True, False), Operator(True, False), last), send, lambda _: None
+        )
+    assert heard[:2] == [Operator(False, False), Operator(True, False)]
+    assert [will.kill for will in heard[2:]] == [True] * KILLS
+    said = [record.getMessage() for record in caplog.records]
+    assert said[1:] == [
+        "the enable is given, which is not sent: Network is unreachable", "the enable is given", "kill"
+    ]  # fmt: skip
+
+
+def test_a_switch_that_is_begun_anew_is_not_taken_for_a_replayed_one(switch, monkeypatch):
+    for now in (1.8e9, 1.8e9 + 5.0):
+        monkeypatch.setattr("dreamer_racing.hil.operator.time.time", lambda now=now: now)
+        send_will(Will(Operator(True, False), Operator(False, True)), switch.say, lambda _: None)
+    switch.poll()
+    assert switch.rejected == 0

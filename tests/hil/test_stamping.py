@@ -117,6 +117,11 @@ def test_a_clock_that_is_set_back_again_and_again_tells_nothing():
     assert times(clock, packets)[:2] == [10.0, 10.01] and clock.out_of_order == 38
 
 
+def test_by_arrival_stamps_say_nothing():
+    packets = [received(k, 7.0 - 0.001 * k, 10.0 + 0.01 * k) for k in range(40)]
+    assert None not in times(PoseClock(Stamping.receive, 0.0), packets)
+
+
 def test_what_was_known_of_another_clock_is_forgotten_after_a_silence():
     clock = PoseClock(Stamping.sender, 0.0)
     assert times(clock, [received(0, 3.0, 10.0), received(1, 3.6, 10.9), received(2, 3.7, 11.0)]) == [10.0, 10.9, 11.0]

@@ -79,13 +79,14 @@ def test_what_cannot_fly_is_refused_before_anything_is_armed(changes, message, t
 @pytest.mark.parametrize("operator", ["auto", "keyboard"])
 def test_a_terminal_over_a_network_answers_for_no_real_vehicle(operator, monkeypatch):
     """The enable would stay where the network drops."""
-    real = hil.HilConfig(actor="kidney", link="crsf", operator=operator)
+    real = hil.HilConfig(actor="kidney", link="crsf", operator=operator, arm=True)
     monkeypatch.delenv("SSH_CONNECTION", raising=False)
     hil.check(real)
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 50000 10.0.0.9 22")
     with pytest.raises(ValueError, match=r"operator=keyboard over ssh.*operator=udp"):
         hil.check(real)
-    hil.check(hil.HilConfig(actor="kidney", link="crsf", operator="udp"))
+    hil.check(hil.HilConfig(actor="kidney", link="crsf", operator=operator))  # nothing is armed
+    hil.check(hil.HilConfig(actor="kidney", link="crsf", operator="udp", arm=True))
     hil.check(hil.HilConfig(actor="kidney", operator=operator))  # simulated
 
 
@@ -189,7 +190,8 @@ def test_a_defect_in_flight_shows_as_one_and_the_vehicle_is_disarmed_all_the_sam
     assert flown.whole and len(flown.ticks) == 5
 
 
-def test_what_a_person_can_mend_is_said_in_a_paragraph(tmp_path):
+def test_what_a_person_can_mend_is_said_in_a_paragraph(tmp_path, monkeypatch):
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
     ended = recipe("hil", "actor=circle", "link=crsf", "operator=keyboard", cwd=tmp_path)
     assert ended.returncode == 2 and ended.stderr.startswith("error: mass= is missing: link=crsf"), ended.stderr
 

@@ -566,7 +566,8 @@ def test_the_best_is_kept_and_only_the_best(tmp_path):
     assert resumed.score == 1.0
     counters["env_steps"] = 5  # resumed from before the best, which is of what is given up, whatever its score
     resumed = BestCheckpoint(tmp_path, {"counters": counters}, 5)
-    assert resumed.score is None and resumed.offer(0.5, 5)
+    load_components(tmp_path / "best.replaced", {"counters": restored})
+    assert restored == {"env_steps": 10} and resumed.score is None and resumed.offer(0.5, 5)
     load_components(tmp_path / "best", {"counters": restored})
     assert restored == {"env_steps": 5}
     assert len(list((tmp_path / "best").glob("checkpoints/checkpoint-*"))) == 1
