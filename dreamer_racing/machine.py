@@ -40,9 +40,10 @@ def keep_freed_memory() -> bool:
 class KeptMemory:
     """Gives back what a process keeps of its freed memory, when that has grown beyond what it uses again and again.
 
-    Blocks of many sizes that come and go, aligned ones above all (before glibc 2.38), leave gaps in a heap that is never
-    given back, and it grows without end: a training of the Control Suite was at 19 GB after 8,600 updates, of which one
-    was in use. Giving back all of it takes a fraction of a second, and what is used comes back with the next update.
+    Blocks of many sizes that come and go, aligned ones above all (before glibc 2.38), leave gaps in a heap that is
+    never given back, and it grows without end: a training of the Control Suite was at 19 GB after 8,600 updates, of
+    which one was in use. Giving back all of it takes a fraction of a second, and what is used comes back with the next
+    update.
 
     Args:
         growth: bytes by which the process may grow before it does [choice].

@@ -144,7 +144,7 @@ def prepare(
 
 
 def name_of(track: Track, given: str) -> str:
-    """Return a name by which a track is found: that of a built-in one that is the same, with its decoys, or as given."""
+    """Return a name by which a track is found: that of a built-in one that is the same, decoys and all, or as given."""
     same = track.name in BUILTIN_TRACKS and hash_track(load_track(track.name)) == hash_track(track)
     return track.name if same else given
 
