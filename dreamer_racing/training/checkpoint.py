@@ -251,7 +251,6 @@ class BestCheckpoint:
 
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
-        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
         self.score: float | None = None
         with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
             kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
@@ -259,6 +258,7 @@ class BestCheckpoint:
                 self._set_aside(kept)
             else:
                 self.score = kept["score"]
+        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
 
     def _set_aside(self, kept: Mapping[str, Any]) -> None:
         """Move away the best of evaluations after the one that the run goes on from."""
