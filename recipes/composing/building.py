@@ -46,7 +46,7 @@ from dreamer_racing.training.following import LockHeldByFirst, NoReport, Unwritt
 from dreamer_racing.training.journal import Journal, Schedule
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
-from dreamer_racing.training.replay_ratio import ReplayRatio
+from dreamer_racing.training.replay_ratio import UpdatesOwed
 from dreamer_racing.training.run import Report, Run
 
 R = TypeVar("R", bound=Run)
@@ -285,10 +285,12 @@ def begin_anew(
         rollouts.begin_at(env_steps)
 
 
-def ratio_of(directory: RunDirectory, config: RunConfig) -> ReplayRatio:
-    """Return the replay ratio that a run was trained with before it is resumed, by its configuration."""
-    saved = OmegaConf.to_object(saved_config(config.algorithm, directory.path))
-    return cast(ReplayRunConfig, saved).replay_ratio
+def go_on_owing(owed: UpdatesOwed, config: RunConfig, env_steps: int) -> None:
+    """Let a resumed run owe updates from here on by its replay ratio, and say so if that is another than before."""
+    trained = OmegaConf.to_object(saved_config(config.algorithm, Path(str(config.run_dir))))
+    if owed.go_on(env_steps, cast(ReplayRunConfig, trained).replay_ratio):
+        ratio = owed.ratio
+        print(f"updates: from here on by {ratio.setting}={ratio.ratio:g}, {ratio.records} records each")
 
 
 def assemble(
@@ -336,9 +338,8 @@ def assemble(
         clock.total = saved
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         begin_anew(env, curriculum, rollouts, counters["env_steps"])
-        if "owed" in own and own["owed"].go_on(counters["env_steps"], ratio_of(directory, config)):
-            ratio = own["owed"].ratio
-            print(f"updates: from here on by {ratio.setting}={ratio.ratio:g}, {ratio.records} records each")
+        if "owed" in own:
+            go_on_owing(own["owed"], config, counters["env_steps"])
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
