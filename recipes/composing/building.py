@@ -285,8 +285,10 @@ def begin_anew(
         rollouts.begin_at(env_steps)
 
 
-def go_on_owing(owed: UpdatesOwed, config: RunConfig, env_steps: int) -> None:
+def go_on_owing(owed: UpdatesOwed | None, config: RunConfig, env_steps: int) -> None:
     """Let a resumed run owe updates from here on by its replay ratio, and say so if that is another than before."""
+    if owed is None:
+        return
     trained = OmegaConf.to_object(saved_config(config.algorithm, Path(str(config.run_dir))))
     if owed.go_on(env_steps, cast(ReplayRunConfig, trained).replay_ratio):
         ratio = owed.ratio
@@ -334,12 +336,10 @@ def assemble(
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
     clock = RunClock(counters, alone=parallel.count() == 1)
     if config.resume:
-        saved = checkpoints.load(config.resume, may_lack=("owed", "lag", "passes", "journal", *OF_WORLDS))
-        clock.total = saved
+        clock.total = checkpoints.load(config.resume, may_lack=("owed", "lag", "passes", "journal", *OF_WORLDS))
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
         begin_anew(env, curriculum, rollouts, counters["env_steps"])
-        if "owed" in own:
-            go_on_owing(own["owed"], config, counters["env_steps"])
+        go_on_owing(own.get("owed"), config, counters["env_steps"])
         if not journal.restored:
             journal.begin_at(counters["env_steps"])
             print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
