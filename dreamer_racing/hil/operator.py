@@ -189,12 +189,13 @@ def send_will(source: OperatorSource, send: Callable[[bytes], object], sleep: Ca
             word = "kill" if will.kill else "the enable is given" if will.enable else "no enable"
             try:
                 send(encode_operator(number, will))
-            except OSError as error:  # the network may come back; the enable lapses meanwhile
+                left -= will.kill
+            except OSError as error:  # the network may come back; the enable lapses meanwhile, and a kill is kept
                 word = f"{word}, which is not sent: {error}"
             if word != said:
                 logger.info(word)
                 said = word
-            number, left = number + 1, left - will.kill
+            number += 1
             sleep(1.0 / SEND_RATE)
         except KeyboardInterrupt:
             will = Operator(False, True)

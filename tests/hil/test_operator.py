@@ -173,6 +173,18 @@ def test_the_switch_of_a_terminal_is_heard_and_ends_with_a_kill(last, clock, swi
     ]  # fmt: skip
 
 
+def test_a_kill_waits_for_a_network_that_is_gone(switch):
+    tries = iter(range(100))
+
+    def send(data: bytes) -> None:
+        if next(tries) < 50:
+            raise OSError("Network is unreachable")
+        switch.say(data)
+
+    send_will(Will(Operator(False, True)), send, lambda _: None)
+    assert switch.poll().kill and next(tries) == 50 + KILLS
+
+
 def test_a_switch_that_is_begun_anew_is_not_taken_for_a_replayed_one(switch, monkeypatch):
     for now in (1.8e9, 1.8e9 + 5.0):
         monkeypatch.setattr("dreamer_racing.hil.operator.time.time", lambda now=now: now)

@@ -90,6 +90,23 @@ def test_a_terminal_over_a_network_answers_for_no_real_vehicle(operator, monkeyp
     hil.check(hil.HilConfig(actor="kidney", operator=operator))  # simulated
 
 
+@pytest.mark.parametrize(
+    ("changes", "compared"),
+    [
+        ({}, True),
+        ({"pose": "mavlink"}, True),
+        ({"pose": "mavlink", "pose_message": "ATT_POS_MOCAP"}, False),
+        ({"pose": "ros2"}, False),
+        ({"pose": "ros2", "pose_message": "Odometry"}, True),
+        ({"pose": "ros2", "limits": flights.LimitsConfig(rate_tolerance=5.0)}, True),
+    ],
+)
+def test_body_rates_are_compared_where_they_are_measured(changes, compared):
+    """Those that are made from attitudes lag behind them, and cannot contradict them."""
+    limits = flights.limits_of(hil.HilConfig(actor="pilot", **changes), load_track("circle"))
+    assert (limits.rate_tolerance == 5.0) is compared
+
+
 def test_a_port_in_use_is_said_and_nothing_else_happens(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
