@@ -102,12 +102,13 @@ def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 LOADING = """
-import os, runpy, signal, sys
+import atexit, os, runpy, signal, sys
 class Interrupted:
     def find_spec(name, path=None, target=None):
         if name == "torchrl.collectors":
             sys.meta_path.remove(Interrupted)
             os.kill(os.getpid(), signal.SIGINT)
+atexit.register(exec, "")  # as packages do when they import one more at the exit: the interpreter forgets the signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
 sys.meta_path.insert(0, Interrupted)
 sys.path.insert(0, {recipes!r})
