@@ -41,14 +41,13 @@ from measuring import print_table, write_json
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker
 from torchrl.envs.utils import RandomPolicy
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
@@ -150,7 +149,7 @@ def measure(
     collector = Collector(env, RandomPolicy(env.action_spec), **options)
     rollouts = iter(collector)
     policy = make_policy(env, actor)
-    remembering = TransformedPixelEnv(env, Compose(InitTracker(), policy.make_primer()))
+    remembering = with_memory(env, policy.make_primer())
     actor_rollouts = iter(Collector(remembering, policy, **options))
     modes: dict[str, Callable[[], Any]] = {
         "worlds": flying(env, lambda _: env.action_spec.rand()),

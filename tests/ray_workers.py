@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchrl.envs import Compose, InitTracker, TensorDictPrimer
+from torchrl.envs import TensorDictPrimer, TransformedEnv
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 
 
 def small_race(num_envs: int) -> DroneRacingEnv:
@@ -15,6 +15,6 @@ def small_race(num_envs: int) -> DroneRacingEnv:
     )
 
 
-def worlds_of_worker(num_envs: int, primer: TensorDictPrimer) -> TransformedPixelEnv:
+def worlds_of_worker(num_envs: int, primer: TensorDictPrimer) -> TransformedEnv:
     """The same, with the keys of a policy's memory."""
-    return TransformedPixelEnv(small_race(num_envs), Compose(InitTracker(), primer))
+    return with_memory(small_race(num_envs), primer)

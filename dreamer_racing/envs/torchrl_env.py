@@ -137,22 +137,27 @@ class DroneRacingEnv(EnvBase):
 
         The worlds that fly on have not moved, so all are observed again; only images are drawn and merged row by row.
         All else, of the race or of a policy, is zero where an episode begins (``EnvBase``: unless all begin at once).
+        On a CUDA device it waits once: to know how many ended.
         """
-        done, images = tensordict.get("done", None), tensordict.get("pixels", None)
-        if done is None or (self.from_pixels and images is None):
-            return super().maybe_reset(tensordict)  # a caller's own data, not a step's
-        if not done.any():
+        if not self.is_of_a_step(tensordict):
+            return super().maybe_reset(tensordict)
+        ended = tensordict.get("done").squeeze(-1)
+        rows = ended.nonzero().squeeze(-1)
+        if not len(rows):
             return tensordict
-        ended = done.squeeze(-1)
         self.worlds.reset(ended)
         seen = self._observe()
         if self.from_pixels:
-            seen["pixels"] = images.clone()  # the step before keeps its own as its outcome
-            seen["pixels"][ended] = self.worlds.render(ended)
+            seen["pixels"] = tensordict.get("pixels").clone()  # the step before keeps its own as its outcome
+            seen["pixels"][rows] = self.worlds.render(rows)
         for key, value in list(tensordict.items(include_nested=True, leaves_only=True)):
             if (key if isinstance(key, str) else key[0]) not in seen:
                 tensordict.set(key, value.masked_fill(ended.view(-1, *[1] * (value.ndim - 1)), 0))
         return tensordict.update(seen)
+
+    def is_of_a_step(self, tensordict: TensorDictBase) -> bool:
+        """Whether data have what a step of this environment returns, as a caller's own may not."""
+        return "done" in tensordict and not (self.from_pixels and "pixels" not in tensordict)
 
     def _column(self, values: Tensor) -> Tensor:
         """(N,) → (N, 1), floats as float32."""

@@ -267,14 +267,14 @@ class RaceWorlds:
         self.load_state_dict(before)
         return graph
 
-    def render(self, mask: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+    def render(self, rows: Tensor | None = None) -> Tensor:
+        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
         if self._images is None:
-            images = self.simulator.render(mask)
-        elif mask is None:
+            images = self.simulator.render(rows)
+        elif rows is None:
             images, self._images = self._images, None  # the caller's from now on
         else:
-            images = self._images[mask]
+            images = self._images[rows]
         looks = self.simulator.looks
         return images if looks is None else looks.add_noise(images)
 

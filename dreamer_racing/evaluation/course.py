@@ -10,16 +10,11 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.evaluate import Evaluation, evaluate
 from dreamer_racing.learners.learner import Policy
-
-
-def with_memory(env: EnvBase, policy: Policy) -> TransformedEnv:
-    """Give an environment what a policy reads beside observations: where episodes begin, and what it remembers."""
-    return TransformedEnv(env, Compose(InitTracker(), policy.make_primer()))
 
 
 def act(policy: Policy, tensordict: TensorDictBase) -> TensorDictBase:
@@ -47,7 +42,7 @@ class Course:
         self.base = DroneRacingEnv(num_envs=num_envs, evaluation=True, **worlds)
         self._policy = policy
         self._seed = worlds["seed"]
-        self._env = with_memory(self.base, policy)
+        self._env = with_memory(self.base, policy.make_primer())
 
     def evaluate(self, episodes: int, deterministic: bool = True, **recording: Any) -> Evaluation:
         """Fly so many episodes; ``recording`` are arguments of ``evaluate``, recorded to their ends if it says none."""

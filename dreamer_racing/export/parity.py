@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.evaluation.course import with_memory
 from dreamer_racing.export.onnx_actor import RecurrentActor
 from dreamer_racing.modules import DreamerPolicy
 from dreamer_racing.modules.agent import Agent
@@ -67,7 +67,7 @@ def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlig
     if env.batch_size != (1,):
         raise ValueError(f"env has batch size {list(env.batch_size)}; a flight is recorded with num_envs=1.")
     policy = DreamerPolicy(agent.world_model, agent.actor, deterministic=True)
-    flying = with_memory(env, policy)
+    flying = with_memory(env, policy.make_primer())
     names = (agent.interface.observation_keys[0], "is_init", "action")
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     tensordict = flying.reset()

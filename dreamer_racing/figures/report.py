@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.course import Course, act, with_memory
+from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
 from dreamer_racing.evaluation.trajectory import write_flight
@@ -153,7 +154,7 @@ class ReturnReport:
         self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
         self._policy = learner.evaluation_policy()
-        self._env = with_memory(env, self._policy)
+        self._env = with_memory(env, self._policy.make_primer())
         self._seed = seed
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:

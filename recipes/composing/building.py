@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
 from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name, worlds_device
 from composing.checks import refuse_to_replace
@@ -20,11 +19,11 @@ from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
 from composing.saved import flat_settings, saved_config
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.collector_state import CollectorState
-from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -130,11 +129,6 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
         track_traj_ids=False,
         no_cuda_sync=env.device.type == "cuda",
     )
-
-
-def with_memory(env: Environment, primer: TensorDictPrimer) -> TransformedPixelEnv:
-    """Give an environment the keys of a policy's memory."""
-    return TransformedPixelEnv(env, Compose(InitTracker(), primer))
 
 
 def make_run_replay(

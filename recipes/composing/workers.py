@@ -7,16 +7,16 @@ from typing import cast
 import torch
 from omegaconf import DictConfig
 from torchrl.collectors import Collector
-from torchrl.envs import TensorDictPrimer
+from torchrl.envs import TensorDictPrimer, TransformedEnv
 
 from composing.arena import Environment, make_env, worlds_device
-from composing.building import make_collector, with_memory
+from composing.building import make_collector
 from composing.learners import make_agent
 from composing.schema import CollectorKind, DreamerConfig, is_race
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
-from dreamer_racing.experience.partial_reset import TransformedPixelEnv
 from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import seeded
@@ -108,6 +108,6 @@ def share_of_worker(config: DreamerConfig) -> DreamerConfig:
     return own
 
 
-def make_worker_env(config: DreamerConfig, primer: TensorDictPrimer) -> TransformedPixelEnv:
+def make_worker_env(config: DreamerConfig, primer: TensorDictPrimer) -> TransformedEnv:
     """Make a worker's worlds, there."""
     return with_memory(make_env(config, num_threads=max(1, int(config.workers.cpus))), primer)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.learners.dreamer import DreamerLearner
@@ -144,10 +149,16 @@ def test_no_control_step_waits_for_the_device(preset: str, looks: str) -> None:
     assert seen.count > 50 and (seen.waits, seen.mixed) == ([], [])
 
 
-def test_an_environments_step_asks_once_whether_an_episode_ended() -> None:
-    env = DroneRacingEnv("circle", 3, from_pixels=False, seed=0, backend="mujoco_warp")
-    env.worlds.race._sweep._picks = False  # as on CUDA
+@pytest.mark.parametrize("ends", [False, True], ids=["flies_on", "ends"])
+@pytest.mark.parametrize("remembers", [False, True], ids=["race", "with_memory"])
+@pytest.mark.parametrize("settings", [{"from_pixels": False}, {"looks": "randomised"}], ids=["numbers", "pixels"])
+def test_a_step_asks_once_which_episodes_ended(settings: dict[str, Any], remembers: bool, ends: bool) -> None:
+    race = DroneRacingEnv("circle", 3, preset="faithful", seed=0, backend="mujoco_warp", **settings)
+    race.worlds.race._sweep._picks = False  # as on CUDA
+    primer = TensorDictPrimer({"memory": Unbounded((2,))}, default_value=0.0, expand_specs=True)
+    env = with_memory(race, primer) if remembers else race
     acted = env.rand_action(env.reset())
+    acted["action"][1] = math.nan if ends else 0.0
     seen = launches(lambda: env.step_and_maybe_reset(acted))
     env.close()
-    assert [place.partition(" ")[0] for place in seen.waits] == ["_local_scalar_dense"]
+    assert [place.partition(" ")[0] for place in seen.waits] == ["nonzero"] and not seen.mixed

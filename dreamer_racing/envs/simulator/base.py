@@ -85,17 +85,20 @@ class Simulator(ABC):
         self.quadrotor.command(action)
         return self._flight.fly()
 
-    def _frames(self, mask: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
-        """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of the M masked ones in order."""
+    def _frames(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
+        """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of M rows."""
         position, attitude = self.state.position, self.state.attitude
         looks = None if self.looks is None else self.looks.looks
-        if mask is None:
+        if rows is None:
             return position, attitude, looks
-        return position[mask], attitude[mask], None if looks is None else looks[mask]
+        return position[rows], attitude[rows], None if looks is None else looks[rows]
 
     @abstractmethod
-    def render(self, mask: Tensor | None = None) -> Tensor:
-        """Images of the nose cameras, uint8 (M, height, width, 3): of all worlds, or of the M masked ones in order.
+    def render(self, rows: Tensor | None = None) -> Tensor:
+        """Images of the nose cameras, uint8 (M, height, width, 3).
+
+        Args:
+            rows: of which worlds, a mask (N,) bool or numbers (M,); of all if None.
 
         Raises:
             RuntimeError: this simulator was made without a renderer.

@@ -61,11 +61,11 @@ class MujocoSimulator(Simulator):
             if looks is not None:
                 self.looks = LooksSampler(looks, scene, camera, num_envs, self.device, self.dtype, generator)
 
-    def render(self, mask: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+    def render(self, rows: Tensor | None = None) -> Tensor:
+        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
         if self.renderer is None:
             raise no_images(self._closed)
-        return self.renderer.render(*self._frames(mask))
+        return self.renderer.render(*self._frames(rows))
 
     def close(self) -> None:
         """Free the renderer's contexts and threads."""

@@ -70,11 +70,11 @@ class WarpSimulator(Simulator):
             if looks is not None:
                 self.looks = LooksSampler(looks, scene, self._camera, num_envs, device, self.dtype, generator)
 
-    def render(self, mask: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of the M masked ones in order."""
+    def render(self, rows: Tensor | None = None) -> Tensor:
+        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
         if self._ray_caster is None:
             raise no_images(self._closed)
-        position, attitude, looks = self._frames(mask)
+        position, attitude, looks = self._frames(rows)
         eye, axes = self._mount(position, attitude, None if looks is None else looks.camera_tilt)
         shape = (len(position), self._camera.height, self._camera.width, 3)
         images = torch.empty(shape, dtype=torch.uint8, device=self.device)

@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, EnvBase, InitTracker, PendulumEnv, TensorDictPrimer, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.experience.partial_reset import TransformedPixelEnv
+from dreamer_racing.envs.policy_memory import RaceWithMemory, with_memory
 
 
 class StockSteps(DroneRacingEnv):
@@ -77,24 +78,39 @@ def test_where_all_episodes_end_at_once_a_policys_keys_are_zero_too(num_envs: in
     assert torch.equal(data["vector"], env.worlds.vector())
 
 
-def test_a_callers_own_data_is_reset_by_torchrl() -> None:
-    env = make()
+def primer() -> TensorDictPrimer:
+    return TensorDictPrimer({"memory": Unbounded((2, 3))}, default_value=0.0, expand_specs=True)
+
+
+@pytest.mark.parametrize("settings", [{}, {"from_pixels": False, "privileged": True}], ids=str)
+def test_a_policy_remembers_what_torchrls_transforms_let_it_remember(settings: dict[str, Any]) -> None:
+    stock = TransformedEnv(make(StockSteps, **settings), Compose(InitTracker(), primer()))
+    ours = with_memory(make(**settings), primer())
+    assert isinstance(ours, RaceWithMemory)
+    assert_same_flights(ours, stock)
+
+
+def test_other_environments_have_torchrls_transforms() -> None:
+    env = with_memory(PendulumEnv(), primer())
+    assert type(env) is TransformedEnv and {"is_init", "memory"} <= set(env.reset().keys())
+
+
+@pytest.mark.parametrize("remember", [False, True])
+def test_a_callers_own_data_is_reset_by_torchrl(remember: bool) -> None:
+    env = with_memory(make(), primer()) if remember else make()
     data = env.reset().exclude("pixels").set("done", torch.tensor([[True], [False], [True], [False]]))
     assert not env.maybe_reset(data)["done"].any()
     env.close()
 
 
-def test_images_are_those_of_torchrls_merge() -> None:
-    assert_same_flights(TransformedPixelEnv(make(), InitTracker()), TransformedEnv(make(), InitTracker()))
-
-
 def test_the_step_before_keeps_its_images() -> None:
-    env = TransformedPixelEnv(make(), InitTracker())
+    env = with_memory(make(), primer())
     step = env.rand_step(env.reset())
+    ended = torch.tensor([[True], [False], [True], [False]])
+    step["next", "done"].copy_(ended)
     kept = step["next", "pixels"].clone()
-    root = step["next"].clone(False).set("_reset", torch.tensor([[True], [False], [True], [False]]))
-    merged = env.reset(root)["pixels"]
+    data = env.maybe_reset(step["next"].clone(False))
     assert torch.equal(step["next", "pixels"], kept)
-    assert torch.equal(merged[1::2], kept[1::2])
-    assert (merged[::2] != kept[::2]).flatten(1).any(1).all()
+    assert torch.equal(data["pixels"][1::2], kept[1::2]) and torch.equal(data["is_init"], ended)
+    assert (data["pixels"][::2] != kept[::2]).flatten(1).any(1).all()
     env.close()
