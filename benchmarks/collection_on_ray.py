@@ -3,11 +3,13 @@
     python benchmarks/collection_on_ray.py --json results/collection_on_ray.json
 
 Every way collects as `recipes/dreamer_v3.py track=circle tuned=race` does, and nothing is learned meanwhile, in turns:
-in this process with all its cores, then by so many workers with one core each on a Ray cluster on this machine.
-`env_steps_per_s` is the median of `--rounds`; `least` and `most` are those of a round; `times` is the multiple of the
-single process. `overhead` is the share of wall-clock time in which no worker flew: rollouts on their way, and requests.
-`weights_age` is how many env_steps the oldest weights were old at the end of what was flown with them, at most, and
-`stated` what workers.weight_interval promises. Keep the machine idle meanwhile; more workers than cores gain nothing.
+in this process with all its cores; by one process with one thread and as few worlds as a worker has; by so many of
+those at once, which share nothing, and so do what the machine can; and by so many workers with one thread each on a Ray
+cluster on this machine. `env_steps_per_s` is the median of `--rounds`; `least` and `most` are those of a round;
+`times` is the multiple of the single process. `overhead` is the share of wall-clock time in which no worker flew:
+rollouts on their way, and requests. `weights_age` is how many env_steps the oldest weights were old at the end of what
+was flown with them, at most, and `stated` what workers.weight_interval promises. Keep the machine idle meanwhile; more
+workers than cores gain nothing. `python benchmarks/pipeline.py --check` compares its forecast with the result.
 """
 
 import argparse
@@ -16,8 +18,9 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import hydra
 import torch
@@ -27,6 +30,8 @@ from omegaconf import OmegaConf
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 import dreamer_v3
+from composing.arena import make_env
+from composing.building import make_collector
 from composing.command_line import CONFIG_DIR
 from composing.learners import make_learner
 from composing.schema import CollectorKind, DreamerConfig
@@ -37,14 +42,32 @@ from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.machine import available_cpus, keep_freed_memory
 from dreamer_racing.modules import Interface
 
-COLUMNS = ("way", "env_steps_per_s", "least", "most", "times", "overhead", "weights_age", "stated")
+COLUMNS = ("way", "worlds", "env_steps_per_s", "least", "most", "times", "overhead", "weights_age", "stated")
 WARM_UP = 3  # rollouts
+together: Any = None
+"""Where a process waits for those that collect at the same time; each has its own reference."""
+
+
+class Way(NamedTuple):
+    """Who collects.
+
+    Attributes:
+        name: In the table.
+        worlds: Of each process or worker.
+        processes: With one thread each and nothing in common; 0 for this process with all its cores, or for workers.
+        workers: On Ray.
+    """
+
+    name: str
+    worlds: int
+    processes: int = 0
+    workers: int = 0
 
 
 def main() -> None:
     """Measure every way."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--workers", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--workers", nargs="+", type=int, default=[1, 2, 4])
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json")
@@ -53,13 +76,11 @@ def main() -> None:
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
     os.environ["PYTHONPATH"] = os.pathsep.join((sys.path[-1], os.environ.get("PYTHONPATH", "")))  # of workers, too
-    ways = {"one process": list[str]()}
-    for workers in arguments.workers:
-        ways[f"{workers} workers"] = ["collector=ray", f"num_workers={workers}"]
-    rounds: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
+    ways = ways_of(composed(arguments.overrides).env.num_envs, arguments.workers)
+    rounds: dict[Way, list[dict[str, float]]] = {way: [] for way in ways}
     for _ in range(arguments.rounds):
-        for way, overrides in ways.items():
-            rounds[way].append(measure(composed([*overrides, *arguments.overrides]), arguments.seconds))
+        for way in ways:
+            rounds[way].append(measure(way, arguments.overrides, arguments.seconds))
     records: list[dict[str, Any]] = []
     for way, measured in rounds.items():
         speeds = [each["env_steps_per_s"] for each in measured]
@@ -67,10 +88,22 @@ def main() -> None:
         first = records[0]["env_steps_per_s"] if records else median
         record = {"env_steps_per_s": median, "least": min(speeds), "most": max(speeds), "times": median / first}
         record |= {"overhead": statistics.median(each["overhead"] for each in measured)}
-        record |= {name: max(each[name] for each in measured) for name in ("weights_age", "stated", "num_envs")}
-        records.append({"benchmark": "collection_on_ray", "way": way, "cores": available_cpus(), **record})
+        record |= {name: max(each[name] for each in measured) for name in ("weights_age", "stated", "rollout_steps")}
+        names = {"way": way.name, **{name: getattr(way, name) for name in ("worlds", "processes", "workers")}}
+        records.append({"benchmark": "collection_on_ray", **names, "cores": available_cpus(), **record})
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
+
+
+def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
+    """What is compared for some numbers of workers that share so many worlds."""
+    shares = {count: num_envs // count for count in workers}
+    return [
+        Way("one process", num_envs),
+        *(Way(f"one thread, {worlds} worlds", worlds, processes=1) for worlds in shares.values()),
+        *(Way(f"{count} processes", worlds, processes=count) for count, worlds in shares.items() if count > 1),
+        *(Way(f"{count} workers", worlds, workers=count) for count, worlds in shares.items()),
+    ]
 
 
 def composed(overrides: Sequence[str]) -> DreamerConfig:
@@ -83,33 +116,82 @@ def composed(overrides: Sequence[str]) -> DreamerConfig:
     return made
 
 
-def measure(config: DreamerConfig, seconds: float) -> dict[str, float]:
+def measure(way: Way, overrides: Sequence[str], seconds: float) -> dict[str, float]:
     """Collect for so long."""
+    if way.workers:
+        cpus = min(1.0, available_cpus() / way.workers)
+        on_ray = ["collector=ray", f"num_workers={way.workers}", f"workers.cpus={cpus}"]
+        return collect(composed([*overrides, *on_ray]), seconds)
+    config = composed([*overrides, f"env.num_envs={way.worlds}"])
+    if not way.processes:
+        return collect(config, seconds)
+    context = get_context("spawn")
+    with context.Pool(way.processes, begin_together, (context.Barrier(way.processes),)) as pool:
+        each = pool.starmap(collect_alone, [(config, seconds)] * way.processes, chunksize=1)
+    return {**each[0], "env_steps_per_s": sum(one["env_steps_per_s"] for one in each)}
+
+
+def begin_together(barrier: Any) -> None:
+    """Prepare a process of its own: one thread, and where to wait for the others."""
+    global together
+    together = barrier
+    torch.set_num_threads(1)
+    keep_freed_memory()
+
+
+def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
+    """Collect with one thread, at the same time as the other processes."""
+    env = make_env(config, num_threads=1)
+    learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
+    collector = make_collector(config, env, learner.policy())
+    rollouts = iter(collector)
+    for _ in range(WARM_UP):
+        next(rollouts)
+    together.wait()
+    rounds, taken = 0, 0.0
+    start = time.perf_counter()
+    while taken < seconds:
+        next(rollouts)
+        rounds, taken = rounds + 1, time.perf_counter() - start
+    collector.shutdown()
+    return found(config, rounds, taken)
+
+
+def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
+    """Collect as the recipe does, with or without workers."""
     env = make_own_env(config)
     learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
     collector, ahead = make_rollouts(config, env, learner)
     rollouts = iter(collector) if ahead is None else ahead
     for _ in range(WARM_UP):
         next(rollouts)
-    frames, flown, age, rounds = config.env.num_envs * config.rollout_steps, 0.0, 0, 0
+    flown, age, rounds, taken = 0.0, 0, 0, 0.0
     start = time.perf_counter()
-    while (taken := time.perf_counter() - start) < seconds:
+    while taken < seconds:
         next(rollouts)
-        rounds += 1
+        rounds, taken = rounds + 1, time.perf_counter() - start
         if isinstance(ahead, RayRollouts):
             flown, age = flown + ahead.seconds, max(age, ahead.weights_age)
-    by_workers = config.collector is CollectorKind.ray
     if ahead is not None:
         ahead.close()
     else:
         collector.shutdown()
     env.close(raise_if_closed=False)
+    if config.collector is not CollectorKind.ray:
+        return found(config, rounds, taken)
+    of_workers = {"overhead": max(0.0, 1.0 - flown / taken), "weights_age": age, "stated": config.weight_interval}
+    return found(config, rounds, taken) | of_workers
+
+
+def found(config: DreamerConfig, rounds: int, taken: float) -> dict[str, float]:
+    """What so many rounds say, where they are flown by this process with weights of the last update."""
+    frames = config.env.num_envs * config.rollout_steps
     return {
         "env_steps_per_s": rounds * frames / taken,
-        "overhead": max(0.0, 1.0 - flown / taken) if by_workers else 0.0,
-        "weights_age": age if by_workers else frames,
-        "stated": config.workers.weight_interval or frames,
-        "num_envs": config.env.num_envs,
+        "overhead": 0.0,
+        "weights_age": frames,
+        "stated": frames,
+        "rollout_steps": config.rollout_steps,
     }
 
 

@@ -2,12 +2,18 @@
 
     python benchmarks/pipeline.py --json results/pipeline.json
     python benchmarks/pipeline.py --learn 0.02 --worlds 32 --link 3.1e9      # a learner on a GPU, as fast as assumed
+    python benchmarks/pipeline.py --check results/collection_on_ray.json     # against what was measured
 
 A model, not a measurement: it plays the rounds of `collector=ray`. In a round every worker flies one rollout with the
 weights that it was sent, while the learner learns from the round before; rollouts come over one link, one after the
 other, and are copied by the learner; the round is over when the slowest worker's has come. Times of flights scatter by
-a log-normal factor, and a worker that dies costs its round a new start. What one process needs for an env_step is taken
-from `results/cores.json` (`--fly`, `--learn`); everything else is an argument with its default below.
+a log-normal factor, and a worker that dies costs its round a new start. Where processes are more than `--cores`, those
+that work share them evenly. What one process needs for an env_step is taken from `results/cores.json` (`--fly`,
+`--learn`); everything else is an argument with its default below.
+
+`--check` forecasts what `collection_on_ray.py` measured with workers from what it measured without: the time of an
+env_step in one process with one thread and as few worlds, and from two such processes side by side, how many cores'
+worth the machine is.
 """
 
 import argparse
@@ -24,6 +30,7 @@ COLUMNS = (
     "workers", "env_steps_per_s", "times", "held_back_by", "learner_busy", "worker_busy", "link_busy", "weights_age",
     "weights_age_s", "hours", "cost",
 )  # fmt: skip
+CHECKED = ("workers", "worlds", "rollout_steps", "cores", "forecast", "measured", "ratio")
 IMAGE, NUMBERS = 64 * 64 * 3, 200
 """Bytes of a record: its image, and about as many for all the rest of it."""
 
@@ -42,6 +49,7 @@ class Pipeline(NamedTuple):
         copy: Bytes a second at which the learner takes records in.
         overhead: ms a round that the learner spends on asking and waiting, for each worker.
         scatter: Standard deviation of the logarithm of the time of a rollout.
+        cores: Of the learner and all workers together; one for each if 0.
         deaths: Of a worker, an hour.
         restart: s until one that died has flown its rollout again.
     """
@@ -56,6 +64,7 @@ class Pipeline(NamedTuple):
     copy: float = 1e9
     overhead: float = 1.0
     scatter: float = 0.1
+    cores: float = 0.0
     deaths: float = 0.0
     restart: float = 20.0
 
@@ -70,8 +79,12 @@ def main() -> None:
     parser.add_argument("--env-steps", type=float, default=1.5e6, help="of the run whose hours and cost are said")
     parser.add_argument("--learner-price", type=float, default=0.0, help="$ an hour")
     parser.add_argument("--worker-price", type=float, default=0.0, help="$ an hour")
+    parser.add_argument("--check", type=Path, metavar="RESULT")
     parser.add_argument("--json")
     arguments = parser.parse_args()
+    if arguments.check:
+        print_table(check(json.loads(arguments.check.read_text())), CHECKED)
+        return
     pipeline = Pipeline(**{name: getattr(arguments, name) for name in Pipeline._fields})
     alone = 1e3 / (pipeline.fly + pipeline.learn)
     print(f"one process, in turns: {alone:,.0f} env_steps/s")
@@ -95,6 +108,55 @@ def one_process() -> dict[str, float]:
     return {"fly": round(record["collect"] * of_a_step, 3), "learn": round((1 - record["collect"]) * of_a_step, 3)}
 
 
+def check(measured: list[dict[str, Any]], rounds: int = 2000) -> list[dict[str, Any]]:
+    """Forecast what workers collect on a machine from what processes without anything in common collect there.
+
+    Args:
+        measured: records of `collection_on_ray.py`.
+        rounds: to play.
+
+    Returns:
+        One record for each number of workers and length of rollouts.
+
+    Raises:
+        ValueError: two processes, or one with as few worlds as a worker, were not measured.
+    """
+    speeds = {
+        (each["processes"], each["worlds"], each["rollout_steps"]): each["env_steps_per_s"]
+        for each in measured
+        if each["processes"]
+    }
+    workers = [each for each in measured if each["workers"]]
+    pairs = [case for case in speeds if case[0] == 2]
+    needed = {(1, each["worlds"], each["rollout_steps"]) for each in workers} | {(1, *pair[1:]) for pair in pairs}
+    if not pairs or not needed <= speeds.keys():
+        raise ValueError("--check needs one and two processes with as many worlds as a worker has: --workers 1 2.")
+    cores = float(np.mean([speeds[pair] / speeds[1, *pair[1:]] for pair in pairs]))
+    records = []
+    for each in workers:
+        worlds, steps = each["worlds"], each["rollout_steps"]
+        pipeline = Pipeline(1e3 / speeds[1, worlds, steps], 0.0, worlds, steps, cores=cores)
+        forecast = play(pipeline, each["workers"], rounds)["env_steps_per_s"]
+        ratio = forecast / each["env_steps_per_s"]
+        found = {"cores": pipeline.cores, "forecast": forecast, "measured": each["env_steps_per_s"], "ratio": ratio}
+        records.append({**{name: each[name] for name in CHECKED[:3]}, **found})
+    return records
+
+
+def share(work: np.ndarray, cores: float) -> np.ndarray:
+    """When jobs are done (K,) that begin together with so much work (K,), on cores that they share evenly.
+
+    A job runs on one core at the most; 0 cores are one for each.
+    """
+    if not cores:
+        return work
+    order, jobs = np.argsort(work), len(work)
+    pace = np.minimum(1.0, cores / np.arange(jobs, 0, -1))  # of those that still run, as one after the other is done
+    done = np.empty(jobs)
+    done[order] = np.cumsum(np.diff(work[order], prepend=0.0) / pace)
+    return done
+
+
 def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[str, Any]:
     """Play rounds; return env_steps a second, shares of time that are spent working, and the age of weights."""
     draw = np.random.default_rng(seed)
@@ -106,16 +168,19 @@ def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[s
     learning = 1e-3 * pipeline.learn * rollout * workers
 
     clock, asked, flown, round_age = 0.0, 0.0, 0.0, []
+    owed = 0.0  # learning, from the round before: none yet
     for _ in range(rounds):
         times = flight * draw.lognormal(-0.5 * pipeline.scatter**2, pipeline.scatter, workers)
         lost = draw.random(workers) < pipeline.deaths * flight / 3600
-        done = asked + sending + np.sort(times + lost * pipeline.restart)
+        *shared, learned = share(np.append(times, owed), pipeline.cores)
+        done = asked + sending + np.sort(shared + lost * pipeline.restart)
         # each waits for the link until those before it are through
         arrived = np.max(done + transfer * np.arange(workers, 0, -1))
-        begins = max(clock, arrived) + taking
-        round_age.append(begins + learning - asked)
-        asked, clock = begins, begins + learning  # the next round is asked for before this one is learned from
+        clock = max(asked + learned, arrived) + taking
+        round_age.append(clock + learning - asked)
+        asked, owed = clock, learning  # the next round is asked for before this one is learned from
         flown += times.sum()
+    clock += owed
 
     busy = {
         "learner": rounds * (learning + taking) / clock,

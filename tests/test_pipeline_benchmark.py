@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.running_recipes import module_of
@@ -36,3 +37,35 @@ def test_the_slowest_worker_and_deaths_hold_all_back() -> None:
         for scatter, deaths in ((0.0, 0.0), (0.3, 0.0), (0.3, 20.0))
     ]
     assert speeds[0] > 1.3 * speeds[1] > 1.3 * speeds[2]
+
+
+@pytest.mark.parametrize(
+    ("work", "cores", "done"),
+    [
+        ([1.0, 1.0, 1.0], 1.5, [2.0, 2.0, 2.0]),
+        ([3.0, 1.0], 1.0, [4.0, 2.0]),
+        ([3.0, 1.0], 4.0, [3.0, 1.0]),
+        ([3.0, 1.0], 0.0, [3.0, 1.0]),
+    ],
+)
+def test_what_runs_shares_the_cores(work: list[float], cores: float, done: list[float]) -> None:
+    assert pipeline.share(np.array(work), cores) == pytest.approx(done)
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_more_workers_than_cores_fly_as_much_as_the_cores_do(workers: int) -> None:
+    found = pipeline.play(IDEAL._replace(cores=2.0), workers, 200)
+    assert found["env_steps_per_s"] == pytest.approx(1000 * min(workers, 2), rel=0.03)
+
+
+def test_workers_are_forecast_from_processes_that_share_nothing() -> None:
+    def record(processes: int, workers: int, speed: float) -> dict[str, float]:
+        kind = {"processes": processes, "workers": workers}
+        return {**kind, "worlds": 16, "rollout_steps": 8, "env_steps_per_s": speed}
+
+    measured = [record(1, 0, 1000.0), record(2, 0, 1500.0), record(0, 2, 1400.0)]
+    (found,) = pipeline.check(measured)
+    assert found["cores"] == 1.5 and found["ratio"] == pytest.approx(found["forecast"] / 1400.0)
+    assert 1300.0 < found["forecast"] < 1500.0
+    with pytest.raises(ValueError, match="needs one and two processes"):
+        pipeline.check(measured[1:])
