@@ -34,6 +34,7 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
+from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
 from dreamer_racing.experience.ray_worker import Flight, Request
 from dreamer_racing.modules import DreamerPolicy
 
@@ -140,7 +141,7 @@ class RayRollouts(RolloutsAhead):
         import ray
 
         if self._weights is None or (number + 1) * self._frames - self._taken_at > self._interval:
-            self._weights = ray.put(TensorDict.from_module(self._policy).data.to("cpu"))
+            self._weights = ray.put(as_arrays(TensorDict.from_module(self._policy)))
             self._taken_at = self.rounds * self._frames
         settings = {name: attrgetter(name)(self._env) for name in self._settings}
         request = Request(number, [self._weights], self._taken_at, settings)
@@ -171,7 +172,7 @@ class RayRollouts(RolloutsAhead):
         self.processes = [flight.process for flight in flights]
         self.seconds = max(flight.seconds for flight in flights)
         self.weights_age = (self.rounds + 1) * self._frames - self._flown_with
-        return torch.cat([flight.rollout for flight in flights])
+        return torch.cat([as_tensors(flight.rollout) for flight in flights])
 
     def _wait(self, asked: list[Any]) -> bool:
         """Wait until every worker has answered; return whether they have, rather than the run is to stop.

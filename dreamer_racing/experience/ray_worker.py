@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
+from dreamer_racing.experience.ray_arrays import Arrays, as_arrays, as_tensors
 from dreamer_racing.machine import PACKAGES, git_commit
 
 
@@ -27,8 +27,8 @@ class Request(NamedTuple):
 
     Attributes:
         round: Its number in the run, from 0.
-        weights: Where the policy's weights are in Ray's object store: a list of one reference, which is not fetched
-            with the request but by who does not have them yet.
+        weights: Where the policy's weights are in Ray's object store, as `Arrays`: a list of one reference, which is
+            not fetched with the request but by who does not have them yet.
         taken_at: env_steps that the learner had learned from when it took those weights.
         settings: Values for attributes of the environment, by dotted name.
     """
@@ -43,13 +43,13 @@ class Flight(NamedTuple):
     """What a worker answers.
 
     Attributes:
-        rollout: ``[N/W, T]``, on the CPU.
+        rollout: ``[N/W, T]``.
         began: whether it is the worker's first, of worlds that begin anew.
         process: host and process id.
         seconds: that it took, of the worker's time.
     """
 
-    rollout: TensorDictBase
+    rollout: Arrays
     began: bool
     process: tuple[str, int]
     seconds: float
@@ -87,10 +87,10 @@ class RayWorker(Collector):
         if request.taken_at != self._taken_at:
             import ray
 
-            self.update_policy_weights_(ray.get(request.weights[0]))
+            self.update_policy_weights_(as_tensors(ray.get(request.weights[0])))
             self._taken_at = request.taken_at
         rollout, process = self.next(), (socket.gethostname(), os.getpid())
-        flight = Flight(rollout, began, process, time.perf_counter() - start)
+        flight = Flight(as_arrays(rollout), began, process, time.perf_counter() - start)
         self._flown = request.round, flight
         return flight
 

@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
 from dreamer_racing.experience.ray_cluster import Share, start_workers
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
 from dreamer_racing.experience.ray_worker import RayWorker, Request
@@ -108,7 +109,7 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
         weights = TensorDict.from_module(after(taken_at, env)).data.clone()
         after(max(0, number - 1), env)
         settings = {"body_rate_weight": env.body_rate_weight, "worlds.start_on_line": 0.0}
-        asked.append(Request(number, [weights], taken_at * FRAMES, settings))
+        asked.append(Request(number, [as_arrays(weights)], taken_at * FRAMES, settings))
     return asked
 
 
@@ -171,14 +172,14 @@ def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pyte
         survivor = twin(0)
         for number, request in enumerate(asked):
             flight = survivor.fly(request)
-            assert_same(flown.rounds[number][:worlds], flight.rollout)
+            assert_same(flown.rounds[number][:worlds], as_tensors(flight.rollout))
             assert survivor.fly(request) is flight, "asked again, it does not fly on"
         lost = twin(1)
         for number, request in enumerate(asked[: flown.lost_in]):
-            assert_same(flown.rounds[number][worlds:], lost.fly(request).rollout)
+            assert_same(flown.rounds[number][worlds:], as_tensors(lost.fly(request).rollout))
         successor = twin(1)
         for number, request in enumerate(asked[flown.lost_in :], flown.lost_in):
-            assert_same(flown.rounds[number][worlds:], successor.fly(request).rollout)
+            assert_same(flown.rounds[number][worlds:], as_tensors(successor.fly(request).rollout))
 
 
 @pytest.mark.slow
