@@ -31,8 +31,8 @@ COLUMNS = (
     "weights_age_s", "hours", "cost",
 )  # fmt: skip
 CHECKED = ("workers", "worlds", "rollout_steps", "cores", "forecast", "measured", "ratio")
-IMAGE, NUMBERS = 64 * 64 * 3, 200
-"""Bytes of a record: its image, and about as many for all the rest of it."""
+BYTES_PER_STEP = 29_100
+"""Of what a worker sends: the images before and after the step, and all the rest of it (`ray_arrays.py`)."""
 
 
 class Pipeline(NamedTuple):
@@ -43,7 +43,7 @@ class Pipeline(NamedTuple):
         learn: ms for an env_step, of the learner: the updates that it owes for one.
         worlds: Of a worker.
         steps: Control steps of a rollout.
-        bytes_per_step: Of a record, on the link.
+        bytes_per_step: Of a step, on the link.
         weights: Bytes that are sent to each worker in each round.
         link: Bytes a second to and from the learner.
         copy: Bytes a second at which the learner takes records in.
@@ -58,7 +58,7 @@ class Pipeline(NamedTuple):
     learn: float
     worlds: int = 16
     steps: int = 8
-    bytes_per_step: int = IMAGE + NUMBERS
+    bytes_per_step: int = BYTES_PER_STEP
     weights: float = 2.9e6
     link: float = 1.25e9
     copy: float = 1e9
