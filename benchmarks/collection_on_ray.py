@@ -44,6 +44,7 @@ from dreamer_racing.modules import Interface
 
 COLUMNS = ("way", "worlds", "env_steps_per_s", "least", "most", "times", "overhead", "weights_age", "stated")
 WARM_UP = 3  # rollouts
+TOGETHER = 120.0  # s that processes wait for each other at most
 together: Any = None
 """Where a process waits for those that collect at the same time; each has its own reference."""
 
@@ -76,7 +77,10 @@ def main() -> None:
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
     os.environ["PYTHONPATH"] = os.pathsep.join((sys.path[-1], os.environ.get("PYTHONPATH", "")))  # of workers, too
-    ways = ways_of(composed(arguments.overrides).env.num_envs, arguments.workers)
+    num_envs = composed(arguments.overrides).env.num_envs
+    if odd := [count for count in arguments.workers if count < 1 or num_envs % count]:
+        parser.error(f"--workers {odd[0]} cannot share env.num_envs={num_envs} evenly.")
+    ways = ways_of(num_envs, arguments.workers)
     rounds: dict[Way, list[dict[str, float]]] = {way: [] for way in ways}
     for _ in range(arguments.rounds):
         for way in ways:
@@ -102,7 +106,7 @@ def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
         Way("one process", num_envs),
         *(Way(f"one thread, {worlds} worlds", worlds, processes=1) for worlds in shares.values()),
         *(Way(f"{count} processes", worlds, processes=count) for count, worlds in shares.items() if count > 1),
-        *(Way(f"{count} workers", worlds, workers=count) for count, worlds in shares.items()),
+        *(Way(f"{count} worker{'s' * (count > 1)}", worlds, workers=count) for count, worlds in shares.items()),
     ]
 
 
@@ -147,7 +151,7 @@ def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
     rollouts = iter(collector)
     for _ in range(WARM_UP):
         next(rollouts)
-    together.wait()
+    together.wait(timeout=TOGETHER)
     rounds, taken = 0, 0.0
     start = time.perf_counter()
     while taken < seconds:

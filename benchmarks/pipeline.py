@@ -2,7 +2,7 @@
 
     python benchmarks/pipeline.py --json results/pipeline.json
     python benchmarks/pipeline.py --learn 0.02 --worlds 32 --link 3.1e9      # a learner on a GPU, as fast as assumed
-    python benchmarks/pipeline.py --check results/collection_on_ray.json     # against what was measured
+    python benchmarks/pipeline.py --check results/collection_on_ray.json --json results/pipeline_check.json
 
 A model, not a measurement: it plays the rounds of `collector=ray`. In a round every worker flies one rollout with the
 weights that it was sent, while the learner learns from the round before; rollouts come over one link, one after the
@@ -13,7 +13,7 @@ that work share them evenly. What one process needs for an env_step is taken fro
 
 `--check` forecasts what `collection_on_ray.py` measured with workers from what it measured without: the time of an
 env_step in one process with one thread and as few worlds, and from two such processes side by side, how many cores'
-worth the machine is.
+worth the machine is, at most those that it has. Link, copying, overhead and scatter are the defaults.
 """
 
 import argparse
@@ -83,7 +83,9 @@ def main() -> None:
     parser.add_argument("--json")
     arguments = parser.parse_args()
     if arguments.check:
-        print_table(check(json.loads(arguments.check.read_text())), CHECKED)
+        checked = check(json.loads(arguments.check.read_text()))
+        print_table(checked, CHECKED)
+        write_json(checked, arguments.json)
         return
     pipeline = Pipeline(**{name: getattr(arguments, name) for name in Pipeline._fields})
     alone = 1e3 / (pipeline.fly + pipeline.learn)
@@ -130,8 +132,9 @@ def check(measured: list[dict[str, Any]], rounds: int = 2000) -> list[dict[str, 
     pairs = [case for case in speeds if case[0] == 2]
     needed = {(1, each["worlds"], each["rollout_steps"]) for each in workers} | {(1, *pair[1:]) for pair in pairs}
     if not pairs or not needed <= speeds.keys():
-        raise ValueError("--check needs one and two processes with as many worlds as a worker has: --workers 1 2.")
-    cores = float(np.mean([speeds[pair] / speeds[1, *pair[1:]] for pair in pairs]))
+        raise ValueError("--check needs one and two processes with as many worlds as a worker has: --workers 2.")
+    gain = float(np.mean([speeds[pair] / speeds[1, *pair[1:]] for pair in pairs]))
+    cores = min(gain, float(measured[0]["cores"]))
     records = []
     for each in workers:
         worlds, steps = each["worlds"], each["rollout_steps"]
@@ -139,7 +142,7 @@ def check(measured: list[dict[str, Any]], rounds: int = 2000) -> list[dict[str, 
         forecast = play(pipeline, each["workers"], rounds)["env_steps_per_s"]
         ratio = forecast / each["env_steps_per_s"]
         found = {"cores": pipeline.cores, "forecast": forecast, "measured": each["env_steps_per_s"], "ratio": ratio}
-        records.append({**{name: each[name] for name in CHECKED[:3]}, **found})
+        records.append({"benchmark": "pipeline_check", **{name: each[name] for name in CHECKED[:3]}, **found})
     return records
 
 
@@ -168,7 +171,7 @@ def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[s
     learning = 1e-3 * pipeline.learn * rollout * workers
 
     clock, asked, flown, round_age = 0.0, 0.0, 0.0, []
-    owed = 0.0  # learning, from the round before: none yet
+    owed, taken_at = 0.0, 0.0  # learning from the round before: none yet; when its weights were taken
     for _ in range(rounds):
         times = flight * draw.lognormal(-0.5 * pipeline.scatter**2, pipeline.scatter, workers)
         lost = draw.random(workers) < pipeline.deaths * flight / 3600
@@ -176,8 +179,8 @@ def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[s
         done = asked + sending + np.sort(shared + lost * pipeline.restart)
         # each waits for the link until those before it are through
         arrived = np.max(done + transfer * np.arange(workers, 0, -1))
-        clock = max(asked + learned, arrived) + taking
-        round_age.append(clock + learning - asked)
+        round_age.append(asked + learned - taken_at)  # of the round before, once it is learned from
+        clock, taken_at = max(asked + learned, arrived) + taking, asked
         asked, owed = clock, learning  # the next round is asked for before this one is learned from
         flown += times.sum()
     clock += owed
@@ -187,12 +190,14 @@ def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[s
         "worker": flown / workers / clock,
         "link": rounds * (workers * transfer + sending) / clock,
     }
+    if pipeline.cores:
+        busy["cores"] = (flown + rounds * (learning + taking)) / pipeline.cores / clock
     return {
         "env_steps_per_s": rounds * rollout * workers / clock,
         "held_back_by": max(busy, key=busy.__getitem__),
-        **{f"{part}_busy": share for part, share in busy.items()},
+        **{f"{part}_busy": busy_share for part, busy_share in busy.items()},
         "weights_age": 2 * rollout * workers,
-        "weights_age_s": float(np.mean(round_age)),
+        "weights_age_s": float(np.mean(round_age[1:])),
     }
 
 

@@ -28,7 +28,6 @@ from collections.abc import Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -172,7 +171,7 @@ class RayRollouts(RolloutsAhead):
         self.processes = [flight.process for flight in flights]
         self.seconds = max(flight.seconds for flight in flights)
         self.weights_age = (self.rounds + 1) * self._frames - self._flown_with
-        return torch.cat([as_tensors(flight.rollout) for flight in flights])
+        return as_tensors(*(flight.rollout for flight in flights))
 
     def _wait(self, asked: list[Any]) -> bool:
         """Wait until every worker has answered; return whether they have, rather than the run is to stop.

@@ -41,6 +41,7 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
 
         @functools.wraps(function)
         def start() -> None:
+            sys.excepthook = sys.__excepthook__  # packages are loaded
             sys.argv[1:] = [whole_number(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
             with plain_errors():

@@ -16,6 +16,7 @@ def end_quietly(kind: type[BaseException], error: BaseException, trace: Tracebac
     """
     if issubclass(kind, KeyboardInterrupt):
         print(INTERRUPTED, file=sys.stderr, flush=True)
+        sys.stdout.flush()
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
     else:

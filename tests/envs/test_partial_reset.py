@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, EnvBase, InitTracker, PendulumEnv, TensorDictPrimer, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, ObservationNorm, PendulumEnv, TensorDictPrimer, TransformedEnv
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.policy_memory import RaceWithMemory, with_memory
@@ -78,8 +78,8 @@ def test_where_all_episodes_end_at_once_a_policys_keys_are_zero_too(num_envs: in
     assert torch.equal(data["vector"], env.worlds.vector())
 
 
-def primer() -> TensorDictPrimer:
-    return TensorDictPrimer({"memory": Unbounded((2, 3))}, default_value=0.0, expand_specs=True)
+def primer(**settings: Any) -> TensorDictPrimer:
+    return TensorDictPrimer({"memory": Unbounded((2, 3))}, expand_specs=True, **{"default_value": 0.0, **settings})
 
 
 @pytest.mark.parametrize("settings", [{}, {"from_pixels": False, "privileged": True}], ids=str)
@@ -93,6 +93,30 @@ def test_a_policy_remembers_what_torchrls_transforms_let_it_remember(settings: d
 def test_other_environments_have_torchrls_transforms() -> None:
     env = with_memory(PendulumEnv(), primer())
     assert type(env) is TransformedEnv and {"is_init", "memory"} <= set(env.reset().keys())
+
+
+@pytest.mark.parametrize("settings", [{"default_value": 1.0}, {"default_value": {"memory": 0.5}}], ids=str)
+def test_memory_that_does_not_begin_with_zeros_is_torchrls(settings: dict[str, Any]) -> None:
+    env = with_memory(make(from_pixels=False), primer(**settings))
+    begins = env.reset()["memory"].clone()
+    data = env.rand_step(env.reset())["next"].clone(False)
+    data["done"].fill_(True)
+    assert begins.all() and torch.equal(env.maybe_reset(data.set("memory", begins * 3))["memory"], begins)
+
+
+def test_transforms_that_are_appended_see_episodes_begin() -> None:
+    def appended(race: DroneRacingEnv) -> TransformedEnv:
+        env = with_memory(race, primer())
+        env.append_transform(ObservationNorm(5.0, 1.0, in_keys=["vector"], standard_normal=False))
+        return env
+
+    settings = {"from_pixels": False}
+    assert_same_flights(appended(make(**settings)), appended(make(StockSteps, **settings)))
+
+
+def test_a_policy_in_place_of_its_primer_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"with_memory takes policy.make_primer\(\), a transform, and no Linear"):
+        with_memory(make(from_pixels=False), torch.nn.Linear(1, 1))
 
 
 @pytest.mark.parametrize("remember", [False, True])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import warnings
 from typing import Any
 
 import torch
@@ -21,21 +20,24 @@ def sent(arrays: Any) -> Any:
     return pickle.loads(data, buffers=[memoryview(buffer).toreadonly() for buffer in buffers])
 
 
-def test_entries_of_every_kind_arrive() -> None:
-    rollout = TensorDict(
-        {
-            "pixels": torch.randint(256, (2, 3, 4, 4, 3), dtype=torch.uint8),
-            "next": {"done": torch.rand(2, 3, 1) > 0.5, "race": {"crash": torch.arange(6).view(2, 3, 1)}},
-            "belief": torch.randn(2, 5, 3, 1).transpose(1, 2).half(),  # not contiguous
-        },
-        [2, 3],
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        arrived = as_tensors(sent(as_arrays(rollout)))
-    assert arrived.batch_size == rollout.batch_size and set(arrived.keys(True)) == set(rollout.keys(True))
-    for key, value in rollout.items(True, True):
-        assert arrived[key].dtype == value.dtype and torch.equal(arrived[key], value), key
+def test_rollouts_of_several_workers_arrive_side_by_side() -> None:
+    rollouts = [
+        TensorDict(
+            {
+                "pixels": torch.randint(256, (worlds, 3, 4, 4, 3), dtype=torch.uint8),
+                "next": {"done": torch.rand(worlds, 3, 1) > 0.5, "race": {"crash": torch.arange(3).expand(worlds, 3)}},
+                "belief": torch.randn(worlds, 5, 3, 1).transpose(1, 2).half(),  # not contiguous
+            },
+            [worlds, 3],
+        )
+        for worlds in (2, 1)
+    ]
+    for given in (rollouts, rollouts[:1]):
+        arrived, expected = as_tensors(*(sent(as_arrays(rollout)) for rollout in given)), torch.cat(given)
+        assert arrived.batch_size == expected.batch_size and set(arrived.keys(True)) == set(expected.keys(True))
+        for key, value in expected.items(True, True):
+            assert arrived[key].dtype == value.dtype and torch.equal(arrived[key], value), key
+        arrived["pixels"].zero_()  # memory of its own
 
 
 def test_weights_arrive_in_another_module() -> None:

@@ -96,8 +96,10 @@ def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None
     seen = []
     start = recipe_module("composing.entry").recipe("plot")(lambda config: seen.append(config.window))
     monkeypatch.setattr(sys, "argv", ["plot.py", "window=1e3"])
+    monkeypatch.setattr(sys, "excepthook", recipe_module("composing.interruption").end_quietly)
     recipe_module("composing.schema").register()
     start()
+    assert sys.excepthook is sys.__excepthook__, "what ends while packages are loaded is no concern any more"
     assert seen == [1000.0] and Path(CONFIG).is_dir() and not hydra.core.global_hydra.GlobalHydra().is_initialized()
 
 
