@@ -35,6 +35,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch import device as Device
 
+from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.experience.ahead import RolloutsAhead
@@ -43,7 +44,6 @@ from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.losses import make_losses
 from dreamer_racing.modules import Interface
-from dreamer_racing.training import parallel
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.replay_ratio import UpdatesOwed

@@ -16,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from dreamer_racing import parallel
 from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
@@ -34,7 +35,6 @@ from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import check_settings
-from dreamer_racing.training import parallel
 
 ACTOR_NUMBERS = ("horizon", "discount", "continuation")
 """What is read off an actor's loss, as `ActorLoss` has it."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 from torchrl.objectives import LossModule
 
+from dreamer_racing import parallel
 from dreamer_racing.losses.config import HORIZON, LossConfig
 from dreamer_racing.losses.contract import require_keys, scheduled
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
@@ -22,7 +23,6 @@ from dreamer_racing.modules.actor import Actor
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic
 from dreamer_racing.modules.world_model import WorldModel
-from dreamer_racing.training import parallel
 
 
 class Judgement(NamedTuple):

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
+from dreamer_racing import parallel
 from dreamer_racing.losses.actor import ActorLoss
 from dreamer_racing.losses.config import HORIZON, ActorPPOConfig, LossConfig
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.agent import Agent
-from dreamer_racing.training import parallel
 
 KL_TOLERANCE = 1.5
 """Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""

@@ -5,7 +5,7 @@ written beside its final place and renamed into it, so that a folder of that nam
 process leaves behind has a name with a leading dot, is never read, and is removed by the next run. The CRC-32 of every
 file lies beside them and is compared before anything is read.
 
-Where several processes train together (`training.parallel`), a checkpoint is of all of them: the first one's parts lie
+Where several processes train together (`parallel`), a checkpoint is of all of them: the first one's parts lie
 where a single one's do, and what each of the others has of its own (worlds, replay, random state) lies below
 ``process-<n>``, written by itself. Any number of processes can restore it: what is common they all read, and what they
 have of their own is read back if they are as many as before; else the replay is dealt anew, and the rest begins anew.
@@ -28,7 +28,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from dreamer_racing.training import parallel
+from dreamer_racing import parallel
 from dreamer_racing.training.checksums import HAS_CHECKSUMS, damage_of
 from dreamer_racing.training.directory import (
     PREFIX,

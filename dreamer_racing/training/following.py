@@ -1,4 +1,4 @@
-"""What a process has in place of what the first one writes, where several train together (`training.parallel`)."""
+"""What a process has in place of what the first one writes, where several train together (`parallel`)."""
 
 from __future__ import annotations
 

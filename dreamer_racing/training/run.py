@@ -3,7 +3,7 @@
 The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
 `logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
 
-Several processes may train together (`training.parallel`): they go through the loop in step, each with worlds and
+Several processes may train together (`parallel`): they go through the loop in step, each with worlds and
 replay of its own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
 """
 
@@ -21,11 +21,11 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from dreamer_racing import parallel
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.machine import KeptMemory
-from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory

@@ -19,6 +19,7 @@ from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
 from composing.saved import flat_settings, saved_config
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
+from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
@@ -36,7 +37,6 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory, replace_text

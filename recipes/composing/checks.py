@@ -23,6 +23,7 @@ from composing.schema import (
     SACRunConfig,
     is_race,
 )
+from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
@@ -34,7 +35,6 @@ from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
-from dreamer_racing.training import parallel
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.schedule import RampClock
 

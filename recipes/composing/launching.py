@@ -19,6 +19,7 @@ from composing.command_line import follow_quietly, merge_overrides, override_key
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
+from dreamer_racing import parallel
 from dreamer_racing.experience.ahead import WorkerError
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
@@ -26,7 +27,6 @@ from dreamer_racing.machine import (
     keep_freed_memory,
     out_of_memory_advice,
 )
-from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train

@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 
 from composing.checks import steps_alone
 from composing.schema import DreamerConfig
+from dreamer_racing import parallel
 from dreamer_racing.losses import ACTOR_LOSSES, find_loss
-from dreamer_racing.training import parallel
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
 OF_IMPROVEMENTS = ("loss.ppo.flown", "loss.ppo.minibatch")

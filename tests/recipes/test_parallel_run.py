@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from dreamer_racing.training import parallel
+from dreamer_racing import parallel
 from tests.running_recipes import ROOT, TINY, compose, recipe, recipe_module, rows
 
 SETTINGS = [

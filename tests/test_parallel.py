@@ -14,6 +14,7 @@ from forked import Forked
 from tensordict import TensorDict
 from torch import Tensor
 
+from dreamer_racing import parallel
 from dreamer_racing.experience.replay import StreamReplay, make_replay
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_config import LearnerConfig
@@ -21,7 +22,6 @@ from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.losses import ActorPPOConfig, LossConfig, make_losses
 from dreamer_racing.modules import Agent, Interface, get_size
 from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.training import parallel
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
 from tests.learners.test_dreamer import make_batch
