@@ -79,11 +79,20 @@ def main() -> None:
     parser.add_argument("--env-steps", type=float, default=1.5e6, help="of the run whose hours and cost are said")
     parser.add_argument("--learner-price", type=float, default=0.0, help="$ an hour")
     parser.add_argument("--worker-price", type=float, default=0.0, help="$ an hour")
-    parser.add_argument("--check", type=Path, metavar="RESULT")
-    parser.add_argument("--json")
+    parser.add_argument("--check", type=Path, metavar="FILE", help="of collection_on_ray.py --json")
+    parser.add_argument("--json", help="file for the numbers")
     arguments = parser.parse_args()
+    if min(arguments.workers) < 1 or not all(
+        getattr(arguments, name) > 0 for name in ("link", "copy", "worlds", "steps", "fly", "rounds", "env_steps")
+    ):
+        parser.error("workers, and all that is flown, carried or copied, must be above 0.")
     if arguments.check:
-        checked = check(json.loads(arguments.check.read_text()))
+        try:
+            checked = check(json.loads(arguments.check.read_text()))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            parser.error(
+                f"--check {arguments.check}: no result of collection_on_ray.py ({type(error).__name__}: {error})."
+            )
         print_table(checked, CHECKED)
         write_json(checked, arguments.json)
         return

@@ -62,7 +62,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 SUITE_SETTINGS = """settings: tuned=suite, which learn a task from images on a CPU (tuned=none: as model=cpu_small):
-  a small DreamerV3 that trains on 64 records for each action, and averaged weights fly evaluations
+  a small DreamerV3 that trains on 128 records for each action, and averaged weights fly evaluations
   recipes/config/tuned/suite.yaml has every number"""
 LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
 RACE_SPEED = 450  # env_steps/s of tuned=race on one core with bfloat16 and AMX, two runs side by side (entry 20)
@@ -186,9 +186,15 @@ def main(config: DictConfig) -> None:
 
 def tune(config: DictConfig) -> str:
     """Choose the file of the group `tuned` for what is to be trained, and say what it means."""
-    on_cpu = choose_device(config.device).type == "cpu"
-    meant = config.model.size in ("auto", "cpu_small") and config.budget not in ("smoke", "paper")
-    if not on_cpu or not meant or not config.env.from_pixels:
+    device, size, budget = choose_device(config.device).type, config.model.size, config.budget
+    others = {
+        f"device={device}": device != "cpu",
+        "env.from_pixels=false": not config.env.from_pixels,
+        f"model={size}": size not in ("auto", "cpu_small"),
+        f"budget={budget}": budget in ("smoke", "paper"),
+    }
+    if reasons := [setting for setting, other in others.items() if other]:
+        print(f"settings: tuned=none, DreamerV3 as published: none are chosen for {', '.join(reasons)}")
         return "none"
     name, settings = ("race", RACE_SETTINGS) if config.env.suite == "race" else ("suite", SUITE_SETTINGS)
     print(settings)

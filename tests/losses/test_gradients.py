@@ -264,5 +264,5 @@ def test_gradients_of_an_unroll_are_those_of_its_steps(recurrence, monkeypatch):
     for name, one, other in zip(parameters, unrolled, stepped, strict=True):
         assert (one is None) == (other is None), name
         if one is not None:
-            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
+            assert (one - other).norm() <= 1e-4 * other.norm() + 1e-6, name
     assert sum(gradient is not None and bool(gradient.any()) for gradient in unrolled) > 8
