@@ -72,7 +72,8 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
     print(
         f"workers: {workers} on Ray (workers.address={asked.address}), each with {own.env.num_envs} worlds on "
         f"{own.env.device}, {asked.cpus:g} CPUs and {asked.gpus:g} GPUs; weights at most {config.weight_interval:,} "
-        "env_steps old"
+        "env_steps old; they and their worlds take half a minute to begin",
+        flush=True,
     )
     with seeded(config.seed):
         agent = make_agent(own, Interface.of(env))  # its weights come with the first request
