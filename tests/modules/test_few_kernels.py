@@ -64,7 +64,7 @@ def test_gradients_are_the_same_in_float32(size: str, actor: str) -> None:
     few, plain = (gradients(learner) for learner in make_pair(SIZES[size], actor=actor)[::-1])
     assert few.keys() == plain.keys()
     for name, value in plain.items():
-        assert (few[name] - value).norm() <= 1e-3 * value.norm() + 1e-6, name
+        assert (few[name] - value).norm() <= 3e-4 * value.norm() + 3e-7, name
 
 
 @pytest.mark.usefixtures("same_noise")
@@ -87,7 +87,8 @@ def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(
     parts = sorted({".".join(name.split(".")[:2]) for name in exact if name != "loss"})
     errors = {part: [relative_error(found, exact, part) for found in (plain, few)] for part in parts}
     fine = {part: pair for part, pair in errors.items() if pair[0] < 0.1}  # of coarser ones nothing can be said
-    assert len(fine) >= len(parts) / 2
+    spared = 0 if torch.__version__ >= "2.13" else 1  # before, a seed means other weights
+    assert len(fine) >= len(parts) - spared, errors
     assert all(with_few < 3 * as_usual + 0.005 for as_usual, with_few in fine.values()), fine
 
 
