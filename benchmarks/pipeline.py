@@ -31,8 +31,10 @@ COLUMNS = (
     "weights_age_s", "hours", "cost",
 )  # fmt: skip
 CHECKED = ("workers", "worlds", "rollout_steps", "cores", "forecast", "measured", "ratio")
-BYTES_PER_STEP = 29_100
-"""Of what a worker sends: the images before and after the step, and all the rest of it (`ray_arrays.py`)."""
+BYTES_SENT = 16_400
+"""Of a step: the image after it, and all the rest (`ray_arrays.py`)."""
+BYTES_TAKEN = 29_100
+"""Of a step, where the learner has unpacked it: the image before it, too."""
 
 
 class Pipeline(NamedTuple):
@@ -43,7 +45,8 @@ class Pipeline(NamedTuple):
         learn: ms for an env_step, of the learner: the updates that it owes for one.
         worlds: Of a worker.
         steps: Control steps of a rollout.
-        bytes_per_step: Of a step, on the link.
+        sent: Bytes of a step, on the link.
+        taken: Bytes of a step that the learner takes in.
         weights: Bytes that are sent to each worker in each round.
         link: Bytes a second to and from the learner.
         copy: Bytes a second at which the learner takes records in.
@@ -58,7 +61,8 @@ class Pipeline(NamedTuple):
     learn: float
     worlds: int = 16
     steps: int = 8
-    bytes_per_step: int = BYTES_PER_STEP
+    sent: int = BYTES_SENT
+    taken: int = BYTES_TAKEN
     weights: float = 2.9e6
     link: float = 1.25e9
     copy: float = 1e9
@@ -174,9 +178,9 @@ def play(pipeline: Pipeline, workers: int, rounds: int, seed: int = 0) -> dict[s
     draw = np.random.default_rng(seed)
     rollout = pipeline.worlds * pipeline.steps  # env_steps
     flight = 1e-3 * pipeline.fly * rollout
-    transfer = rollout * pipeline.bytes_per_step / pipeline.link
+    transfer = rollout * pipeline.sent / pipeline.link
     sending = workers * pipeline.weights / pipeline.link
-    taking = workers * (rollout * pipeline.bytes_per_step / pipeline.copy + 1e-3 * pipeline.overhead)
+    taking = workers * (rollout * pipeline.taken / pipeline.copy + 1e-3 * pipeline.overhead)
     learning = 1e-3 * pipeline.learn * rollout * workers
 
     clock, asked, flown, round_age = 0.0, 0.0, 0.0, []

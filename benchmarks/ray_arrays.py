@@ -1,9 +1,10 @@
-"""Milliseconds to pack and unpack a rollout and weights for Ray's object store: tensor by tensor, and as arrays.
+"""Milliseconds to pack and unpack a rollout and weights for Ray's object store: tensor by tensor, as arrays, each once.
 
     python benchmarks/ray_arrays.py --json results/ray_arrays.json
 
 The rollout is one of `recipes/dreamer_v3.py track=circle tuned=race`, of 16 worlds; the weights are its policy's.
-`pack` and `unpack` are the least of `--times`, without the way through the store.
+`pack` and `unpack` are the least of `--times`, without the way through the store. `once`: what is observed before a
+step and was after the last one is sent once, as workers do.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from typing import Any
 
 import torch
 from measuring import print_table, write_json
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
@@ -26,7 +27,7 @@ from composing.arena import make_env
 from composing.building import make_collector
 from composing.learners import make_learner
 
-from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
+from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors, pack_rollout, unpack_rollout
 from dreamer_racing.modules import Interface
 
 COLUMNS = ("what", "how", "megabytes", "pack", "unpack")
@@ -42,17 +43,24 @@ def main() -> None:
     config = composed(["env.num_envs=16"])
     env = make_env(config, num_threads=1)
     policy = make_learner(config, Interface.of(env), torch.device("cpu")).policy()
-    parts = {"rollout": next(iter(make_collector(config, env, policy))), "weights": TensorDict.from_module(policy).data}
+    rollout = next(iter(make_collector(config, env, policy)))
+    weights = TensorDict.from_module(policy).data
+    jobs: list[tuple[str, str, TensorDictBase, Callable[[Any], Any], Callable[[Any], Any]]] = [
+        ("rollout", "tensors", rollout, unchanged, unchanged),
+        ("rollout", "arrays", rollout, as_arrays, as_tensors),
+        ("rollout", "once", rollout, pack_rollout, unpack_rollout),
+        ("weights", "tensors", weights, unchanged, unchanged),
+        ("weights", "arrays", weights, as_arrays, as_tensors),
+    ]
     records: list[dict[str, Any]] = []
-    for what, data in parts.items():
-        for how, to_send, to_use in (("tensors", unchanged, unchanged), ("arrays", as_arrays, as_tensors)):
-            packed = pack(to_send, data)
-            times = {
-                "pack": least(partial(pack, to_send, data), arguments.times),
-                "unpack": least(partial(unpack, to_use, packed), arguments.times),
-            }
-            size = data.bytes() / 1e6
-            records.append({"benchmark": "ray_arrays", "what": what, "how": how, "megabytes": size, **times})
+    for what, how, data, to_send, to_use in jobs:
+        packed = pack(to_send, data)
+        size = (len(packed[0]) + sum(buffer.nbytes for buffer in packed[1])) / 1e6
+        times = {
+            "pack": least(partial(pack, to_send, data), arguments.times),
+            "unpack": least(partial(unpack, to_use, packed), arguments.times),
+        }
+        records.append({"benchmark": "ray_arrays", "what": what, "how": how, "megabytes": size, **times})
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
 

@@ -28,7 +28,7 @@ def test_beyond_what_the_learner_learns_workers_gain_nothing() -> None:
 
 
 def test_a_link_carries_what_it_carries() -> None:
-    found = pipeline.play(IDEAL._replace(link=2_000 * IDEAL.bytes_per_step), 8, 200)
+    found = pipeline.play(IDEAL._replace(link=2_000 * IDEAL.sent), 8, 200)
     assert found["env_steps_per_s"] == pytest.approx(2_000 / (1 + 2_000 / 8_000), rel=0.05)
     assert found["held_back_by"] == "link"
 

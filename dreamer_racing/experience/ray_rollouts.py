@@ -33,7 +33,7 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
-from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
+from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
 from dreamer_racing.experience.ray_worker import Flight, Request
 from dreamer_racing.modules import DreamerPolicy
 
@@ -171,7 +171,7 @@ class RayRollouts(RolloutsAhead):
         self.processes = [flight.process for flight in flights]
         self.seconds = max(flight.seconds for flight in flights)
         self.weights_age = (self.rounds + 1) * self._frames - self._flown_with
-        return as_tensors(*(flight.rollout for flight in flights))
+        return unpack_rollout(*(flight.rollout for flight in flights))
 
     def _wait(self, asked: list[Any]) -> bool:
         """Wait until every worker has answered; return whether they have, rather than the run is to stop.

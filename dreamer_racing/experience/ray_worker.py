@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torchrl.collectors import Collector
 
-from dreamer_racing.experience.ray_arrays import Arrays, as_arrays, as_tensors
+from dreamer_racing.experience.ray_arrays import Arrays, as_tensors, pack_rollout
 from dreamer_racing.machine import PACKAGES, git_commit
 
 
@@ -43,7 +43,7 @@ class Flight(NamedTuple):
     """What a worker answers.
 
     Attributes:
-        rollout: ``[N/W, T]``.
+        rollout: ``[N/W, T]``, packed.
         began: whether it is the worker's first, of worlds that begin anew.
         process: host and process id.
         seconds: that it took, of the worker's time.
@@ -90,7 +90,7 @@ class RayWorker(Collector):
             self.update_policy_weights_(as_tensors(ray.get(request.weights[0])))
             self._taken_at = request.taken_at
         rollout, process = self.next(), (socket.gethostname(), os.getpid())
-        flight = Flight(as_arrays(rollout), began, process, time.perf_counter() - start)
+        flight = Flight(pack_rollout(rollout), began, process, time.perf_counter() - start)
         self._flown = request.round, flight
         return flight
 

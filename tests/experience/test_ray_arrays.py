@@ -5,11 +5,12 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
+from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors, pack_rollout, unpack_rollout
 
 
 def sent(arrays: Any) -> Any:
@@ -20,24 +21,44 @@ def sent(arrays: Any) -> Any:
     return pickle.loads(data, buffers=[memoryview(buffer).toreadonly() for buffer in buffers])
 
 
-def test_rollouts_of_several_workers_arrive_side_by_side() -> None:
-    rollouts = [
-        TensorDict(
-            {
-                "pixels": torch.randint(256, (worlds, 3, 4, 4, 3), dtype=torch.uint8),
-                "next": {"done": torch.rand(worlds, 3, 1) > 0.5, "race": {"crash": torch.arange(3).expand(worlds, 3)}},
-                "belief": torch.randn(worlds, 5, 3, 1).transpose(1, 2).half(),  # not contiguous
-            },
-            [worlds, 3],
-        )
-        for worlds in (2, 1)
-    ]
+def flown(worlds: int, steps: int) -> TensorDict:
+    """A rollout as a collector makes it: observed before a step is what came of the last, or an episode begins."""
+    after, begins = TensorDict(_observed(worlds, steps), [worlds, steps]), torch.rand(worlds, steps, 1) > 0.6
+    before = TensorDict(_observed(worlds, steps), [worlds, steps])
+    before[:, 1:] = torch.where(begins[:, 1:, 0], before[:, 1:], after[:, :-1])
+    after.update({"reward": torch.randn(worlds, steps, 1), "is_init": torch.zeros_like(begins)})
+    return before.update({"action": torch.randn(worlds, steps, 4), "is_init": begins, "next": after})
+
+
+def _observed(worlds: int, steps: int) -> dict[str, Any]:
+    return {
+        "pixels": torch.randint(256, (worlds, steps, 4, 4, 3), dtype=torch.uint8),
+        "race": TensorDict({"crash": torch.randint(9, (worlds, steps))}, [worlds, steps]),
+        "belief": torch.randn(worlds, 5, steps).transpose(1, 2).half(),  # not contiguous
+    }
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_rollouts_of_several_workers_arrive_side_by_side(steps: int) -> None:
+    rollouts = [flown(worlds, steps) for worlds in (2, 3)]
     for given in (rollouts, rollouts[:1]):
-        arrived, expected = as_tensors(*(sent(as_arrays(rollout)) for rollout in given)), torch.cat(given)
+        packed, expected = [sent(pack_rollout(rollout)) for rollout in given], torch.cat(given)
+        arrived = unpack_rollout(*packed)
         assert arrived.batch_size == expected.batch_size and set(arrived.keys(True)) == set(expected.keys(True))
         for key, value in expected.items(True, True):
             assert arrived[key].dtype == value.dtype and torch.equal(arrived[key], value), key
-        arrived["pixels"].zero_()  # memory of its own
+        arrived.zero_()  # memory of its own
+
+
+def test_each_observation_goes_once() -> None:
+    """After its step; before it, too, where a rollout or an episode begins."""
+    rollout = flown(worlds=3, steps=4)
+    begins = rollout["is_init"][..., 0].clone()
+    begins[:, 0] = True
+    packed = pack_rollout(rollout).entries
+    for key in ("pixels", ("race", "crash"), "belief"):
+        assert len(packed[key]) == begins.sum() < rollout.numel()
+    assert packed["next", "pixels"].shape[:2] == packed["action"].shape[:2] == (3, 4)
 
 
 def test_weights_arrive_in_another_module() -> None:

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors
+from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
 from dreamer_racing.experience.ray_cluster import Share, start_workers
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
 from dreamer_racing.experience.ray_worker import RayWorker, Request
@@ -172,14 +172,14 @@ def test_workers_fly_what_a_single_process_would(flown: Flown, monkeypatch: pyte
         survivor = twin(0)
         for number, request in enumerate(asked):
             flight = survivor.fly(request)
-            assert_same(flown.rounds[number][:worlds], as_tensors(flight.rollout))
+            assert_same(flown.rounds[number][:worlds], unpack_rollout(flight.rollout))
             assert survivor.fly(request) is flight, "asked again, it does not fly on"
         lost = twin(1)
         for number, request in enumerate(asked[: flown.lost_in]):
-            assert_same(flown.rounds[number][worlds:], as_tensors(lost.fly(request).rollout))
+            assert_same(flown.rounds[number][worlds:], unpack_rollout(lost.fly(request).rollout))
         successor = twin(1)
         for number, request in enumerate(asked[flown.lost_in :], flown.lost_in):
-            assert_same(flown.rounds[number][worlds:], as_tensors(successor.fly(request).rollout))
+            assert_same(flown.rounds[number][worlds:], unpack_rollout(successor.fly(request).rollout))
 
 
 @pytest.mark.slow
