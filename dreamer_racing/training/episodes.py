@@ -28,7 +28,7 @@ class EpisodeTracker:
         >>> tracker = EpisodeTracker(num_envs=16)
         >>> # for rollout in collector:
         >>> #     episodes = tracker.update(rollout)
-        >>> #     metrics.push(tracker.summary(episodes))
+        >>> #     metrics.push(tracker.summary(episodes), len(episodes))
     """
 
     _FACTS = ("gates_passed", "crash", "finished", "target_gate")

@@ -30,7 +30,7 @@ class UnwrittenMetrics:
     def __init__(self) -> None:
         self.loggers: list[Logger] = []
 
-    def push(self, metrics: Mapping[str, Tensor | float]) -> None:
+    def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
         """Do nothing."""
 
     def close_row(self, env_steps: int) -> dict[str, float]:

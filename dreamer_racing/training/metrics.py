@@ -65,13 +65,14 @@ class MetricsLog:
         else:
             self._truncate(resume_env_steps)
 
-    def push(self, metrics: Mapping[str, Tensor | float]) -> None:
+    def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
         """Adds values to the averages; tensors stay on their device, so that nothing waits for it.
 
         Args:
             metrics: values by name; of a tensor of several elements the mean counts.
+            count: as how many values each counts, being the mean of so many.
         """
-        self._pending.averages.push(metrics)
+        self._pending.averages.push(metrics, count)
 
     def write(self, env_steps: int) -> dict[str, float]:
         """Makes a row of the averages and writes it: `close_row` and `flush`."""
@@ -237,20 +238,20 @@ class RunningMean:
         self._tensors: dict[tuple[torch.device, tuple[str, ...]], tuple[Tensor, int]] = {}
         self._floats: dict[str, tuple[float, int]] = {}
 
-    def push(self, metrics: Mapping[str, Tensor | float]) -> None:
-        """Add values to the averages; tensors stay on their device."""
+    def push(self, metrics: Mapping[str, Tensor | float], count: int = 1) -> None:
+        """Add values to the averages, each of which counts as so many; tensors stay on their device."""
         by_device: dict[torch.device, dict[str, Tensor]] = defaultdict(dict)
         for name, value in metrics.items():
             if isinstance(value, Tensor):
                 by_device[value.device][name] = value.detach().float().mean() if value.ndim else value.detach().float()
             else:
-                total, count = self._floats.get(name, (0.0, 0))
-                self._floats[name] = (total + float(value), count + 1)
+                total, counted = self._floats.get(name, (0.0, 0))
+                self._floats[name] = (total + count * float(value), counted + count)
         for device, values in by_device.items():
             key = (device, tuple(values))
             stacked = torch.stack(list(values.values()))
-            sums, pushes = self._tensors.get(key, (torch.zeros_like(stacked), 0))
-            self._tensors[key] = (sums + stacked, pushes + 1)
+            sums, counted = self._tensors.get(key, (torch.zeros_like(stacked), 0))
+            self._tensors[key] = (sums + count * stacked, counted + count)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""

@@ -103,7 +103,7 @@ class Run:
         self.counters["env_steps"] += rollout.numel() * parallel.count()
         episodes = parallel.gathered_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
-        self.metrics.push(self.tracker.summary(episodes))
+        self.metrics.push(self.tracker.summary(episodes), len(episodes))
         if self.curriculum:
             self.env.body_rate_weight = self.curriculum.update(episodes["return"])
             self.metrics.push({"curriculum/body_rate_weight": self.env.body_rate_weight})

@@ -252,6 +252,16 @@ def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
     assert "2.0" in (tmp_path / "other" / "scalars" / "loss" / "actor.csv").read_text()
 
 
+def test_the_mean_of_several_counts_as_many(tmp_path):
+    """Episodes that end together, as by their time limit, count as often as those that end alone."""
+    with MetricsLog(tmp_path) as log:
+        log.push({"episode/return": 40.0, "loss": torch.tensor(2.0)}, 32)
+        for _ in range(10):
+            log.push({"episode/return": -4.0, "loss": torch.tensor(9.0)})
+        log.push({}, 0)
+        assert log.write(1) == pytest.approx({"episode/return": 1240 / 42, "loss": 154 / 42})
+
+
 # --- episodes ---
 
 
