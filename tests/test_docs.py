@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import inspect
 import json
+import pkgutil
 import re
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +14,7 @@ from types import ModuleType
 import pytest
 import yaml
 
+import dreamer_racing
 from dreamer_racing import GYM_ENVIRONMENTS
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.gates import CrashCause
@@ -182,6 +186,20 @@ def test_every_attack_of_the_benchmarks_is_in_a_row_and_what_was_not_measured_sa
     named = named - {"kill at {function}"} | {f"kill at {name}" for name in ("open", "rename", "fsync")}
     kinds = set(re.findall(r'^    "(\w+)": \w+,$', fuzz, re.MULTILINE))
     assert len(named) > 8 and len(kinds) == 5 and attacks == named | kinds
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        found.name
+        for found in pkgutil.walk_packages(dreamer_racing.__path__, "dreamer_racing.")
+        if "__" not in found.name
+    ],
+)
+def test_examples_do_what_they_say(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = doctest.testmod(importlib.import_module(module), optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert not found.failed, f"{found.failed} of {found.attempted} lines, see above"
 
 
 def test_tests_that_promises_name_are_there() -> None:

@@ -55,9 +55,10 @@ class HandPolicy(TensorDictModuleBase):
         hover_action: collective thrust, in units of the action, that holds a level drone.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> policy = HandPolicy(lambda image: StickPositions(pitch=0.5), hover_action=-0.4)
         >>> policy(TensorDict({"pixels": torch.zeros(1, 64, 64, 3, dtype=torch.uint8)}, [1]))["action"]
-        tensor([[-0.4000,  0.0000,  0.5000,  0.0000]])
+        tensor([[-0.4000,  0.0000,  0.5000, -0.0000]])
     """
 
     def __init__(self, sticks: Sticks, hover_action: float) -> None:

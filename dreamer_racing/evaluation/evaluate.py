@@ -252,6 +252,8 @@ def evaluate(
         ValueError: the environment is no evaluation environment or lacks what is measured, or no episode is asked for.
 
     Example:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from dreamer_racing.envs import DroneRacingEnv
         >>> env = DroneRacingEnv("circle", num_envs=2, from_pixels=False, evaluation=True, episode_steps=5)
         >>> policy = TensorDictModule(lambda position: torch.zeros(2, 4), [("privileged", "position")], ["action"])
         >>> evaluate(env, policy, episodes=3).episode_length

@@ -76,7 +76,7 @@ class LesionedPolicy(torch.nn.Module):
         lesion: what happens to them.
 
     Example:
-        >>> result = fly(LesionedPolicy(policy, Blank()), {"track": "circle"}, episodes=10)
+        >>> # result = fly(LesionedPolicy(policy, Blank()), {"track": "circle"}, episodes=10)
     """
 
     def __init__(self, policy: Policy, lesion: Lesion) -> None:

@@ -57,7 +57,7 @@ class ActorStep(nn.Module):
         ValueError: If the agent sees images and numbers both.
 
     Example:
-        >>> from dreamer_racing.modules import get_size
+        >>> from dreamer_racing.modules import Interface, get_size
         >>> step = ActorStep(Agent(get_size("debug"), Interface(), decode=False))
         >>> list(step.example_inputs())
         ['image_u8', 'h', 'z', 'previous_action', 'is_init']

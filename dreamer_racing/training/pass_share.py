@@ -40,7 +40,7 @@ class PassShare:
         ...     {"gates_passed": torch.tensor([4]), "target_gate": torch.tensor([0]), "crash": torch.tensor([1])}, [1]
         ... )
         >>> for _ in range(120):  # gate 0, then 1, 2, 3, and a crash at 0
-        ...     share = passes.update(episodes)
+        ...     share = passes.update(episodes, env_steps=10_000)
         >>> passes.shares.tolist(), passes.best
         ([0.0, 1.0, 1.0, 1.0], 0.0)
     """

@@ -268,6 +268,7 @@ class PilotPolicy(TensorDictModuleBase):
         pilot: who flies.
 
     Example:
+        >>> from dreamer_racing.envs import DroneRacingEnv
         >>> env = DroneRacingEnv("circle", num_envs=2, from_pixels=False)
         >>> env.rollout(100, PilotPolicy(ScriptedPilot(env.track)))["next", "race", "gates_passed"].max() > 0
         tensor(True)

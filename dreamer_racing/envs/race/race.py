@@ -76,6 +76,7 @@ class Race:
         miss_radius: see `GateSweeper`.
 
     Example:
+        >>> from dreamer_racing.envs.tracks import load_track
         >>> race = Race(load_track("circle"), num_envs=1)
         >>> start = torch.tensor([[4.0, -2.5, 1.35]])
         >>> race.begin(torch.tensor([True]), start, torch.tensor([0]))
