@@ -10,7 +10,7 @@ import torch
 from composing.arena import Environment, make_env, worlds_device
 from composing.command_line import AGENTS
 from composing.devices import choose_device
-from composing.learners import clock_times, make_learner, scheduled_numbers
+from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
 from composing.saved import trained_config
 from composing.schema import (
     DreamerConfig,
@@ -209,7 +209,9 @@ def restore_learner(
     load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
     if isinstance(learner, DreamerLearner):
         config = cast(DreamerConfig, config)
-        learner.adjust(**scheduled_numbers(config, clock_times(config, counters["env_steps"], passes)))
+        numbers = scheduled_numbers(config, clock_times(config, counters["env_steps"], passes))
+        # The networks bring theirs, which do not change if the run is made longer.
+        learner.adjust(**{name: number for name, number in numbers.items() if name not in IN_CHECKPOINTS})
     return learner, counters
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -311,3 +312,21 @@ def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(
             assert weights.keys() == other.keys()
             for name, value in weights.items():
                 assert torch.equal(value, other[name]), f"{home}: {name}"
+
+
+def test_a_checkpoint_flies_as_it_did_after_its_run_was_made_longer(tmp_path: Path) -> None:
+    """The networks' bounds of deviations are the checkpoint's; of what it does not hold the schedule tells."""
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "env.num_envs=2", "prefill=32"]
+    overrides += ["schedule.max_std.to=0.2", "schedule.discount.to=0.9", f"run_dir={tmp_path / 'run'}"]
+    recipe = recipe_module("dreamer_v3")
+    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides, "total_env_steps=1000")))
+    run = recipe.build(config, overrides)
+    run.counters["env_steps"] = 500
+    run.learner.adjust(max_std=0.3)
+    checkpoint = run.save()
+    run.close()
+    for total, discount in ((1000, 0.9485), (2000, 0.97275)):  # from 0.997
+        longer = replace(config, total_env_steps=total)
+        learner, _ = recipe_module("composing.restoring").restore_learner(longer, checkpoint, torch.device("cpu"))
+        assert learner.agent.actor.max_std.item() == pytest.approx(0.3)
+        assert learner.discount == pytest.approx(discount)
