@@ -253,7 +253,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
     def case() -> bool:
         chosen = draw.choices(names, k=draw.choice((1, 1, 1, 2, 3)))
         given = [f"{draw.choice(('',) * 8 + ('+', '~'))}{name}={value()}" for name in chosen]
-        given = ["device=cpu", *(entry.whole_number(override) for override in given)]
+        given = ["device=cpu", *(entry.readable(override) for override in given)]
         quiet = io.StringIO()
         try:
             with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), command_line.plain_errors():

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from composing.checks import check_variant
-from composing.command_line import merge_overrides, override_key
+from composing.command_line import as_override, merge_overrides, override_key
 from composing.entry import in_plain_words, recipe
 from composing.report import FAILURES
 from composing.saved import read_yaml
@@ -111,13 +111,13 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     try:
         latest_checkpoint(RunDirectory(run_dir).checkpoints)
     except FileNotFoundError:
-        return [*recipe, f"run_dir={run_dir}", *overrides]
+        return [*recipe, as_override("run_dir", run_dir), *overrides]
     refuse_other_settings(run_dir, overrides)
     if tuned := tuned_by_recipe(run_dir, overrides):
         wanted = cast(RunConfig, compose(config.algorithm, [*overrides, tuned]))
     if RunDirectory(run_dir).finished_env_steps() >= wanted.total_env_steps:
         return None
-    return [*recipe, f"resume={run_dir}", f"total_env_steps={wanted.total_env_steps}"]
+    return [*recipe, as_override("resume", run_dir), f"total_env_steps={wanted.total_env_steps}"]
 
 
 def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
@@ -155,11 +155,13 @@ def settings_of(overrides: Iterable[str]) -> dict[str, Any]:
     """
     values = {}
     for override in map(str, overrides):
+        if (name := override_key(override)) in ("run_dir", "total_env_steps"):
+            continue
         try:
-            values[override_key(override)] = safe_load(override.partition("=")[2])
+            values[name] = safe_load(override.partition("=")[2])
         except YAMLError as error:
             raise ValueError(f"The override {shortened(override)} has no value that can be read.") from error
-    return {name: value for name, value in values.items() if name not in ("run_dir", "total_env_steps")}
+    return values
 
 
 def run(command: list[str], run_dir: Path) -> int:

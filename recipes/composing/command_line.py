@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue
 
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
@@ -87,6 +90,26 @@ def agent_path(name: str) -> Path:
 def override_key(override: str) -> str:
     """The setting that an override is of."""
     return override.partition("=")[0].lstrip("+~")
+
+
+def as_override(name: str, text: str | Path) -> str:
+    """Write a setting that is a text so that hydra reads that text, whatever letters are in it."""
+    plain, quoted = (f"{name}={word}" for word in (text, QuotedString(str(text), Quote.single).with_quotes()))
+    return plain if hydra_takes(plain) and override_value(plain) == str(text) else quoted
+
+
+def override_value(override: str) -> object:
+    """What hydra reads in an override that it takes."""
+    return OverridesParser.create().parse_override(override).value()
+
+
+def hydra_takes(override: str) -> bool:
+    """Whether hydra can read an override."""
+    try:
+        override_value(override)
+    except HydraException:
+        return False
+    return True
 
 
 def merge_overrides(saved: Sequence[str], given: Sequence[str]) -> list[str]:

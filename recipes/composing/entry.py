@@ -14,7 +14,15 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import CONFIG_DIR, follows, override_key, plain_errors, say_error
+from composing.command_line import (
+    CONFIG_DIR,
+    as_override,
+    follows,
+    hydra_takes,
+    override_key,
+    plain_errors,
+    say_error,
+)
 from composing.interruption import INTERRUPTED
 from dreamer_racing.settings import shortened, suggestion
 
@@ -42,7 +50,7 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
         @functools.wraps(function)
         def start() -> None:
             sys.excepthook = sys.__excepthook__  # packages are loaded
-            sys.argv[1:] = [whole_number(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
+            sys.argv[1:] = [readable(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
             with plain_errors():
                 refuse_unknown_settings(sys.argv[1:], name)
@@ -61,14 +69,17 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     return decorate
 
 
-def whole_number(argument: str) -> str:
-    """Return an override with its whole numbers, one or several with commas between, in full digits.
+def readable(argument: str) -> str:
+    """Return an override as hydra reads it.
 
-    Hydra takes 1e6 for a fraction.
+    Whole numbers, one or several with commas between, get all their digits, since hydra takes 1e6 for a fraction; texts
+    are quoted if hydra would refuse a letter in them, unless that has a meaning in lists or is a quote.
     """
     name, equals, value = argument.partition("=")
-    if not equals or override_key(argument) in TEXTS:
+    if not equals:
         return argument
+    if override_key(argument) in TEXTS:
+        return argument if hydra_takes(argument) or set(value) & set(",[]{}'\"") else as_override(name, value)
     return f"{name}={','.join(map(_in_digits, value.split(',')))}"
 
 

@@ -15,7 +15,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from composing.checks import check_overrides
-from composing.command_line import follow_quietly, merge_overrides, override_key, plain_errors, start_logging
+from composing.command_line import (
+    as_override,
+    follow_quietly,
+    merge_overrides,
+    override_key,
+    override_value,
+    plain_errors,
+    start_logging,
+)
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
 from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
@@ -134,7 +142,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     known = saved_config(algorithm, run_dir)
     for override in overrides:
         name, value = override_key(override), override.partition("=")[2]
-        if name == "run_dir" and Path(value.strip("'\"")).absolute() != run_dir:
+        if name == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
             raise ValueError(f"{override}: the run goes on in its own directory, {run_dir}. Leave it out.")
         trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
         if name in TRAINED_ON and OmegaConf.from_dotlist([f"value={value}"]).value != trained:
@@ -142,7 +150,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
                 f"{run_dir} was trained with {name}={trained}, and goes on with it: {override} would be "
                 "another run. Leave it out, or begin anew."
             )
-    merged = merge_overrides([*begun_with(algorithm, run_dir), f"run_dir={run_dir}"], overrides)
+    merged = merge_overrides([*begun_with(algorithm, run_dir), as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
     return config, merged
@@ -170,12 +178,13 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
     left = {"run": directory.path, "best policy": directory.best.path}
     if (evaluation := directory.latest_evaluation()) is not None:
         left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
-    place, longer = shlex.quote(_from_here(directory.path)), 2 * config.total_env_steps
+    place, longer = _from_here(directory.path), 2 * config.total_env_steps
+    given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
     commands = {
-        "evaluate it": f"{command('evaluate')} checkpoint={place} episodes=100",
-        "watch it fly": f"{command('fly')} agent={place}" if is_race(config) else "",
-        "draw it": f"{command('plot')} runs={place} output=figures",
-        "go on": f"{command(config.algorithm)} resume={place} total_env_steps={longer}{_rising(config)}",
+        "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100",
+        "watch it fly": f"{command('fly')} {given['agent']}" if is_race(config) else "",
+        "draw it": f"{command('plot')} {given['runs']} output=figures",
+        "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{_rising(config)}",
     }
     files = {what: _from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)

@@ -23,6 +23,10 @@ from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module
         ("loss.ppo.kl_target=0.02", "loss.ppo.kl_target=0.02"),
         ("run_dir=1e6x", "run_dir=1e6x"),
         ("run_dir=1e6", "run_dir=1e6"),
+        ("resume=null", "resume=null"),
+        ("resume=läufe/k=1 (2)", "resume='läufe/k=1 (2)'"),
+        ("runs=läufe/k1,läufe/k2", "runs=läufe/k1,läufe/k2"),
+        ("run_dir='läufe/k1'", "run_dir='läufe/k1'"),
         ("total_env_steps=1e5,2e5,7", "total_env_steps=100000,200000,7"),
         ("variants.slow=['env.num_envs=4']", "variants.slow=['env.num_envs=4']"),
         ("env.num_envs=1.5e0", "env.num_envs=1.5e0"),
@@ -30,8 +34,16 @@ from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module
         ("seed=1e999999999", "seed=1e999999999"),
     ],
 )
-def test_whole_numbers_may_be_written_short(argument: str, taken: str) -> None:
-    assert recipe_module("composing.entry").whole_number(argument) == taken
+def test_whole_numbers_may_be_written_short_and_paths_as_they_are(argument: str, taken: str) -> None:
+    assert recipe_module("composing.entry").readable(argument) == taken
+
+
+@pytest.mark.parametrize("text", ["runs/a-b_1.2", "läufe/k1", "a,b", "it's", "a\\'b\\", "(x)[y]{z}=1#&", "null", "1e3"])
+def test_any_text_can_be_said_to_hydra(text: str) -> None:
+    command_line = recipe_module("composing.command_line")
+    override = command_line.as_override("run_dir", text)
+    assert command_line.override_value(override) == text
+    assert (override == f"run_dir={text}") is (text == "runs/a-b_1.2")
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.xdist_group("run")  # one worker makes what these tests
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished debug run."""
-    directory = tmp_path_factory.mktemp("runs") / "first run"
+    directory = tmp_path_factory.mktemp("runs") / "first läuf (a=1, b)"
     done = recipe("dreamer_v3", *SMALL, "evaluation.stochastic=true", f"run_dir='{directory}'", cwd=directory.parent)
     assert done.returncode == 0, done.stderr
     assert "device: cpu (device=auto)" in done.stdout and "renderer: " in done.stdout and "GB when full" in done.stdout
@@ -316,9 +316,9 @@ def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
 
 def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
     resumed = recipe_module("composing.launching").resumed_config
-    with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first run\."):
+    with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first läuf \(a=1, b\)\."):
         resumed("dreamer_v3", str(run_dir / "best"), [])
-    with pytest.raises(ValueError, match=r"run_dir=elsewhere: the run goes on in its own directory, .*first run"):
+    with pytest.raises(ValueError, match=r"run_dir=elsewhere: the run goes on in its own directory, .*first läuf"):
         resumed("dreamer_v3", str(run_dir), ["run_dir=elsewhere"])
     best = shutil.copytree(run_dir, tmp_path / "best")  # a run may have any name
     recipe_module("composing.schema").register()
