@@ -68,6 +68,7 @@ class ControlSuiteEnv(EnvBase):
         device: where tensors live; the simulation itself runs on CPU.
         from_pixels: whether there are `pixels`; if not there is a `vector` instead.
         action_repeat: simulator steps that an action lasts; an episode is 1000 simulator steps.
+        episode_steps: actions after which an episode is truncated, where that is sooner; None: nowhere.
         camera: number or name of the task's camera; if None that of the reference.
         image_size: width and height of `pixels`.
         seed: of the worlds; None draws one from the operating system.
@@ -92,12 +93,14 @@ class ControlSuiteEnv(EnvBase):
         camera: int | str | None = None,
         image_size: int = 64,
         seed: int | None = None,
+        episode_steps: int | None = None,
     ) -> None:
         _check_arguments(task, num_envs, action_repeat)
         super().__init__(device=device, batch_size=[num_envs])
         self.task = task
         self.from_pixels = from_pixels
         self.action_repeat = action_repeat
+        self.episode_steps = episode_steps
         self.image_size = image_size
         self.camera = CAMERAS.get(TASKS[task][0], 0) if camera is None else camera
         self.worlds: list[SuiteWorld] = []
@@ -177,7 +180,8 @@ class ControlSuiteEnv(EnvBase):
             self.worlds.append(self._make_world(int(number)))
 
     def _make_world(self, seed: int) -> "SuiteWorld":
-        return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None, self.image_size)
+        limit = None if self.episode_steps is None else self.episode_steps * self.action_repeat
+        return SuiteWorld(self.task, seed, self.camera if self.from_pixels else None, self.image_size, limit)
 
     def state_dict(self) -> dict[str, Any]:
         """What an environment with the same arguments needs to go on exactly as this one would, bit for bit.
@@ -225,6 +229,7 @@ class SuiteWorld:
         seed: of the task's model and episodes.
         camera: number or name of the camera; None for no images.
         image_size: width and height of the images.
+        limit: simulator steps after which an episode is truncated, where that is sooner than the task's time limit.
 
     Attributes:
         action_size: A.
@@ -237,8 +242,11 @@ class SuiteWorld:
         RendererUnavailableError: dm_control has no OpenGL that works here.
     """
 
-    def __init__(self, task: str, seed: int, camera: int | str | None, image_size: int) -> None:
+    def __init__(
+        self, task: str, seed: int, camera: int | str | None, image_size: int, limit: int | None = None
+    ) -> None:
         self.seed = seed
+        self._limit = math.inf if limit is None else limit
         self.env: control.Environment = suite.load(*TASKS[task], task_kwargs={"random": seed})
         self.terminated = self.truncated = False
         self._episode_start = self._random_state()
@@ -279,6 +287,9 @@ class SuiteWorld:
             if time_step.last():
                 self.terminated = time_step.discount == 0.0
                 self.truncated = not self.terminated
+                break
+            if self.env._step_count >= self._limit:
+                self.truncated = True
                 break
         return reward
 

@@ -80,7 +80,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
             f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
             "losses, e.g. loss=reconstruction loss.actor=reinforce."
         )
-    return make_suite(config, num_envs, config.seed)
+    return make_suite(config, num_envs, config.seed, env.episode_steps)
 
 
 def privileged_losses(config: DreamerConfig) -> list[str]:
@@ -92,10 +92,17 @@ def privileged_losses(config: DreamerConfig) -> list[str]:
     return [words for words, loss in chosen.items() if getattr(loss, "reads_privileged", False)]
 
 
-def make_suite(config: RunConfig, num_envs: int, seed: int) -> ControlSuiteEnv:
-    """Make worlds of the Control Suite, to train in or to evaluate."""
+def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:
+    """Make worlds of the Control Suite: to evaluate, or to train in episodes of so many control steps."""
     env = config.env
-    return ControlSuiteEnv(config.task, num_envs, from_pixels=env.from_pixels, image_size=env.image_size, seed=seed)
+    return ControlSuiteEnv(
+        config.task,
+        num_envs,
+        from_pixels=env.from_pixels,
+        image_size=env.image_size,
+        seed=seed,
+        episode_steps=episode_steps,
+    )
 
 
 def make_report(

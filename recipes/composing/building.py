@@ -67,7 +67,7 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.num_envs = num_envs
     if not math.isfinite(config.env.control_rate):
         raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
-    if config.env.episode_steps is None:
+    if config.env.episode_steps is None and is_race(config):
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
         config.env.device = worlds_device(device, config.env)

@@ -67,7 +67,7 @@ def launch(
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
         if tune and config.tuned == "auto":
             overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
-            config = hydra.compose(config.algorithm, overrides)
+            config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
         check_overrides(config, overrides)
         if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
             print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))

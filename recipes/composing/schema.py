@@ -28,7 +28,8 @@ class EnvConfig:
     preset: str = "easy"  # physics: easy | faithful
     num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
     control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
-    episode_steps: int | None = setting(None, COUNT)  # control steps of a training episode; null: those of 20 s
+    # control steps of a training episode; null: those of 20 s, with env=dmc those of the task
+    episode_steps: int | None = setting(None, COUNT)
     # share of training episodes, but for those on a line, that begin behind a gate, to practise turns
     start_beyond_gate: float = setting(0.0, SHARE)
     # share of those that begin neither there nor on a line, that begin in flight before a gate instead of at the start

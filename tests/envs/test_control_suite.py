@@ -99,6 +99,18 @@ def test_time_limit_truncates_after_500_agent_steps_and_never_terminates() -> No
     assert not after["truncated"][:, :-1].any() and not after["terminated"].any()
 
 
+def test_episodes_may_be_shorter_and_a_resumed_one_is_as_long() -> None:
+    env, resumed = (blind(num_envs=2, episode_steps=30) for _ in range(2))
+    after = env.rollout(10)["next"]
+    assert not after["done"].any()
+    resumed.load_state_dict(env.state_dict())
+    action = torch.zeros(2, *env.action_spec.shape[1:])
+    for step in range(11, 31):
+        after = resumed.step(TensorDict({"action": action}, [2]))["next"]
+        assert after["truncated"].all() == after["done"].all() == (step == 30)
+    assert not after["terminated"].any()
+
+
 def test_the_last_action_repeat_of_an_episode_is_cut_short() -> None:
     env = blind(num_envs=1, action_repeat=300)
     assert env.rollout(10).shape == (1, 4)  # 3 x 300 + 100 simulator steps

@@ -148,3 +148,11 @@ def test_ctrl_c_before_anything_is_there_is_no_traceback(tmp_path: Path) -> None
     done = recipe("ppo", "track=circle", "env.from_pixels=false", "run_dir=run", cwd=tmp_path, before=SETTING_UP)
     assert done.returncode == 130, done.stderr
     assert done.stderr.strip().splitlines()[-1] == "interrupted" and "Traceback" not in done.stderr
+
+
+def test_a_configuration_of_ones_own_stays_when_settings_are_chosen_for_it(tmp_path: Path) -> None:
+    """`tuned=auto` composes anew, from the configuration that was named."""
+    own = "defaults: [dreamer_v3, _self_]\nprefill: 123456789\n"
+    (tmp_path / "own.yaml").write_text(own, encoding="utf-8")
+    done = recipe("dreamer_v3", "--config-dir", str(tmp_path), "--config-name", "own", cwd=tmp_path)
+    assert done.returncode == 2 and "prefill=123456789" in done.stderr

@@ -316,7 +316,7 @@ def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
 
 def test_what_is_no_whole_run_is_not_continued(run_dir: Path, tmp_path: Path) -> None:
     resumed = recipe_module("composing.launching").resumed_config
-    with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first läuf \(a=1, b\)\."):
+    with pytest.raises(ValueError, match=r"networks of a run's best evaluation alone: resume=.*first läuf .*b\)\."):
         resumed("dreamer_v3", str(run_dir / "best"), [])
     with pytest.raises(ValueError, match=r"run_dir=elsewhere: the run goes on in its own directory, .*first läuf"):
         resumed("dreamer_v3", str(run_dir), ["run_dir=elsewhere"])
