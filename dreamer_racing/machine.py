@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,26 @@ def check_fits(size: int, device: torch.device | str, setting: str) -> None:
         raise ValueError(
             f"{setting} needs {size / GB:.1f} GB when full, and {device} has {available / GB:.1f} GB left: lower it to "
             f"{100 * available / size:.3g}% of that or less, or keep the records in files with replay.storage=memmap."
+        )
+
+
+def check_space(size: int, folder: Path, setting: str) -> None:
+    """Refuse files that are larger than what is free on the disk: writing them by a memory map would end the process.
+
+    Args:
+        size: bytes, of all of them when full.
+        folder: where; it need not be there yet.
+        setting: what asks for them, as the user wrote it.
+
+    Raises:
+        ValueError: the message gives both numbers and what to change.
+    """
+    place = next(above for above in (folder.absolute(), *folder.absolute().parents) if above.exists())
+    free = shutil.disk_usage(place).free
+    if size > free:
+        raise ValueError(
+            f"{setting} needs {size / GB:.1f} GB of files when full, and {place} has {free / GB:.1f} GB free: lower it "
+            f"to {100 * free / size:.3g}% of that or less, or choose another run_dir=."
         )
 
 

@@ -7,12 +7,20 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from dreamer_racing import machine
-from dreamer_racing.machine import KeptMemory, available_memory, check_fits, keep_freed_memory, out_of_memory_advice
+from dreamer_racing.machine import (
+    KeptMemory,
+    available_memory,
+    check_fits,
+    check_space,
+    keep_freed_memory,
+    out_of_memory_advice,
+)
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,6 +47,13 @@ def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.Monk
     assert "replay.storage=memmap" in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(ValueError, match=r"lower it to 0\.001% of that"):
         check_fits(1_200_000_000_000_000, "cpu", "replay.capacity=7")
+
+
+def test_files_that_the_disk_has_no_room_for_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine.shutil, "disk_usage", lambda place: SimpleNamespace(free=3e9 * (place == tmp_path)))
+    check_space(3_000_000_000, tmp_path / "not" / "there", "replay.capacity=7")
+    with pytest.raises(ValueError, match=r"^replay.capacity=7 needs 6.0 GB .* has 3.0 GB free: .* 50% of .* run_dir="):
+        check_space(6_000_000_000, tmp_path / "not" / "there", "replay.capacity=7")
 
 
 def test_advice_keeps_the_first_line_of_the_error() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import zstandard
@@ -288,7 +288,6 @@ def make_replay(
     batch_length: int,
     device: torch.device | str = "cpu",
     *,
-    storage: Literal["tensor", "memmap"] = "tensor",
     storage_device: torch.device | str | None = None,
     scratch_dir: str | Path | None = None,
     seed: int = 0,
@@ -309,9 +308,8 @@ def make_replay(
         batch_size: B, windows a sample (not records, unlike TorchRL's `SliceSampler`).
         batch_length: T, records a window.
         device: where samples are delivered.
-        storage: ``"tensor"`` keeps records in memory, ``"memmap"`` in files below ``scratch_dir``.
-        storage_device: where ``"tensor"`` keeps them; ``device`` if None.
-        scratch_dir: folder of ``"memmap"``, overwritten; a temporary one, removed at exit, if None.
+        storage_device: in whose memory records are kept; ``device`` if None.
+        scratch_dir: folder in whose files they are kept instead, overwritten; None: nowhere.
         seed: of the sampler's own generator.
         transform: applied to samples, for example `RelabelReward`.
         observation_keys: what of an observation is kept.
@@ -338,7 +336,7 @@ def make_replay(
     if not 0 <= held_out < num_envs:
         raise ValueError(f"held_out={held_out} of num_envs={num_envs} streams: at least one must be left to sample.")
     slots = stream_length * num_envs
-    if storage == "memmap":
+    if scratch_dir is not None:
         records = StreamMemmapStorage(slots, scratch_dir=scratch_dir, existsok=True)
     else:
         records = StreamTensorStorage(slots, device=storage_device or device)

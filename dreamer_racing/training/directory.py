@@ -14,6 +14,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
+from dreamer_racing import parallel
 from dreamer_racing.training.lock import RunLock
 
 logger = logging.getLogger(__name__)
@@ -113,6 +114,11 @@ class RunDirectory:
     def evaluation_file(self) -> Path:
         """Numbers of that evaluation."""
         return self.evaluation / EVALUATION
+
+    @property
+    def replay(self) -> Path:
+        """Folder of this process's replay while the run goes on, with ``replay.storage=memmap``."""
+        return self.path / "replay" / f"{PROCESS}{parallel.rank()}"
 
     @property
     def nonfinite_batch(self) -> Path:

@@ -8,6 +8,7 @@ replay of its own; counters and what is learnt from episodes are of all, and the
 """
 
 import logging
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -226,6 +227,11 @@ class ReplayRun(Run):
             self.metrics.push(metrics)
             self.counters["updates"] += 1
             self.after_update(batch, metrics)
+
+    def close(self) -> None:
+        """Remove files that held the replay, too."""
+        shutil.rmtree(self.directory.replay, ignore_errors=True)
+        super().close()
 
     def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
         """Do what a recipe does with a batch that was learned from."""

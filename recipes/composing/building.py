@@ -33,6 +33,7 @@ from dreamer_racing.learners.saved_dreamer import LossState
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
+    check_space,
     git_commit,
 )
 from dreamer_racing.modules import Interface
@@ -67,7 +68,7 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.num_envs = num_envs
     if not math.isfinite(config.env.control_rate):
         raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
-    if config.env.episode_steps is None and is_race(config):
+    if config.env.episode_steps is None and config.env.suite == "race":
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
         config.env.device = worlds_device(device, config.env)
@@ -155,15 +156,20 @@ def make_run_replay(
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
-    storage_device = settings.device
+    assert config.run_dir is not None, "resolve_common() names it"
+    of_all, asked = parallel.count(), f"replay.capacity={settings.capacity:,}"  # each process has such a replay
+    files = RunDirectory(Path(config.run_dir)).replay if settings.storage is Storage.memmap else None
+    storage_device = settings.device if files is None else "cpu"
     if storage_device == "auto":
         on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
         storage_device = config.device if on_learner else "cpu"
-    where = storage_device if settings.storage is Storage.tensor else "files"
-    if settings.storage is Storage.tensor:
-        check_fits(size, storage_device, f"replay.capacity={settings.capacity:,}")
-    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in memory of {where}")
-    of_all = parallel.count()  # processes, each with a replay like this one
+    if files is None:
+        check_fits(size, storage_device, asked)
+    else:
+        check_space(size * of_all, files, asked)
+        files.mkdir(parents=True, exist_ok=True)
+    where = f"memory of {storage_device}" if files is None else f"files below {files}, until the process ends"
+    print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in {where}")
     print(disk_needed(config, round(size * min(of_all, config.total_env_steps / settings.capacity))))
     return make_replay(
         settings.capacity,
@@ -171,8 +177,8 @@ def make_run_replay(
         batch_size,
         batch_length,
         config.device,
-        storage=settings.storage.value,
         storage_device=storage_device,
+        scratch_dir=files,
         seed=config.seed,
         transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,

@@ -146,7 +146,7 @@ def test_writer_equals_the_reference(num_envs, length, steps, end, seed):
 @pytest.mark.parametrize("storage", ["tensor", "memmap"])
 def test_collector_rollouts_in_every_storage(storage, image_shape, tmp_path):
     rollouts = collect(CountingEnv(3, image_shape=image_shape), steps=7, batches=5)
-    replay = make_replay(60, 3, 4, 5, storage=storage, scratch_dir=tmp_path if storage == "memmap" else None)
+    replay = make_replay(60, 3, 4, 5, scratch_dir=tmp_path if storage == "memmap" else None)
     reference = ReferenceStreams(3, 20)
     for rollout in rollouts:
         replay.extend(rollout)
@@ -324,7 +324,8 @@ def test_terminals_are_sampled_as_often_as_stored():
 
 def test_dump_and_load_continue_the_same_samples(tmp_path):
     rollouts = collect(CountingEnv(3), steps=15, batches=4)
-    replay, restored = make_replay(150, 3, 6, 4, seed=5), make_replay(150, 3, 6, 4, seed=6, storage="memmap")
+    replay = make_replay(150, 3, 6, 4, seed=5)
+    restored = make_replay(150, 3, 6, 4, seed=6, scratch_dir=tmp_path / "maps")
     for rollout in rollouts[:2]:
         replay.extend(rollout)
     replay.sample()

@@ -330,3 +330,15 @@ def test_a_checkpoint_flies_as_it_did_after_its_run_was_made_longer(tmp_path: Pa
         learner, _ = recipe_module("composing.restoring").restore_learner(longer, checkpoint, torch.device("cpu"))
         assert learner.agent.actor.max_std.item() == pytest.approx(0.3)
         assert learner.discount == pytest.approx(discount)
+
+
+def test_records_in_files_lie_in_the_run_directory_as_long_as_the_run_goes_on(tmp_path: Path) -> None:
+    overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "env.num_envs=2"]
+    overrides += ["replay.storage=memmap", "replay.capacity=1000", f"run_dir={tmp_path / 'run'}"]
+    recipe = recipe_module("dreamer_v3")
+    run = recipe.build(OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides))), overrides)
+    run.take_in(next(run.rollouts))
+    files = sorted(path.name for path in (tmp_path / "run" / "replay" / "process-0").rglob("*.memmap"))
+    assert len(run.replay) and {"vector.memmap", "action.memmap", "reward.memmap"} & set(files)
+    run.close()
+    assert not (tmp_path / "run" / "replay" / "process-0").exists()
