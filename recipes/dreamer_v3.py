@@ -110,7 +110,9 @@ class DreamerRun(ReplayRun):
         windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
         if windows is None or not self.counters["updates"]:
             return {}
-        return held_out_metrics(self.learner, windows)
+        self.wait()
+        with self.clock.timed("measure"):
+            return held_out_metrics(self.learner, windows)
 
     def look_at_lag(self) -> None:
         """Every so many env_steps, whatever is logged: see whether the model still knows where its policy flies."""

@@ -30,6 +30,9 @@ class RolloutsAhead(Iterator[TensorDictBase]):
     def begin_at(self, env_steps: int) -> None:
         """Go on with a run that has made so many env_steps."""
 
+    def wait(self) -> None:
+        """Wait until nothing under way draws from this process's random numbers; it is delivered as ever."""
+
     @abstractmethod
     def drain(self) -> TensorDictBase | None:
         """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.

@@ -56,6 +56,11 @@ class OverlappedRollouts(RolloutsAhead):
     def _copy_weights(self) -> None:
         self._acting.load_state_dict(self._policy.state_dict())
 
+    def wait(self) -> None:
+        """Wait for the rollout under way."""
+        if self._next is not None:
+            self._next.exception()  # which `next` raises
+
     def drain(self) -> TensorDictBase | None:
         """Return the rollout under way, if there is one, and begin no other."""
         if self._next is None:

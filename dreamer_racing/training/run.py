@@ -140,6 +140,11 @@ class Run:
     def settle(self) -> None:
         """Take in what is collected already; nothing, unless collection is ahead of learning."""
 
+    def wait(self) -> None:
+        """Wait until nothing else draws from the random numbers of this process, to set them back after a look."""
+        if isinstance(self.rollouts, RolloutsAhead):
+            self.rollouts.wait()
+
     def keep_up(self, progress: Progress) -> None:
         """Evaluate and log if it is due by now; of several processes the first does, and all take note."""
         env_steps = self.counters["env_steps"]
@@ -165,6 +170,7 @@ class Run:
     def evaluate(self) -> str:
         """Evaluate, without a trace in the random numbers of training; return a line on what came of it."""
         self.learner.check_finite()
+        self.wait()
         devices = [self.learner.device] if self.learner.device.type == "cuda" else []
         with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(self.config.seed)
@@ -281,6 +287,9 @@ def collect_and_learn(run: Run, stop: GracefulExit, progress: Progress) -> None:
     minutes = Interval(config.checkpoint.minutes)
     run.learn(None, stop)  # what an interrupted run still owes
     while not stop.requested:
+        if run.at_end:  # so that what is evaluated last is what is saved
+            run.settle()
+            run.learn(None, stop)
         run.keep_up(progress)
         by_steps = run.schedule.due("save", counters["env_steps"])
         by_minutes = parallel.agreed(minutes.due())  # both take note
@@ -298,10 +307,6 @@ def collect_and_learn(run: Run, stop: GracefulExit, progress: Progress) -> None:
             run.take_in(rollout)
         progress.advance(counters["env_steps"])
         run.learn(rollout, stop)
-    if not stop.requested:
-        run.settle()
-        run.learn(None, stop)
-        run.write_row()  # of what settled
 
 
 def graceful_exit() -> GracefulExit:

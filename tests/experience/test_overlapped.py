@@ -93,6 +93,20 @@ def test_who_acts_has_the_weights_from_before_the_last_updates() -> None:
     overlapped.rollouts.close()
 
 
+def test_who_waits_loses_nothing_and_finds_no_one_acting() -> None:
+    overlapped = Overlapped()
+    overlapped.rollouts.wait()
+    arrived = [overlapped.take()]
+    threading.Timer(0.2, overlapped.collector.let_end.release).start()
+    overlapped.rollouts.wait()
+    assert overlapped.collector.ended == 2
+    assert not overlapped.collector.begun.acquire(timeout=0.1), "the next waits to be asked for"
+    overlapped.collector.let_end.release()  # of the third, which the next `take` begins
+    rollout = next(overlapped.rollouts)
+    assert [int(arrived[0]["number"]), int(rollout["number"])] == [0, 1]
+    overlapped.rollouts.close()
+
+
 def test_after_drain_nothing_is_under_way_and_nothing_is_lost() -> None:
     overlapped = Overlapped()
     assert overlapped.rollouts.drain() is None
