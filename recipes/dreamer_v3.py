@@ -81,7 +81,9 @@ class DreamerRun(ReplayRun):
     lag: ModelLag
     passes: PassShare
 
-    remedy: ClassVar[str] = "model.learning_rate, or model.mixed_precision=false"
+    remedy: ClassVar[str] = (
+        "model.learning_rate (of an improvement loss.ppo.learning_rate), or model.mixed_precision=false"
+    )
 
     def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
         """Take note of the gates passed, and of how they were flown, too."""

@@ -134,9 +134,9 @@ class DreamerLearner:
 
         Raises:
             KeyError: If the batch lacks what a loss reads.
-            NonFiniteLossError: If loss, gradient or a reward is not finite. On a CPU no network has been changed by
-                this batch; on a CUDA device this is noticed two updates late, because waiting for the device would
-                stall it.
+            NonFiniteLossError: If loss, gradient or a reward is not finite, also of an actor's improvement, which the
+                error says. On a CPU no network has been changed by it; on a CUDA device this is noticed two updates
+                late, because waiting for the device would stall it.
         """
         batch = batch.to(self.device, non_blocking=True)
         if self._actor_optimizer is not None:
@@ -156,7 +156,8 @@ class DreamerLearner:
                 improved = cast(ActorLoss, self.losses["actor"]).improve(self.updates)
             improved = parallel.averaged(improved)
             if improved:
-                self._guard.check(improved, batch)
+                kept = TensorDict(dict(self.losses["actor"].named_buffers(recurse=False)))
+                self._guard.check(improved, kept, of=" of the actor's improvement")
             metrics |= improved
         self._average()
         return metrics

@@ -13,12 +13,12 @@ class NonFiniteLossError(RuntimeError):
     """The loss, its gradient or a reward became infinite or not a number.
 
     Attributes:
-        batch: The batch that it happened with, ``[B, T]``.
+        batch: What it was computed of: an update's batch ``[B, T]``, or what the actor's loss keeps for improvements.
     """
 
-    def __init__(self, batch: TensorDictBase) -> None:
+    def __init__(self, batch: TensorDictBase, of: str = "") -> None:
         super().__init__(
-            "The loss, its gradient or a reward is not finite: the learning rate may be too high, or a reward or "
+            f"The loss{of}, its gradient or a reward is not finite: the learning rate may be too high, or a reward or "
             "observation is bad."
         )
         self.batch = batch
@@ -54,24 +54,29 @@ class FiniteGuard:
 
     def __init__(self, lag: int) -> None:
         self._lag = lag
-        self._pending: deque[tuple[Flag, TensorDictBase]] = deque()
+        self._pending: deque[tuple[Flag, TensorDictBase, str]] = deque()
 
-    def check(self, metrics: dict[str, Tensor], batch: TensorDictBase) -> None:
+    def check(self, metrics: dict[str, Tensor], batch: TensorDictBase, of: str = "") -> None:
         """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
 
         The loss alone does not tell: two-hot targets are clamped, so that an infinite reward makes it merely large.
+
+        Args:
+            metrics: Scalars by name.
+            batch: What they are of.
+            of: Whose loss it is, as the error says it; the update's if empty.
         """
         watched = [
             value
             for name, value in metrics.items()
             if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
         ]
-        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch))
+        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch, of))
         self.settle(self._lag)
 
     def settle(self, lag: int = 0) -> None:
         """Look at all updates but the latest ``lag``; raise ``NonFiniteLossError`` at the first that was bad."""
         while len(self._pending) > lag:
-            finite, batch = self._pending.popleft()
+            finite, batch, of = self._pending.popleft()
             if not finite:
-                raise NonFiniteLossError(batch)
+                raise NonFiniteLossError(batch, of)

@@ -276,7 +276,8 @@ def test_a_gradient_that_is_not_finite_leaves_the_actor_as_it_was():
         learner.update(make_batch())
     learner.losses["actor"].advantage[0, 0, 0] = math.nan
     before = copy.deepcopy(learner.agent.actor.state_dict())
-    with pytest.raises(NonFiniteLossError):
+    with pytest.raises(NonFiniteLossError, match="of the actor's improvement") as error:
         learner.update(make_batch())
+    assert error.value.batch["advantage"].isnan().any(), "what is kept of it shows why"
     for name, value in learner.agent.actor.state_dict().items():
         assert torch.equal(value, before[name]), name
