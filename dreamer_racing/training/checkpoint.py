@@ -252,18 +252,21 @@ class BestCheckpoint:
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self.score: float | None = None
+        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
+        if parallel.is_first():  # who alone offers, and writes there
+            self._find(env_steps)
+
+    def _find(self, env_steps: int) -> None:
+        """Take up what is kept, unless it is of later flights."""
         with contextlib.suppress(FileNotFoundError, RunCheckpointError):  # the next evaluation replaces a damaged one
             kept = Checkpoint.manifest(newest_sound(self.directory))["metadata"]
             if kept["env_steps"] > env_steps:
                 self._set_aside(kept)
             else:
                 self.score = kept["score"]
-        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
 
     def _set_aside(self, kept: Mapping[str, Any]) -> None:
         """Move away the best of evaluations after the one that the run goes on from."""
-        if not parallel.is_first():
-            return
         aside = self.directory.with_name(self.directory.name + REPLACED)
         shutil.rmtree(aside, ignore_errors=True)
         self.directory.rename(aside)
