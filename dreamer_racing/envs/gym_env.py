@@ -204,14 +204,19 @@ class GymWorlds:
         return info
 
     def frames(self) -> np.ndarray:
-        """The on-board views, uint8 (N, 256, 256, 3); their renderer is made on first use."""
-        worlds = self.worlds
+        """The on-board views, uint8 (N, 256, 256, 3), as each drone sees but for noise; drawn by a renderer of their own.
+
+        It is made on first use.
+        """
+        worlds, looks = self.worlds, self.worlds.simulator.looks
         if self._onboard is None:
             camera = replace(worlds.camera, width=FRAME_SIZE, height=FRAME_SIZE)
             scene = build_scene(worlds.track, worlds.parameters, camera).compile()
-            self._onboard = make_renderer(self.renderer_name, scene, camera, worlds.num_envs, num_workers=1)
+            self._onboard = make_renderer(
+                self.renderer_name, scene, camera, worlds.num_envs, num_workers=1, varied_looks=looks is not None
+            )
         state = worlds.simulator.state
-        return self._onboard.render(state.position, state.attitude).numpy()
+        return self._onboard.render(state.position, state.attitude, None if looks is None else looks.looks).numpy()
 
     def close(self) -> None:
         """Free rendering contexts and threads."""

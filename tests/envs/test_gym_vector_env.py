@@ -47,6 +47,17 @@ def test_vector_spaces_infos_and_frames() -> None:
     envs.close()
 
 
+def test_frames_look_as_what_is_seen() -> None:
+    """With light, colours, lens and tilt of each drone: nearer to its own image than to another's."""
+    envs = make_vec(observation="pixels", render_mode="rgb_array", looks="randomised")
+    seen, _ = envs.reset(seed=0)
+    frames = np.stack([frame.reshape(64, 4, 64, 4, 3).mean((1, 3)) for frame in envs.render()])
+    apart = np.abs(frames[:, None] - seen[None].astype(float)).mean((2, 3, 4))  # (3, 3), frame by image
+    envs.close()
+    assert (apart.argmin(1) == np.arange(3)).all(), apart
+    assert apart.diagonal().max() < 0.5 * apart[~np.eye(3, dtype=bool)].min(), apart
+
+
 def test_autoreset_begins_an_episode_in_the_step_after_its_end() -> None:
     envs = make_vec(observation="both", evaluation=True, max_episode_steps=4)
     start, _ = envs.reset(seed=0)
