@@ -204,7 +204,7 @@ class GymWorlds:
         return info
 
     def frames(self) -> np.ndarray:
-        """The on-board views, uint8 (N, 256, 256, 3), as each drone sees but for noise; drawn by a renderer of their own.
+        """The on-board views, uint8 (N, 256, 256, 3), as each drone sees, but for noise; by a renderer of their own.
 
         It is made on first use.
         """

@@ -1,12 +1,13 @@
 """Where a run acts: the environment that its configuration names, and what comes with it."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
 from composing.schema import DreamerConfig, EnvConfig, RunConfig, is_race
-from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
@@ -16,7 +17,10 @@ from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, find_loss
 from dreamer_racing.training.run import Report
 
-Environment = DroneRacingEnv | ControlSuiteEnv
+if TYPE_CHECKING:
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv
+
+Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
 
 
 def scene_name(config: RunConfig) -> str:
@@ -94,6 +98,8 @@ def privileged_losses(config: DreamerConfig) -> list[str]:
 
 def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:
     """Make worlds of the Control Suite: to evaluate, or to train in episodes of so many control steps."""
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv  # opens a display where it is imported
+
     env = config.env
     return ControlSuiteEnv(
         config.task,

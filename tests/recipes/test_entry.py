@@ -156,3 +156,9 @@ def test_a_configuration_of_ones_own_stays_when_settings_are_chosen_for_it(tmp_p
     (tmp_path / "own.yaml").write_text(own, encoding="utf-8")
     done = recipe("dreamer_v3", "--config-dir", str(tmp_path), "--config-name", "own", cwd=tmp_path)
     assert done.returncode == 2 and "prefill=123456789" in done.stderr
+
+
+def test_a_race_does_without_dm_control_which_opens_a_display(tmp_path: Path) -> None:
+    without = "import sys; sys.modules['dm_control'] = None"
+    done = recipe("dreamer_v3", "model=debug", "total_env_steps=1", cwd=tmp_path, before=without)
+    assert done.returncode == 2 and "prefill" in done.stderr, done.stderr
