@@ -1,4 +1,4 @@
-"""Pictures of races and of learning: PNG, PDF or SVG by the path's suffix.
+"""Pictures of races: PNG, PDF or SVG by the path's suffix.
 
 Everything is drawn on a `matplotlib.figure.Figure` of its own; pyplot and its global state are not touched.
 Shapes: K control steps of an episode.
@@ -7,8 +7,7 @@ Shapes: K control steps of an episode.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from fnmatch import fnmatch
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,12 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import EngFormatter, MultipleLocator
+from matplotlib.ticker import MultipleLocator
 
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track
 from dreamer_racing.evaluation.trajectory import Trajectory
-from dreamer_racing.training.metrics import read_metrics
 
 GATE_COLOR = "#e8590c"
 DECOY_COLOR = "#c2255c"
@@ -48,12 +46,6 @@ SPEED_COLORS: Colormap = LinearSegmentedColormap.from_list(
 ARROW_INTERVAL = 0.1  # s between camera arrows
 ARROW_LENGTH = 0.6  # m
 NOTE_LETTERS = 14  # of a note beside a figure, an inch of its width
-
-DEFAULT_PANELS: dict[str, tuple[str, ...]] = {
-    "Return": ("episode/return", "evaluation/return_mean"),
-    "Gates per episode": ("episode/gates_passed", "evaluation/gates_per_episode"),
-    "Losses": ("loss", "loss_*", "loss/*"),
-}
 
 
 def speed_scale(trajectories: Sequence[Trajectory]) -> Normalize:
@@ -104,42 +96,6 @@ def draw_track(axes: Axes, track: Track, labels: bool = True) -> None:
     dress_map(axes, "y (m)" if labels else None)
     if labels:
         axes.set_xlabel("x (m)")
-
-
-def plot_curve(
-    metrics_csv: str | Path,
-    path: str | Path,
-    columns: Mapping[str, Sequence[str]] | None = None,
-    title: str | None = None,
-) -> None:
-    """Draw learning curves over `env_steps` from a run's `metrics.csv`, one panel above the other.
-
-    Args:
-        metrics_csv: the file.
-        path: the file to write; missing folders are made.
-        columns: for each panel its title and its columns, in which `*` stands for anything; None for return, gates per
-            episode and losses. Panels without a column in the file are left out.
-        title: above the picture.
-
-    Raises:
-        ValueError: the file has no rows, or none of the columns.
-    """
-    table = read_metrics(metrics_csv).columns
-    wanted = columns or DEFAULT_PANELS
-    found = {name: _match(table, patterns) for name, patterns in wanted.items()}
-    panels = {name: matches for name, matches in found.items() if matches}
-    if not panels:
-        patterns = ", ".join(pattern for patterns in wanted.values() for pattern in patterns)
-        raise ValueError(f"{metrics_csv} has no values for any of: {patterns}. It has: {', '.join(table)}.")
-    figure = Figure(figsize=(8.0, 0.6 + 2.1 * len(panels)), layout="constrained")
-    stack = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, matches) in zip(stack, panels.items(), strict=True):
-        _draw_curves(axes, name, {column: table[column] for column in matches})
-    stack[-1].set(xlabel="env_steps", xlim=(0.0, max(steps[-1] for steps, _ in table.values()) or 1.0))
-    stack[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
-    if title:
-        figure.suptitle(title, x=0.02, ha="left", fontsize=11, color=INK)
-    save(figure, path)
 
 
 def save(figure: Figure, path: str | Path, left_out: Sequence[str] = ()) -> None:
@@ -301,36 +257,3 @@ def flight_legend(decoys: bool, crash: bool) -> list[Line2D]:
     handles.append(Line2D([], [], color=INK, marker=r"$\rightarrow$", linestyle="", markersize=12, label="camera"))
     handles.append(Line2D([], [], color=MUTED, linestyle=(0, (5, 3)), linewidth=1.0, label="bounding box"))
     return handles
-
-
-def _match(names: Mapping[str, object], patterns: Sequence[str]) -> list[str]:
-    return [name for name in names if any(fnmatch(name, pattern) for pattern in patterns)]
-
-
-def _draw_curves(axes: Axes, title: str, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Draw a panel's columns; a long noisy one faintly, under its running mean."""
-    for index, (name, (steps, values)) in enumerate(curves.items()):
-        color = f"C{index}"
-        window = len(values) // 50
-        marker = "o" if len(values) < 3 else ""
-        if window > 1:
-            axes.plot(steps, values, color=color, alpha=0.25, linewidth=0.8)
-        axes.plot(steps, _smooth(values, window), color=color, linewidth=1.6, marker=marker, markersize=3, label=name)
-    values = np.concatenate([values for _, values in curves.values()])
-    if len(curves) > 1:
-        axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.03))
-        sizes = [np.median(np.abs(values)) for _, values in curves.values()]
-        if max(sizes) > 50 * min(sizes):
-            axes.set_yscale("log" if values.min() > 0 else "symlog")
-    if values.min() >= 0 > axes.get_ylim()[0]:
-        from_zero(axes, least=0.0 if values.any() else 1.0)
-    axes.set_title(title, loc="left", fontsize=10, color=INK)
-    dress(axes)
-
-
-def _smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Centred running mean; near the ends over what there is."""
-    if window < 2:
-        return values
-    kernel = np.ones(window)
-    return np.convolve(values, kernel, mode="same") / np.convolve(np.ones_like(values), kernel, mode="same")

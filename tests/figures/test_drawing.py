@@ -17,7 +17,7 @@ from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation.trajectory import Trajectory
-from dreamer_racing.figures.drawing import _smooth, camera_directions, draw_track, plot_curve
+from dreamer_racing.figures.drawing import camera_directions, draw_track
 from dreamer_racing.figures.film import top_down_frames
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.training.metrics import read_metrics
@@ -146,17 +146,6 @@ def write_metrics(path, rows: int = 200):
     return path
 
 
-def test_curves_of_a_run(tmp_path, figures):
-    metrics = write_metrics(tmp_path / "metrics.csv")
-    plot_curve(metrics, tmp_path / "curve.png", title="a run")
-    panels = figures[0].axes
-    assert [axes.get_title(loc="left") for axes in panels] == ["Return", "Losses"]  # no gates in this file
-    assert panels[-1].get_xlabel() == "env_steps"
-    np.testing.assert_array_equal(panels[0].lines[-1].get_xdata(), np.arange(1, 200, 2) * 1000)
-    plot_curve(metrics, tmp_path / "other.svg", columns={"Mine": ["oth*"]})
-    assert [axes.get_title(loc="left") for axes in figures[1].axes] == ["Mine"]
-
-
 def test_empty_and_non_finite_cells_are_left_out(tmp_path):
     table = read_metrics(write_metrics(tmp_path / "metrics.csv", rows=4)).columns
     assert list(table) == ["episode/return", "loss", "loss_actor", "other"]
@@ -164,28 +153,9 @@ def test_empty_and_non_finite_cells_are_left_out(tmp_path):
     assert table["loss_actor"][0].tolist() == [1000, 2000, 3000]
 
 
-def test_curves_of_nothing_are_refused(tmp_path):
-    metrics = write_metrics(tmp_path / "metrics.csv")
-    with pytest.raises(ValueError, match=r"bogus.*It has: episode/return, loss"):
-        plot_curve(metrics, tmp_path / "curve.png", columns={"Mine": ["bogus"]})
+def test_metrics_of_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match="nothing was logged"):
-        plot_curve(write_metrics(tmp_path / "metrics.csv", rows=0), tmp_path / "curve.png")
-
-
-@pytest.mark.parametrize("values", [[0.0], [0.0, 0.0, 0.0], [3.0, 0.0]])
-def test_curves_of_what_is_never_negative_do_not_go_below_zero(tmp_path, figures, values):
-    rows = [f"{1000 * index},{value}\n" for index, value in enumerate(values)]
-    (tmp_path / "metrics.csv").write_text("env_steps,episode/gates_passed\n" + "".join(rows))
-    plot_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
-    (axes,) = figures[0].axes
-    assert axes.get_xlim()[0] == axes.get_ylim()[0] == 0.0
-    assert axes.get_ylim()[1] >= max(*values, 1.0) and axes.get_xlim()[1] == max(1.0, 1000.0 * (len(values) - 1))
-
-
-def test_running_mean_keeps_constants_and_ends():
-    np.testing.assert_allclose(_smooth(np.full(10, 3.0), 4), 3.0)
-    np.testing.assert_allclose(_smooth(np.arange(5.0), 3), [0.5, 1, 2, 3, 3.5])
-    np.testing.assert_allclose(_smooth(np.arange(3.0), 0), [0, 1, 2])
+        read_metrics(write_metrics(tmp_path / "metrics.csv", rows=0))
 
 
 def test_pyplot_is_not_touched():
