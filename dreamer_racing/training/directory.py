@@ -139,10 +139,6 @@ class RunDirectory:
         """
         return RunLock(ensure_writable(self.path))
 
-    def latest_checkpoint(self) -> Path:
-        """As the function of that name."""
-        return latest_checkpoint(self.path)
-
     def mark_finished(self, env_steps: int) -> None:
         """Note that all is done."""
         replace_text(self.finished, json.dumps({"env_steps": env_steps}) + "\n")

@@ -29,7 +29,7 @@ from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.machine import KeptMemory
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
 from dreamer_racing.training.journal import Interval, Schedule
@@ -193,7 +193,7 @@ class Run:
     def last_good(self) -> str:
         """Which checkpoint is left when training breaks off."""
         try:
-            return f"the last good checkpoint is {self.directory.latest_checkpoint()}"
+            return f"the last good checkpoint is {latest_checkpoint(self.directory.path)}"
         except FileNotFoundError:
             return "there is no checkpoint yet"
 
