@@ -25,6 +25,7 @@ import numpy as np
 from measuring import print_table, write_json
 
 from dreamer_racing.envs import control_suite as dmc
+from dreamer_racing.envs import dm_control_gl
 
 TASKS = ("cartpole_swingup", "walker_walk", "reacher_easy", "cheetah_run", "ball_in_cup_catch", "finger_spin",
          "hopper_hop", "quadruped_walk", "humanoid_walk")  # fmt: skip
@@ -94,7 +95,7 @@ def measure(task: str, size: int, frames: int, parts: dict[str, dict[str, float]
     return [
         {
             "benchmark": "control_suite", "task": task, "way": name, "image_size": size, "frames": frames,
-            "opengl": dmc._render.BACKEND, "dm_control": importlib.metadata.version("dm-control"),
+            "opengl": dm_control_gl.BACKEND, "dm_control": importlib.metadata.version("dm-control"),
             "frames_per_s": float(1 / np.quantile(wall[name], 0.1)), "cpu_ms": cpu_ms[name],
             "times": cpu_ms["physics.render"] / cpu_ms[name], "mean": float(np.mean(differences[name])),
             "worst": float(np.mean(differences[name], (1, 2, 3)).max()), "max": int(np.max(differences[name])),

@@ -31,20 +31,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from dreamer_racing.envs.dm_control_gl import open_camera  # before dm_control
+
+# isort: split
+import mujoco as mujoco_bindings
 import numpy as np
 import torch
+from dm_control import mujoco, suite
+from dm_control.rl import control
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
-
-from dreamer_racing.envs.dm_control_env import _choose_gl_backend
-from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
-
-_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
-
-import mujoco as mujoco_bindings  # noqa: E402 - decides by MUJOCO_GL as it is imported
-from dm_control import _render, mujoco, suite  # noqa: E402
-from dm_control.rl import control  # noqa: E402
 
 TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
 """Domain and task of the suite by the name `domain_task`."""
@@ -350,16 +347,7 @@ class SuiteWorld:
         for name, per_pixel in DETAIL.items():
             enough = int(per_pixel * max(image_size, 64))
             setattr(model.vis.quality, name, min(enough, getattr(model.vis.quality, name)))
-        try:
-            return mujoco.Camera(self.env.physics, image_size, image_size, camera)
-        except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
-            raise RendererUnavailableError(
-                f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
-                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "
-                "libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before "
-                "dreamer_racing, MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. Without images: "
-                "from_pixels=False."
-            ) from error
+        return open_camera(self.env.physics, image_size, image_size, camera)
 
     def _random_state(self) -> dict[str, Any]:
         state = self.env.task.random.get_state(legacy=False)

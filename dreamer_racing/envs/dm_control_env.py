@@ -18,14 +18,18 @@ Shapes: P physics steps per control step. SI units.
 """
 
 import collections
-import ctypes
-import os
-import sys
 from typing import Any
 
+from dreamer_racing.envs.dm_control_gl import open_camera  # before dm_control
+
+# isort: split
 import mujoco as mujoco_bindings
 import numpy as np
 import torch
+from dm_control import mujoco
+from dm_control.mujoco import wrapper
+from dm_control.rl import control
+from dm_control.suite import base
 from dm_env import specs
 from torch import Tensor
 
@@ -35,40 +39,9 @@ from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, R
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
-
-
-def _choose_gl_backend() -> None:
-    """Without a display, point dm_control to a headless OpenGL library before it settles for a windowing one.
-
-    dm_control decides when it is imported, and takes GLFW even where GLFW cannot open a window. A `MUJOCO_GL` that
-    is set already is left alone.
-    """
-    if "MUJOCO_GL" in os.environ or not sys.platform.startswith("linux"):
-        return
-    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        return
-    usable = (name for name, libraries in GL_LIBRARIES.items() if any(_loads(library) for library in libraries))
-    os.environ["MUJOCO_GL"] = next(usable, "disable")
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
-
-
-_choose_gl_backend()  # before dm_control is imported, which decides then: hence imports below code
-
-from dm_control import _render, mujoco  # noqa: E402
-from dm_control.mujoco import wrapper  # noqa: E402
-from dm_control.rl import control  # noqa: E402
-from dm_control.suite import base  # noqa: E402
 
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
 
@@ -248,16 +221,7 @@ class OnboardView:
     """
 
     def __init__(self, physics: Physics, camera: Camera) -> None:
-        try:
-            self._camera = mujoco.Camera(physics, camera.height, camera.width, CAMERA_NAME)
-        except Exception as error:  # GLFW, PyOpenGL and MuJoCo each raise their own
-            raise RendererUnavailableError(
-                f"dm_control cannot draw with {_render.BACKEND or 'no OpenGL library'}, which it chose when it was "
-                f"imported ({type(error).__name__}: {error}). Without a display it needs EGL (Debian: apt-get install "
-                "libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6), and, where dm_control is imported before "
-                "dreamer_racing, MUJOCO_GL=egl or MUJOCO_GL=osmesa in the environment. DroneRacingEnv and the "
-                "Gymnasium environments can draw without OpenGL."
-            ) from error
+        self._camera = open_camera(physics, camera.height, camera.width, CAMERA_NAME)
         self._camera.option.geomgroup[:] = 0
         self._camera.option.geomgroup[HALL_GROUP] = 1
         self._camera.option.sitegroup[:] = 0

@@ -14,6 +14,7 @@ from torchrl.envs import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs import dm_control_env as task_module
+from dreamer_racing.envs import dm_control_gl
 from dreamer_racing.envs.dm_control_env import OnboardView, load
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause
@@ -359,9 +360,9 @@ def test_headless_backend_choice(
         monkeypatch.delenv(name)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(task_module.sys, "platform", "linux")
-    monkeypatch.setattr(task_module.ctypes, "CDLL", open_library)
-    task_module._choose_gl_backend()
+    monkeypatch.setattr(dm_control_gl.sys, "platform", "linux")
+    monkeypatch.setattr(dm_control_gl.ctypes, "CDLL", open_library)
+    dm_control_gl.choose_backend()
     assert os.environ.get("MUJOCO_GL") == chosen
 
 
