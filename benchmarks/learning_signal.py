@@ -38,7 +38,7 @@ from composing.schema import DreamerConfig
 
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.losses import ActorLoss, FlownPPOActorLoss, PPOActorLoss, imagine
+from dreamer_racing.losses import FlownPPOActorLoss, PPOActorLoss, imagine
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
@@ -93,7 +93,7 @@ def measure(checkpoint: Path, updates: int, pairs: int) -> Iterator[dict[str, An
     for record in compare_windows(learner, long.sample()):
         yield {**where, "measured": "windows", **record}
     del long
-    if isinstance(learner.losses["actor"], FlownPPOActorLoss):
+    if isinstance(learner.actor_loss, FlownPPOActorLoss):
         print("gradient, drift: not measured, an actor that learns from what it flies does not learn from a replay")
         return
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
@@ -183,7 +183,7 @@ def starts_of(learner: DreamerLearner, replay: StreamReplay, number: int) -> tup
 
 def gradient_noise(learner: DreamerLearner, replay: StreamReplay, number: int) -> dict[str, float]:
     """Compare gradients from independent starts."""
-    loss, actor = cast(ActorLoss, learner.losses["actor"]).eval(), learner.agent.actor
+    loss, actor = learner.actor_loss.eval(), learner.agent.actor
     parameters = list(actor.parameters())
     gradients = []
     for _ in range(GRADIENTS):

@@ -5,14 +5,12 @@ Shapes: W windows of T records, C context records, H horizon, F features.
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.losses import ActorLoss, imagine
+from dreamer_racing.losses import imagine
 from dreamer_racing.modules.world_model import join_features
 
 SEEN = 16
@@ -111,7 +109,7 @@ def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], hori
     model = learner.agent.world_model
     features = imagine(model.rssm, learner.agent.actor, *start, horizon).features[1:]  # (H, W, F)
     continuation = model.continue_head.probability(features).squeeze(-1)  # (H, W)
-    if not cast(ActorLoss, learner.losses["actor"]).continuation:
+    if not learner.actor_loss.continuation:
         continuation = torch.ones_like(continuation)
     reached = torch.cat((torch.ones_like(continuation[:1]), continuation[:-1])).cumprod(0)
     reward = model.reward_head.mean(features).squeeze(-1) * reached

@@ -23,7 +23,7 @@ from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optim
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_optimizers, check_saved, load_parameters, own_state
-from dreamer_racing.losses import WORLD_MODEL_LOSSES, ActorLoss, LossConfig, find_loss, make_losses
+from dreamer_racing.losses import ActorLoss, LossConfig, WorldModelLoss, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys, set_number
 from dreamer_racing.losses.imagination import choose_starts
@@ -36,7 +36,6 @@ from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import check_settings
 
-ACTOR_NUMBERS = ("horizon", "discount", "continuation")
 """What is read off an actor's loss, as `ActorLoss` has it."""
 
 
@@ -70,8 +69,8 @@ class DreamerLearner:
         optimizer: torch.optim.Optimizer,
         config: LearnerConfig | None = None,
     ) -> None:
-        if lacking := [name for name in ACTOR_NUMBERS if not hasattr(losses["actor"], name)]:
-            raise ValueError(f"{type(losses['actor']).__name__} lacks {', '.join(lacking)}, which an actor's loss has.")
+        if not isinstance(losses["actor"], ActorLoss):
+            raise ValueError(f"{type(losses['actor']).__name__} is no ActorLoss: subclass that.")
         self.config = config or LearnerConfig()
         self.agent = agent
         self.losses = nn.ModuleDict(losses)
@@ -86,7 +85,7 @@ class DreamerLearner:
         self.actor_waits = False
         self.updates = 0
         self._networks = trained_parameters(agent, losses)
-        self._actor_optimizer: torch.optim.Optimizer | None = getattr(losses["actor"], "optimizer", None)
+        self._actor_optimizer = losses["actor"].optimizer
         self._rates = [group["lr"] for group in self._groups]
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
         if self.config.compile:
@@ -100,19 +99,24 @@ class DreamerLearner:
         return list(nn.ModuleList(kept).parameters())
 
     @property
+    def actor_loss(self) -> ActorLoss:
+        """The actor's."""
+        return cast(ActorLoss, self.losses["actor"])
+
+    @property
     def discount(self) -> float:
         """γ of the actor's loss, as it is now; reading it waits for the device."""
-        return float(cast(ActorLoss, self.losses["actor"]).discount)
+        return float(self.actor_loss.discount)
 
     @property
     def imagines(self) -> bool:
-        """Whether updates imagine; an actor's loss of one's own that does not say does."""
-        return getattr(self.losses["actor"], "imagines", True)
+        """Whether updates imagine."""
+        return self.actor_loss.imagines
 
     @property
     def horizon(self) -> int:
         """H, imagined actions from each start."""
-        return cast(ActorLoss, self.losses["actor"]).horizon
+        return self.actor_loss.horizon
 
     @property
     def size(self) -> ModelSize:
@@ -140,7 +144,7 @@ class DreamerLearner:
         """
         batch = batch.to(self.device, non_blocking=True)
         if self._actor_optimizer is not None:
-            cast(ActorLoss, self.losses["actor"]).prepare(self._number_of_starts(batch))
+            self.actor_loss.prepare(self._number_of_starts(batch))
         metrics = self._backward(batch, timed) if self._graph is None else self._graph(batch)
         if parallel.count() > 1:
             metrics = self._of_all_processes(metrics, timed)
@@ -153,10 +157,10 @@ class DreamerLearner:
         self.updates += 1
         if self._actor_optimizer is not None and not self.actor_waits:
             with timed("improve"), self.autocast():
-                improved = cast(ActorLoss, self.losses["actor"]).improve(self.updates)
+                improved = self.actor_loss.improve(self.updates)
             improved = parallel.averaged(improved)
             if improved:
-                kept = TensorDict(dict(self.losses["actor"].named_buffers(recurse=False)))
+                kept = TensorDict(dict(self.actor_loss.named_buffers(recurse=False)))
                 self._guard.check(improved, kept, of=" of the actor's improvement")
             metrics |= improved
         self._average()
@@ -164,8 +168,7 @@ class DreamerLearner:
 
     def watch(self, rollout: TensorDictBase) -> None:
         """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights."""
-        if isinstance(loss := self.losses["actor"], ActorLoss):  # one of one's own need not care
-            loss.watch(rollout)
+        self.actor_loss.watch(rollout)
 
     def _average(self) -> None:
         """Move the averaged weights; while there are few updates they are the plain mean of all."""
@@ -293,7 +296,7 @@ class DreamerLearner:
 
     def judge(self) -> Judge:
         """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
-        return getattr(self.losses["actor"], "judge", None) or self._judge_latents
+        return getattr(self.actor_loss, "judge", None) or self._judge_latents
 
     @torch.no_grad()
     def _judge_latents(self, acted: TensorDictBase) -> Tensor:
@@ -417,7 +420,7 @@ def make_dreamer(
     losses, config = losses or LossConfig(), config or LearnerConfig()
     check_settings(losses)
     check_settings(config)
-    decodes = find_loss(WORLD_MODEL_LOSSES, losses.world_model).decodes
+    decodes = find_loss(WorldModelLoss, losses.world_model).decodes
     with seeded(seed):
         agent = Agent(get_size(size), interface or Interface(), decodes, losses.min_std, losses.max_std).to(device)
         modules = make_losses(agent, losses, horizon)

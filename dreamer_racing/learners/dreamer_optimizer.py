@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from dreamer_racing.learners.dreamer_config import LearnerConfig
+from dreamer_racing.losses import ActorLoss
 from dreamer_racing.modules.agent import Agent
 
 ParameterGroups = list[dict[str, Any]]
@@ -26,7 +27,8 @@ def make_optimizer(agent: Agent, losses: Mapping[str, LossModule], config: Learn
 
     networks = trained_parameters(agent, losses)
     rate = config.learning_rate
-    actor = [] if getattr(losses["actor"], "optimizer", None) is not None else networks["actor"]
+    stepped_by_loss = isinstance(loss := losses["actor"], ActorLoss) and loss.optimizer is not None
+    actor = [] if stepped_by_loss else networks["actor"]
     groups: ParameterGroups = [
         {"params": networks["world_model"], "lr": rate},
         {"params": actor + networks["critic"], "lr": config.behavior_learning_rate or rate},

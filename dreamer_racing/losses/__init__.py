@@ -1,14 +1,14 @@
 """Losses of the DreamerV3 learner, each a TorchRL ``LossModule`` that also works alone.
 
-A loss is chosen by name in ``LossConfig``. To add one, put a class with ``from_config(agent, config)`` under a new
-name; it must read and write the keys that the class it replaces documents. See ``docs/losses.md``.
+A loss is chosen by name in ``LossConfig``. To add one, put a subclass of ``WorldModelLoss``, ``ActorLoss`` or
+``CriticLoss`` under a new name; it must read and write the keys that the class it replaces documents. See
+``docs/losses.md``.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from torchrl.objectives import LossModule
 
@@ -29,16 +29,7 @@ from dreamer_racing.losses.representation import (
 from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
 from dreamer_racing.modules.agent import Agent
 
-T = TypeVar("T")
-
-
-class LossClass(Protocol):
-    """A loss that can be made of an agent and numbers."""
-
-    def from_config(self, agent: Agent, config: LossConfig, **own: Any) -> LossModule:
-        """Make the loss of an agent with the losses' numbers; an actor's is given its ``horizon`` too."""
-        ...
-
+Loss = TypeVar("Loss", bound=LossModule)
 
 WORLD_MODEL_LOSSES: dict[str, type[WorldModelLoss]] = {
     "reconstruction": ReconstructionLoss,
@@ -47,37 +38,43 @@ WORLD_MODEL_LOSSES: dict[str, type[WorldModelLoss]] = {
     "decoder_free": DecoderFreeLoss,
     "reward_only": WorldModelLoss,
 }
-ACTOR_LOSSES: dict[str, LossClass] = {
+ACTOR_LOSSES: dict[str, type[ActorLoss]] = {
     "reinforce": ReinforceLoss,
     "dynamics": DynamicsActorLoss,
     "ppo": PPOActorLoss,
     "flown_ppo": FlownPPOActorLoss,
     "asymmetric_ppo": AsymmetricPPOActorLoss,
 }
-CRITIC_LOSSES: dict[str, LossClass] = {"two_hot": CriticLoss}
+CRITIC_LOSSES: dict[str, type[CriticLoss]] = {"two_hot": CriticLoss}
 
 
-def find_loss(registry: Mapping[str, T], name: str) -> T:
+def find_loss(kind: type[Loss], name: str) -> type[Loss]:
     """Return the class registered under a name, or found in a module.
 
     Args:
-        registry: ``WORLD_MODEL_LOSSES``, ``ACTOR_LOSSES`` or ``CRITIC_LOSSES``.
-        name: Key of the registry, or ``module:Class`` of a loss of your own.
+        kind: ``WorldModelLoss``, ``ActorLoss`` or ``CriticLoss``.
+        name: In the registry of its kind, or ``module:Class`` of a loss of your own.
 
     Raises:
-        ValueError: If no loss has that name; the message lists those that exist.
+        ValueError: If no loss has that name, where the message lists those that exist; or if it is none of that kind.
     """
+    registries: dict[Any, dict] = {
+        WorldModelLoss: WORLD_MODEL_LOSSES,
+        ActorLoss: ACTOR_LOSSES,
+        CriticLoss: CRITIC_LOSSES,
+    }
     module, colon, attribute = name.partition(":")
     if colon:
         try:
-            return getattr(importlib.import_module(module), attribute)
+            found = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"Loss {name!r}, given as module:Class, cannot be imported: {error}.") from error
-    if name not in registry:
-        raise ValueError(
-            f"Unknown loss {name!r}. Known here: {', '.join(registry)}; a loss of your own is given as module:Class."
-        )
-    return registry[name]
+    elif (found := registries[kind].get(name)) is None:
+        known = ", ".join(registries[kind])
+        raise ValueError(f"Unknown loss {name!r}. Known here: {known}; a loss of your own is given as module:Class.")
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise ValueError(f"Loss {name!r} is no {kind.__name__}: subclass that, or its nearest child.")
+    return found
 
 
 def make_losses(agent: Agent, config: LossConfig, horizon: int = HORIZON) -> dict[str, LossModule]:
@@ -92,13 +89,13 @@ def make_losses(agent: Agent, config: LossConfig, horizon: int = HORIZON) -> dic
         ``world_model``, ``actor`` and ``critic``, as ``DreamerLearner`` takes them.
 
     Raises:
-        ValueError: If there is no loss of a name.
+        ValueError: As ``find_loss``.
     """
     device = next(agent.parameters()).device
-    losses = {
-        "world_model": find_loss(WORLD_MODEL_LOSSES, config.world_model).from_config(agent, config),
-        "actor": find_loss(ACTOR_LOSSES, config.actor).from_config(agent, config, horizon=horizon),
-        "critic": find_loss(CRITIC_LOSSES, config.critic).from_config(agent, config),
+    losses: dict[str, LossModule] = {
+        "world_model": find_loss(WorldModelLoss, config.world_model).from_config(agent, config),
+        "actor": find_loss(ActorLoss, config.actor).from_config(agent, config, horizon=horizon),
+        "critic": find_loss(CriticLoss, config.critic).from_config(agent, config),
     }
     return {name: loss.to(device) for name, loss in losses.items()}
 
@@ -117,7 +114,6 @@ __all__ = [
     "FlownPPOActorLoss",
     "Imagination",
     "InformedLoss",
-    "LossClass",
     "LossConfig",
     "PPOActorLoss",
     "PrivilegedLoss",

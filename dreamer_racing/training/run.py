@@ -231,7 +231,7 @@ class ReplayRun(Run):
                 batch = self.replay.sample()
             metrics = self.learner.update(batch, self.clock.timed)
             self.metrics.push(metrics)
-            self.counters["updates"] += 1
+            self.counters["updates"] = self.learner.updates
             self.after_update(batch, metrics)
 
     def close(self) -> None:

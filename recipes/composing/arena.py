@@ -14,7 +14,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Evaluable
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
 from dreamer_racing.training.run import Report
 
 if TYPE_CHECKING:
@@ -90,10 +90,10 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
 def privileged_losses(config: DreamerConfig) -> list[str]:
     """Which losses of a run read the simulator's state, as on the command line."""
     chosen: dict[str, Any] = {
-        f"loss.world_model={config.loss.world_model}": find_loss(WORLD_MODEL_LOSSES, config.loss.world_model),
-        f"loss.actor={config.loss.actor}": find_loss(ACTOR_LOSSES, config.loss.actor),
+        f"loss.world_model={config.loss.world_model}": find_loss(WorldModelLoss, config.loss.world_model),
+        f"loss.actor={config.loss.actor}": find_loss(ActorLoss, config.loss.actor),
     }
-    return [words for words, loss in chosen.items() if getattr(loss, "reads_privileged", False)]
+    return [words for words, loss in chosen.items() if loss.reads_privileged]
 
 
 def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:

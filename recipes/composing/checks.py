@@ -32,7 +32,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import TrackError, load_track
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
-from dreamer_racing.losses import ACTOR_LOSSES, ActorPPOConfig, LossConfig, find_loss
+from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss, ActorPPOConfig, LossConfig, find_loss
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
@@ -270,7 +270,7 @@ def check_imagination(config: DreamerConfig) -> None:
         ValueError: the message names the settings.
     """
     model, share = config.model, config.replay.recent_share
-    if not getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True):
+    if not find_loss(ActorLoss, config.loss.actor).imagines:
         unread = {f"loss.{name}": (getattr(config.loss, name), getattr(LossConfig, name)) for name in OF_IMAGINATION}
         for name, (own, default) in {"model.imagine_recent": (model.imagine_recent, False), **unread}.items():
             if own != default:
@@ -386,8 +386,7 @@ def check_wait(config: DreamerConfig) -> None:
 
 def steps_alone(actor_loss: str) -> bool:
     """Whether the actor of a loss of this name learns in improvements of its own."""
-    loss = find_loss(ACTOR_LOSSES, actor_loss)
-    return isinstance(loss, type) and issubclass(loss, ClippedActorLoss)
+    return issubclass(find_loss(ActorLoss, actor_loss), ClippedActorLoss)
 
 
 def check_image_size(image_size: int, size: str) -> None:

@@ -17,7 +17,7 @@ from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
 from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
 from dreamer_racing.learners.learner import Learner
 from dreamer_racing.learners.saved_dreamer import check_size
-from dreamer_racing.losses import WORLD_MODEL_LOSSES, find_loss
+from dreamer_racing.losses import WorldModelLoss, find_loss
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -56,7 +56,7 @@ def size_of(config: DreamerConfig) -> ModelSize:
 
 def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
     """Make the networks of a resolved configuration, with initial weights from torch's generator."""
-    decodes = find_loss(WORLD_MODEL_LOSSES, config.loss.world_model).decodes
+    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 

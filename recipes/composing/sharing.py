@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from composing.checks import steps_alone
 from composing.schema import DreamerConfig
 from dreamer_racing import parallel
-from dreamer_racing.losses import ACTOR_LOSSES, find_loss
+from dreamer_racing.losses import ActorLoss, find_loss
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
 OF_IMPROVEMENTS = ("loss.ppo.flown", "loss.ppo.minibatch")
@@ -105,7 +105,7 @@ def check_captured(config: DreamerConfig) -> None:
 
 def imagines(config: DreamerConfig | DictConfig) -> bool:
     """Whether the actor's loss does."""
-    return getattr(find_loss(ACTOR_LOSSES, config.loss.actor), "imagines", True)
+    return find_loss(ActorLoss, config.loss.actor).imagines
 
 
 def _own_device(device: str) -> str:

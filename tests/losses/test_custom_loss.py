@@ -12,7 +12,15 @@ import pytest
 import torch
 
 from dreamer_racing.learners.dreamer import make_dreamer
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES, LossConfig, find_loss, kl_losses
+from dreamer_racing.losses import (
+    ACTOR_LOSSES,
+    CRITIC_LOSSES,
+    WORLD_MODEL_LOSSES,
+    ActorLoss,
+    LossConfig,
+    find_loss,
+    kl_losses,
+)
 from dreamer_racing.losses.contract import set_number
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
@@ -112,8 +120,12 @@ def test_page_names_every_loss_and_key():
 def test_a_loss_is_found_in_a_module_of_ones_own(tmp_path, monkeypatch):
     (tmp_path / "my_losses.py").write_text("from dreamer_racing.losses import ReinforceLoss as MyLoss\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert find_loss(ACTOR_LOSSES, "my_losses:MyLoss") is ACTOR_LOSSES["reinforce"]
+    assert find_loss(ActorLoss, "my_losses:MyLoss") is ACTOR_LOSSES["reinforce"]
     with pytest.raises(ValueError, match="'my_losses:Other', given as module:Class, cannot be imported"):
-        find_loss(ACTOR_LOSSES, "my_losses:Other")
+        find_loss(ActorLoss, "my_losses:Other")
     with pytest.raises(ValueError, match=r"Unknown loss 'mine'. Known here: reinforce, dynamics"):
-        find_loss(ACTOR_LOSSES, "mine")
+        find_loss(ActorLoss, "mine")
+    (tmp_path / "my_critics.py").write_text("from dreamer_racing.losses import CriticLoss as Mine\nThis = 3\n")
+    for name in ("my_critics:Mine", "my_critics:This"):
+        with pytest.raises(ValueError, match=f"Loss '{name}' is no ActorLoss: subclass that"):
+            find_loss(ActorLoss, name)
