@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 from composing.arena import worlds_of
-from composing.command_line import AGENTS, plain_errors, start_logging
-from composing.drawing import stage_name
+from composing.command_line import AGENTS, agent_path, plain_errors, start_logging
+from composing.drawing import run_of, stage_name
 from composing.entry import recipe
 from composing.restoring import restore
 from composing.schema import EvaluateConfig
@@ -132,7 +132,7 @@ def locate(setting_name: str, place: str) -> Path | str:
     path = Path(place)
     if path.is_file():
         return path
-    if is_agent(path) or (path.name == place and is_agent(AGENTS / place)):
+    if is_agent(agent_path(place)):
         return place
     if not path.exists():
         there = ", ".join(agents_in(AGENTS)) or "none"
@@ -159,13 +159,9 @@ def stored_flights(folder: Path) -> list[Path]:
 def read(file: Path) -> Source:
     """Read a stored flight with its track; run and evaluation are its title."""
     trajectory, track = read_flight(file)
-    folder = file.absolute().parent
-    if folder.name == RunDirectory(folder).evaluations.name:
-        folder = folder.parent
-    if folder.name.startswith(RunDirectory(folder).evaluation.name):  # of recipes/evaluate.py, in the run
-        folder = folder.parent
+    folder = run_of(file)
     stage = "" if file.name == f"{STORED[0]}{NUMBERS}" else f", {stage_name(file)}"
-    return Source(ShownFlight(f"{folder.name}{stage}", trajectory), load_track(track), folder)
+    return Source(ShownFlight(f"{folder.name}{stage}", trajectory), track, folder)
 
 
 def fly(place: str, config: DashboardConfig) -> Source:

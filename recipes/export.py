@@ -92,15 +92,17 @@ def export(config: ExportConfig) -> None:
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     about = describe(config, trained, checkpoint, step, contract) if config.agent else None
+    if about:
+        (output.parent / AGENT).unlink(missing_ok=True)  # of an earlier agent, whose files are replaced now
     deviation = export_actor(step, contract, flight, output, config.seed, about is not None, config.parts)
-    print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, no latent flipped")
+    print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, latents alike")
     for name, value in deviation.items():
         print(f"largest deviation of an action, {name} from torch: {value:.1e}")
-    measure(step, flight, output, config.parts)
     names = [*(file["name"] for file in read_contract(output.parent / CONTRACT)["files"].values()), CONTRACT]
     if about:
         write_agent(output.parent, trained, about)
         names += [CONFIG, AGENT]
+    measure(step, flight, output, config.parts)
     size = sum((output.parent / name).stat().st_size for name in names)
     print(f"written to {output.parent}: {', '.join(names)} ({size / 1e6:.2f} MB)")
 
@@ -217,14 +219,17 @@ def read_evaluation(
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is of other weights or another track; the message says how to make one.
+        ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
     """
-    path = Path(config.evaluation or RunDirectory(results_of(checkpoint)).evaluation_file)
+    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint)))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
-    written = json.loads(path.read_text())
-    made = written["provenance"]
+    try:
+        written = json.loads(path.read_text(encoding="utf-8"))
+        made = written["provenance"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
     if made["track"] != trained.track:
@@ -234,9 +239,15 @@ def read_evaluation(
     return {**{name: made[name] for name in names}, **statistics}
 
 
+def newest_evaluation(folder: Path) -> Path:
+    """Return the numbers that were written last of a run's evaluations, each of which has a folder of its own."""
+    first = RunDirectory(folder).evaluation_file
+    there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
+    return max(there, key=lambda path: path.stat().st_mtime, default=first)
+
+
 def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:
     """Write configuration and agent.json, the latter last: with it the folder is an agent."""
-    (folder / AGENT).unlink(missing_ok=True)
     env = replace(trained.env, device="cpu")
     OmegaConf.save(
         OmegaConf.structured(replace(trained, run_dir=None, resume=None, device="auto", env=env)), folder / CONFIG

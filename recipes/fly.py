@@ -142,7 +142,6 @@ def check_display(config: FlyConfig) -> None:
 class PlannedFlight:
     """A race that is about to be flown."""
 
-    track: str | Track  # as it was named
     env: DroneRacingEnv
     fly: Callable[..., Evaluation]  # one episode of all laps; takes further arguments of `evaluate`
 
@@ -161,7 +160,7 @@ def fly(config: FlyConfig) -> None:
     flight.env.close()
     laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
     print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-    write(Path(config.run_dir), flight.track, result)
+    write(Path(config.run_dir), flight.env.track, result)
 
 
 def watch(config: FlyConfig) -> None:
@@ -200,9 +199,9 @@ def pilots_flight(config: FlyConfig) -> PlannedFlight:
         env = DroneRacingEnv(config.track or TRACK, 1, preset=preset, seed=config.seed, **worlds)
     print(f"{pilot} pilot on {env.track.name}, {env.track.laps} laps, physics: {preset}")
     if pilot in KINDS:
-        return PlannedFlight(config.track or TRACK, env, partial(fly_by_hand, pilot, env))
+        return PlannedFlight(env, partial(fly_by_hand, pilot, env))
     policy = PILOTS[pilot](env.track, env.worlds.parameters)
-    return PlannedFlight(config.track or TRACK, env, partial(evaluate, env, policy, episodes=1))
+    return PlannedFlight(env, partial(evaluate, env, policy, episodes=1))
 
 
 def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
@@ -234,15 +233,17 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     course = Course(restored.flyer.evaluation_policy(), worlds, num_envs=1)
-    return PlannedFlight(worlds["track"], course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
+    return PlannedFlight(course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
 
 
-def write(directory: Path, named: str | Track, result: Evaluation) -> None:
+def write(directory: Path, track: Track, result: Evaluation) -> None:
     """Write numbers, plot and, of flights with images, video and GIF, and say where."""
-    track, trajectory = load_track(named), result.trajectories[0]
+    trajectory = result.trajectories[0]
     (directory / EVALUATION).write_text(result.to_json())
-    stored = write_flight(directory / "flight", trajectory, track.name if isinstance(named, Track) else named)
+    stored = write_flight(directory / "flight", trajectory, track)
     plot_top_down(track, trajectory, directory / "top_down.png")
+    for earlier in ("onboard.mp4", "onboard.gif"):
+        (directory / earlier).unlink(missing_ok=True)  # that it is not taken for this flight's
     files = f"{directory}: {EVALUATION}, {', '.join(stored)}, top_down.png"
     if trajectory.pixels is None:
         print(f"{'files':<18} {files} (there is no video: the agent sees numbers)")

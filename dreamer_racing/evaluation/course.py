@@ -45,10 +45,9 @@ class Course:
         self._env = with_memory(self.base, policy.make_primer())
 
     def evaluate(self, episodes: int, deterministic: bool = True, **recording: Any) -> Evaluation:
-        """Fly so many episodes; ``recording`` are arguments of ``evaluate``, recorded to their ends if it says none."""
+        """Fly so many episodes; ``recording`` are arguments of ``evaluate``."""
         self._policy.deterministic = deterministic
         self.base.worlds.seed(self._seed)
-        recording = {"max_recorded_steps": self.base.worlds.race.episode_steps, **recording}
         return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), episodes, **recording)
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ Shapes: N environments, K steps of an episode, A action (4).
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -221,7 +222,7 @@ def evaluate(
     *,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     num_trajectories: int = 1,
-    max_recorded_steps: int = 1000,
+    max_recorded_steps: int | None = None,
     record_pixels: bool = True,
     judge: Judge | None = None,
     on_episode: Callable[[int, int], None] | None = None,
@@ -239,7 +240,7 @@ def evaluate(
         episodes: how many.
         exploration_type: what TorchRL's probabilistic policies return: mode or sample.
         num_trajectories: the first episode of this many environments is recorded.
-        max_recorded_steps: a recording stops here, K at most.
+        max_recorded_steps: a recording stops here, K at most; None: at the end of the episode.
         record_pixels: whether recordings keep images, 12 KB a step.
         judge: what says the value of each recorded state, after the policy has acted on it; None: recordings have none.
         on_episode: is told after each step in which one ended how many have, and of how many.
@@ -267,7 +268,8 @@ def evaluate(
     with set_exploration_type(exploration_type):
         tensordict = env.reset()
         recorded = min(num_trajectories, num_envs, episodes)
-        recorder = TrajectoryRecorder(tensordict, recorded, max_recorded_steps, record_pixels)
+        longest = math.inf if max_recorded_steps is None else max_recorded_steps
+        recorder = TrajectoryRecorder(tensordict, recorded, longest, record_pixels)
         action = torch.zeros(env.action_spec.shape, device=env.device)
         while any(len(done) < share for done, share in zip(flown, shares, strict=True)):
             if on_step:

@@ -6,6 +6,7 @@ Shapes: N environments, M of them recorded, K steps of an episode, A action (4).
 from __future__ import annotations
 
 import csv
+import json
 import os
 import zipfile
 import zlib
@@ -21,6 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.tracks import Track, describe_track, load_track, read_track
 
 FINISHED, TIMEOUT = "finished", "timeout"
 CRASHES = tuple(cause.name.lower() for cause in CrashCause if cause is not CrashCause.NONE)
@@ -102,7 +104,7 @@ class TrajectoryRecorder:
         pixels: whether to keep images too, where there are any.
     """
 
-    def __init__(self, root: TensorDictBase, count: int, max_steps: int, pixels: bool = True) -> None:
+    def __init__(self, root: TensorDictBase, count: int, max_steps: float, pixels: bool = True) -> None:
         self._max_steps = max_steps
         self._pixels = pixels
         self._rows: dict[str, list[Tensor]] = defaultdict(list)  # each (M, ...)
@@ -167,7 +169,7 @@ class TrajectoryRecorder:
         return value[: len(self._running)].to("cpu", copy=True)
 
 
-def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> None:
+def write_trajectory(path: str | Path, trajectory: Trajectory, track: str | Path | Track) -> None:
     """Write an episode as CSV: a row an observation, K + 1 of them, the action beside the one it was taken at.
 
     So is the value, where a critic judged. Images are left out; every other number is kept to the last bit. Lines with
@@ -176,7 +178,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> No
     Args:
         path: the file; missing folders are made.
         trajectory: the episode.
-        track: name or YAML file of its track.
+        track: what it was flown on, as `load_track` takes it; the file holds all of it.
     """
     fields = [getattr(trajectory, name).reshape(len(trajectory.position), -1).tolist() for name in STATE]
     steps, names = trajectory.action, [f"a{index}" for index in range(trajectory.action.shape[1])]
@@ -186,7 +188,8 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> No
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     partial = Path(path).with_name(f".{Path(path).name}.partial")
     with partial.open("w", newline="", encoding="utf-8") as file:
-        head = (track, repr(trajectory.control_dt), trajectory.outcome or "none")
+        course = json.dumps(describe_track(load_track(track)))
+        head = (course, repr(trajectory.control_dt), trajectory.outcome or "none")
         file.writelines(f"# {name}: {value}\n" for name, value in zip(HEAD, head, strict=True))
         if trajectory.camera_tilt is not None:
             file.write(f"# {TILT}: {trajectory.camera_tilt!r}\n")
@@ -198,7 +201,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, track: str) -> No
     os.replace(partial, path)
 
 
-def read_trajectory(path: str | Path) -> tuple[Trajectory, str]:
+def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
     """Read what `write_trajectory` wrote.
 
     Returns:
@@ -206,6 +209,7 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, str]:
 
     Raises:
         ValueError: this is no such file, or it was cut short.
+        TrackError: its track cannot be flown; or, in a file of before tracks were in it, is not there any more.
         OSError: it cannot be read.
     """
     text = Path(path).read_text(encoding="utf-8", errors="replace")
@@ -241,16 +245,27 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, str]:
         value=steps[:, -1] if judged else None,
         camera_tilt=tilt,
     )
-    return trajectory, head["track"]
+    return trajectory, _read_track(head["track"], path)
 
 
-def write_flight(stem: str | Path, trajectory: Trajectory, track: str) -> list[str]:
+def _read_track(text: str, path: str | Path) -> Track:
+    """Read a track that a file holds, or, in older ones, names."""
+    if not text.startswith("{"):
+        return load_track(text)
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{path} holds no track: {error}.") from error
+    return read_track(content, str(path))
+
+
+def write_flight(stem: str | Path, trajectory: Trajectory, track: str | Path | Track) -> list[str]:
     """Write an episode with its images: `<stem>_trajectory.csv` and, of one that has some, `<stem>_onboard.npz`.
 
     Args:
         stem: folder and beginning of both files' names.
         trajectory: the episode.
-        track: name or YAML file of its track.
+        track: what it was flown on, as `load_track` takes it.
 
     Returns:
         The files' names.
@@ -266,7 +281,7 @@ def write_flight(stem: str | Path, trajectory: Trajectory, track: str) -> list[s
     return [numbers.name, images.name]
 
 
-def read_flight(path: str | Path) -> tuple[Trajectory, str]:
+def read_flight(path: str | Path) -> tuple[Trajectory, Track]:
     """Read what `write_flight` or `write_trajectory` wrote.
 
     Args:

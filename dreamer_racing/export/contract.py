@@ -43,8 +43,8 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
             "parameters": sum(parameter.numel() for parameter in step.parameters()),
         },
         "latent": step.latent,
-        "inputs": _describe(step.example_inputs()),
-        "outputs": _describe(outputs),
+        "inputs": _describe(step.example_inputs(), size.sampled),
+        "outputs": _describe(outputs, size.sampled),
         "feedback": {"h": "h_next", "z": "z_next", "previous_action": "action"},
         "reset": (
             "At the first step of an episode set is_init to true: h, z and previous_action are then ignored and "
@@ -74,7 +74,7 @@ _MEANINGS = {
     "image_u8": "what the nose camera sees now: (1, height, width, RGB)",
     "vector": "what the drone knows now, instead of an image",
     "h": "deterministic state (belief) after the step before",
-    "z": "stochastic state after the step before: one-hots of (latents, classes), flattened",
+    "z": "stochastic state after the step before, of (latents, classes), flattened: ",
     "previous_action": "the action of the step before",
     "is_init": "whether this is the first step of an episode",
     "noise": "uniform numbers in [0, 1), fresh at every step, one for each class of each latent: "
@@ -85,13 +85,14 @@ _MEANINGS = {
 }
 
 
-def _describe(tensors: Mapping[str, Tensor]) -> list[dict[str, Any]]:
+def _describe(tensors: Mapping[str, Tensor], sampled: bool) -> list[dict[str, Any]]:
+    states = "one-hots" if sampled else "probabilities"
     return [
         {
             "name": name,
             "shape": list(value.shape),
             "type": str(value.dtype).removeprefix("torch."),
-            "meaning": _MEANINGS[name],
+            "meaning": _MEANINGS[name] + (states if name == "z" else ""),
         }
         for name, value in tensors.items()
     ]

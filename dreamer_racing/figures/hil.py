@@ -13,7 +13,6 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
-from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.trajectory import Trajectory, read_trajectory
 from dreamer_racing.figures.drawing import CRASH_COLOR, INK, MUTED, dress, save
 from dreamer_racing.figures.flights import NamedFlight, plot_flights
@@ -114,7 +113,7 @@ def _read_other(path: Path) -> NamedFlight:
         if not path.is_file():
             raise FileNotFoundError(f"against={path}: there is no such file.")
         simulated, track = read_trajectory(path)
-        return NamedFlight(f"simulated ({path.stem})", load_track(track), simulated)
+        return NamedFlight(f"simulated ({path.stem})", track, simulated)
     flight = read_flown(path)
     flown = trajectory_of(flight)
     if flown is None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.policy_memory import with_memory
-from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
 from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
@@ -58,8 +57,6 @@ class EvaluationReport:
         self.on_episode: Callable[[int, int], None] | None = None
         self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
-        track = worlds["track"]
-        self._track = track.name if isinstance(track, Track) else str(track)  # what `load_track` takes
         self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, min(num_envs, episodes))
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
@@ -96,7 +93,7 @@ class EvaluationReport:
             folder.mkdir(parents=True, exist_ok=True)
         (into.evaluations / f"{name}.json").write_text(json.dumps(result.to_dict(), indent=2))
         trajectory = result.trajectories[0]
-        write_flight(into.evaluations / name, trajectory, self._track)
+        write_flight(into.evaluations / name, trajectory, self._course.base.track)
         plot_top_down(self._course.base.track, trajectory, into.plots / f"{name}.png")
         if trajectory.pixels is None:
             return

@@ -84,7 +84,8 @@ def new_run_dir(recipe: str, track: str) -> Path:
 
 def agent_path(name: str) -> Path:
     """The folder of an agent that ships, by its name; else the path that the name is."""
-    return AGENTS / name if (AGENTS / name).is_dir() else Path(name)
+    named = AGENTS / name
+    return named if Path(name).name == name and (named / "agent.json").is_file() else Path(name)
 
 
 def override_key(override: str) -> str:

@@ -1,11 +1,12 @@
 """What `recipes/plot.py` draws, and an experiment at its end: figures of what runs have stored."""
 
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from composing.schema import PlotConfig
-from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
@@ -136,12 +137,14 @@ def draw_imagined(config: PlotConfig, output: Path, runs: list[RunData], problem
     """Make a grid, a video and a small GIF of three stages of training of each curve's first seed that has dreams."""
     if config.dreams:
         return draw_dreams("imagined", {Path(file): Dream.load(file) for file in config.dreams}, [], output)
-    files, missing = [], []
+    files, missing, names = [], [], Counter[str]()
     for run in first_of_each_curve(runs):
         stages, left_out = stages_of_training(run)
         missing += left_out
         if stages:
-            files += draw_dreams(f"imagined_{run.name}", stages, left_out, output).files
+            names[run.name] += 1  # runs of two experiments may be called alike
+            name = f"imagined_{run.name}" + (f"_{names[run.name]}" if names[run.name] > 1 else "")
+            files += draw_dreams(name, stages, left_out, output).files
     return Drawn(files, missing)
 
 
@@ -205,8 +208,15 @@ def stored_flights(run: RunData, which: str) -> list[Path]:
 def named_flight(file: str | Path) -> NamedFlight:
     """Read a flight with its track; the run's and the evaluation's names are its title."""
     trajectory, track = read_trajectory(file)
-    run = RunDirectory.of(Path(file).absolute()).path.name
-    return NamedFlight(f"{run}, {stage_name(file)}", load_track(track), trajectory)
+    return NamedFlight(f"{run_of(file).name}, {stage_name(file)}", track, trajectory)
+
+
+def run_of(file: str | Path) -> Path:
+    """Return the folder whose name says who flew: a run's, also of what an evaluation left in it, or a flight's."""
+    folder = Path(file).absolute().parent
+    if folder.name == RunDirectory(folder).evaluations.name:
+        folder = folder.parent
+    return folder.parent if re.fullmatch(r"evaluation(_\d+)?", folder.name) else folder
 
 
 def stage_name(file: str | Path) -> str:

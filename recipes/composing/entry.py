@@ -72,14 +72,16 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
 def readable(argument: str) -> str:
     """Return an override as hydra reads it.
 
-    Whole numbers, one or several with commas between, get all their digits, since hydra takes 1e6 for a fraction; texts
-    are quoted if hydra would refuse a letter in them, unless that has a meaning in lists or is a quote.
+    Whole numbers, one or several with commas between, get all their digits, since hydra takes 1e6 for a fraction; of
+    texts a ~ at the beginning is the user's home, and they are quoted if hydra would refuse a letter in them, unless
+    that has a meaning in lists or is a quote.
     """
     name, equals, value = argument.partition("=")
     if not equals:
         return argument
     if override_key(argument) in TEXTS:
-        return argument if hydra_takes(argument) or set(value) & set(",[]{}'\"") else as_override(name, value)
+        known = hydra_takes(argument) or set(value) & set(",[]{}'\"")
+        return argument if known else as_override(name, os.path.expanduser(value))
     return f"{name}={','.join(map(_in_digits, value.split(',')))}"
 
 

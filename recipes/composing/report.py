@@ -30,10 +30,11 @@ class DrawFigures(Callback):
         print(f"figures: {place}/figures")
         try:
             draw(PlotConfig(str(place), output=f"{place}/figures", quantities=list(DRAWN), axis=self._axis))
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             print(f"figures: none, {error}")
-        notes = sorted((place / FAILURES).glob("*.txt"))
-        for note in notes:
-            print(f"failed: {note.stem}: {note.read_text(encoding='utf-8').strip()}")
-        if notes:
-            raise SystemExit(1)
+        finally:  # of all other errors hydra makes a warning
+            notes = sorted((place / FAILURES).glob("*.txt"))
+            for note in notes:
+                print(f"failed: {note.stem}: {note.read_text(encoding='utf-8').strip()}")
+            if notes:
+                raise SystemExit(1)

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 
 from composing.arena import Environment, make_env, worlds_device
-from composing.command_line import AGENTS
+from composing.command_line import AGENTS, agent_path
 from composing.devices import choose_device
 from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
 from composing.saved import trained_config
@@ -38,6 +38,9 @@ from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
 from dreamer_racing.training.pass_share import PassShare
+
+BEGUN = ".begun"
+"""File by which a process claims a folder for what it is about to measure."""
 
 
 @dataclass
@@ -138,11 +141,9 @@ def find_trained(name: str) -> Path:
     Raises:
         FileNotFoundError: there is neither; the message names the agents that ship.
     """
-    named = AGENTS / name
-    if Path(name).name == name and is_agent(named):
-        return named
-    if is_agent(name):
-        return Path(name).absolute()
+    path = agent_path(name)
+    if is_agent(path):
+        return path.absolute()
     try:
         return newest_sound(name, ("learner", "counters"))
     except FileNotFoundError as error:
@@ -169,14 +170,27 @@ def fresh_directory(path: str | Path, result: str) -> Path:
         path: the folder asked for.
         result: name of the file that is written last.
     """
-    directory, number = Path(path), 1
-    while directory.is_dir() and any(directory.iterdir()):
+    asked = directory = Path(path).expanduser()
+    number = 1
+    while not _claimed(directory):
         number += 1
-        directory = Path(f"{path}_{number}")
+        directory = asked.with_name(f"{asked.name}_{number}")
     if number > 1:
-        held = f"an earlier {result}" if (Path(path) / result).exists() else f"files, but no {result}"
-        print(f"{path} holds {held}, which is kept: writing to {directory}")
-    return ensure_writable(directory)
+        held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
+        print(f"{asked} holds {held}, which is kept: writing to {directory}")
+    return directory.absolute()
+
+
+def _claimed(directory: Path) -> bool:
+    """Claim a folder that holds nothing, for this process alone; return whether it could."""
+    if directory.is_dir() and any(directory.iterdir()):
+        return False
+    ensure_writable(directory)
+    try:
+        (directory / BEGUN).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
 def heading(title: str, provenance: dict[str, Any]) -> str:

@@ -55,10 +55,20 @@ def test_a_flight_comes_back_exactly(tmp_path, outcome):
     before.linear_velocity[-1, 0] = math.inf
     write_trajectory(tmp_path / "new" / "flight.csv", before, "figure8_decoys")
     after, track = read_trajectory(tmp_path / "new" / "flight.csv")
-    assert (track, after.control_dt, after.outcome, after.pixels) == ("figure8_decoys", 0.02, outcome, None)
+    assert track == load_track("figure8_decoys")
+    assert (after.control_dt, after.outcome, after.pixels) == (0.02, outcome, None)
     for name in ("position", "attitude", "linear_velocity", "target_gate", "action"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=0, atol=0, equal_nan=True)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["flight.csv"]
+
+
+def test_a_track_that_was_changed_since_is_drawn_as_it_was_flown(tmp_path):
+    mine = replace(load_track("circle"), name="kidney", laps=2)  # called as another, as an edited copy may be
+    write_trajectory(tmp_path / "flight.csv", random_flight(), mine)
+    assert read_trajectory(tmp_path / "flight.csv")[1] == mine
+    lines = (tmp_path / "flight.csv").read_text().splitlines()
+    (tmp_path / "old.csv").write_text("\n".join(["# track: figure8", *lines[1:]]) + "\n")  # as before
+    assert read_trajectory(tmp_path / "old.csv")[1] == load_track("figure8")
 
 
 def test_value_and_images_come_back_with_the_flight(tmp_path):
@@ -66,7 +76,7 @@ def test_value_and_images_come_back_with_the_flight(tmp_path):
     before = replace(before, value=torch.randn(60), camera_tilt=12.5)
     assert write_flight(tmp_path / "one", before, "circle") == ["one_trajectory.csv", "one_onboard.npz"]
     after, track = read_flight(tmp_path / "one_trajectory.csv")
-    assert (track, after.camera_tilt, after.outcome) == ("circle", 12.5, "ground")
+    assert (track.name, after.camera_tilt, after.outcome) == ("circle", 12.5, "ground")
     for name in ("action", "value", "pixels"):
         assert torch.equal(getattr(after, name), getattr(before, name)), name
     assert read_trajectory(tmp_path / "one_trajectory.csv")[0].pixels is None

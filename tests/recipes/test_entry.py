@@ -25,6 +25,7 @@ from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module
         ("run_dir=1e6", "run_dir=1e6"),
         ("resume=null", "resume=null"),
         ("resume=läufe/k=1 (2)", "resume='läufe/k=1 (2)'"),
+        ("resume=~/k1", f"resume={Path.home()}/k1"),
         ("runs=läufe/k1,läufe/k2", "runs=läufe/k1,läufe/k2"),
         ("run_dir='läufe/k1'", "run_dir='läufe/k1'"),
         ("total_env_steps=1e5,2e5,7", "total_env_steps=100000,200000,7"),
