@@ -22,8 +22,17 @@ from composing.schema import EvaluateConfig, register
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import load_track
-from dreamer_racing.evaluation.protocol import CONDITIONS, EPISODES, MODES, PRESETS, Result, results_table, run_protocol
+from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.evaluation.protocol import (
+    CONDITIONS,
+    EPISODES,
+    MODES,
+    PRESETS,
+    Result,
+    check_conditions,
+    results_table,
+    run_protocol,
+)
 from dreamer_racing.figures.film import onboard_beside_map, write_video
 from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
@@ -46,7 +55,7 @@ def main(config: DictConfig) -> None:
         settings = cast(EvaluateConfig, OmegaConf.to_object(config))
         check(settings)
         restored = restore(settings)
-        StartSampler(load_track(restored.trained.track), start_noise=settings.start_noise)  # refuses what cannot be
+        refuse_races(settings, load_track(worlds_of(restored.trained)["track"]))
         directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
@@ -77,6 +86,18 @@ def check(config: EvaluateConfig) -> None:
         raise ValueError(
             f"start_noise={config.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."
         )
+
+
+def refuse_races(config: EvaluateConfig, track: Track) -> None:
+    """Refuse races that a track leaves no room for.
+
+    Raises:
+        ValueError: the message says which.
+    """
+    if config.protocol == "full":
+        check_conditions(CONDITIONS, track, config.seed)
+    else:
+        StartSampler(track, start_noise=config.start_noise)
 
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dreamer_racing.envs.drone import parameters
+from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
 from dreamer_racing.evaluation.course import Course
@@ -151,6 +152,20 @@ def run_protocol(
                     if share
                 ]
                 yield Result(preset, condition.name, mode, races[0]["track"], Evaluation.join(parts))
+
+
+def check_conditions(conditions: Sequence[Condition], track: Track, seed: int) -> None:
+    """Refuse conditions that a track leaves no room for, before any is flown.
+
+    Raises:
+        ValueError: the message names the condition.
+    """
+    for condition in conditions:
+        try:
+            for race in condition.races(track, seed):
+                StartSampler(race["track"], start_noise=race["start_noise"])
+        except ValueError as error:
+            raise ValueError(f"condition {condition.name} cannot be flown on {track.name}: {error}") from error
 
 
 def fly(

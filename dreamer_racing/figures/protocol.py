@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Evaluation, Trajectory
+from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation, Trajectory
 from dreamer_racing.evaluation.protocol import MODES, Result
 from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight
 from dreamer_racing.figures.drawing import (
@@ -95,16 +95,21 @@ def plot_conditions(results: Sequence[Result], path: str | Path, title: str | No
     labels = [f"{condition.replace('_', ' ')}\n{preset}" for preset, condition in places]
     gates.set_xticks(range(len(places)), labels, fontsize=8)
     success.legend(frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 1.16))
-    _note(figure, "Lines: 95 % interval over n episodes (Wilson's of success, the normal one of mean gates).")
+    _note(figure, "Lines: 95 % interval over n different flights (Wilson's of success, normal of mean gates).")
     _save(figure, path, title)
 
 
 def _success(evaluation: Evaluation) -> Bar:
-    return share_bar([episode.outcome == FINISHED for episode in evaluation.episodes])
+    return share_bar([episode.outcome == FINISHED for episode in _distinct(evaluation)])
 
 
 def _gates(evaluation: Evaluation) -> Bar:
-    return mean_bar([episode.gates_passed for episode in evaluation.episodes])
+    return mean_bar([episode.gates_passed for episode in _distinct(evaluation)])
+
+
+def _distinct(evaluation: Evaluation) -> list[Episode]:
+    """Leave out repetitions: where nothing is drawn at random, every episode of a track is the same flight."""
+    return list({repr(episode): episode for episode in evaluation.episodes}.values())
 
 
 def plot_crashes(flown: Mapping[str, Evaluation], path: str | Path, title: str | None = None) -> None:

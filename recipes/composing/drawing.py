@@ -52,10 +52,11 @@ def draw(config: PlotConfig) -> None:
     output = ensure_writable(config.output)
     places = config.runs if isinstance(config.runs, list) else [config.runs]
     if [Path(str(place)).suffix for place in places] == [".csv"]:
+        refuse_for_curves(config)
         draw_curves(read_curves(places[0]), output)
         print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
-    explicit = config.figure != "all" and (config.flights or config.dreams)
+    explicit = {"trajectories": config.flights, "imagined": config.dreams}.get(config.figure)
     asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
     columns = {column for figure in asked for column in figure.columns(config)}
     runs, problems = ([], []) if explicit else read_runs(find_runs(places), columns)
@@ -64,6 +65,23 @@ def draw(config: PlotConfig) -> None:
         draw_all(config, output, runs, problems)
     elif not draw_one(config.figure, config, output, runs, problems):
         raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
+
+
+def refuse_for_curves(config: PlotConfig) -> None:
+    """Refuse, with a file of curves, what only runs can be drawn with.
+
+    Raises:
+        ValueError: the message names the setting.
+    """
+    names = ("quantities", "axis", "aggregate", "window", "flights", "dreams")
+    given = [name for name in names if getattr(config, name) != getattr(PlotConfig(), name)]
+    if config.figure not in ("all", "learning_curves"):
+        given.append("figure")
+    if given:
+        raise ValueError(
+            f"{', '.join(f'{name}=' for name in given)}: runs={config.runs} is a file of curves, which is drawn as it "
+            "is. Leave it out, or name runs."
+        )
 
 
 def check_plot(config: PlotConfig) -> None:

@@ -23,6 +23,7 @@ from dreamer_racing.evaluation.protocol import (
     MODES,
     PRESETS,
     Condition,
+    check_conditions,
     crashes_in_words,
     fly,
     results_table,
@@ -132,9 +133,21 @@ def test_table_and_plots(tmp_path, figures):
     success, gates = figures[0].axes
     for axes in (success, gates):
         assert axes.get_ylim()[0] == 0.0  # nobody finished, no gate was passed
-        assert [note.get_text() for note in axes.texts] == [f"{'0%' if axes is success else '0.00'}\nn = 2"] * 4
+        words = "0%" if axes is success else "0.00"
+        # Where no physics are drawn at random, both episodes are the same flight.
+        assert [note.get_text() for note in axes.texts] == [f"{words}\nn = {n}" for n in (1, 2, 1, 2)]
     for axes in figures[1].axes:
         assert axes.get_ylim()[0] == 0.0
+
+
+def test_conditions_that_a_track_has_no_room_for_are_refused_before_any_is_flown():
+    circle = load_track("circle")
+    check_conditions(CONDITIONS, circle, seed=0)
+    gate = circle.gates[0]
+    near = tuple(a - 1.2 * b for a, b in zip(gate.position, gate.forward, strict=True))
+    crowded = dataclasses.replace(circle, start_position=near)
+    with pytest.raises(ValueError, match=r"condition start_noise cannot be flown on circle: start_noise=2"):
+        check_conditions(CONDITIONS, crowded, seed=0)
 
 
 def test_intervals_of_bars():

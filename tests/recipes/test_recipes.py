@@ -150,8 +150,9 @@ def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFix
     assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
     (tmp_path / "evaluation" / "evaluation.json").unlink()
     (tmp_path / "evaluation" / "plots").mkdir()
-    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_5"  # another has begun in _4
     assert "holds files, but no evaluation.json" in capsys.readouterr().out
+    assert fresh(f"{tmp_path}/evaluation/", "evaluation.json") == tmp_path / "evaluation_6"
 
 
 KILLED_BEHIND_THE_FIRST_POLICY = """
