@@ -35,6 +35,7 @@ from composing.flight import (
 )
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.hil.battery import STALE
@@ -45,6 +46,7 @@ from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.pose_sources import make_poses
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
+from dreamer_racing.hil.safety import State
 from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
@@ -75,7 +77,7 @@ def plainly() -> Iterator[None]:
 
 
 def fly(config: HilConfig) -> int:
-    """Fly one flight; return the exit status: 0 if it was flown to its end."""
+    """Fly one flight; return the exit status: 0 if it was flown to its end, all laps of it or until it was ended."""
     with ExitStack() as opened:
         with plainly():
             flight = prepare(config, opened)
@@ -84,7 +86,9 @@ def fly(config: HilConfig) -> int:
             opened.close()
             summary = conclude(config, flight, ended)
     say(summary)
-    return 0 if config.laps is None or len(summary["passes"]) >= config.laps * flight.track.num_gates else 1
+    if config.laps is not None:
+        return 0 if len(summary["passes"]) >= config.laps * flight.track.num_gates else 1
+    return 0 if flight.loop.flew and flight.chain.safety.state is not State.CUT else 1
 
 
 class Prepared(NamedTuple):
@@ -203,8 +207,14 @@ def replay(config: HilConfig) -> int:
     """Play a flight through the chain again; return 0 if every tick comes out as it was written, 1 otherwise."""
     assert config.replay is not None, "checked"
     flight = Flight(Path(config.replay))
-    written = {"lift": 0.0, **flight.about["config"]}  # flights of old were not lifted
-    flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), written))
+    try:
+        written = {"lift": 0.0, **flight.about["config"]}  # flights of old were not lifted
+        flown = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(HilConfig), written))
+    except (KeyError, TypeError, OmegaConfBaseException) as error:
+        raise ValueError(
+            f"replay={config.replay} was flown with settings that this version does not know "
+            f"({str(error).partition(chr(10))[0]}): play it back by the version that its recording names."
+        ) from error
     settings = cast(HilConfig, flown)
     if not flight.holds_track:
         print("note: the recording does not hold its track: it is taken as it is now")

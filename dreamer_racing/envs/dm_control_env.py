@@ -18,6 +18,7 @@ Shapes: P physics steps per control step. SI units.
 """
 
 import collections
+import math
 from typing import Any
 
 from dreamer_racing.envs.dm_control_gl import open_camera  # before dm_control
@@ -44,6 +45,9 @@ from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
 
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
+
+
+MOST_STEPS = 2**31 - 1  # of an episode without a limit: a year and more
 
 
 def load(
@@ -106,8 +110,10 @@ def load(
 
 
 def _steps_of(time_limit: float, control_dt: float) -> int:
-    """Return the control steps of an episode; refuse one without any."""
-    episode_steps = round(time_limit / control_dt)
+    """Return the control steps of an episode, all that there can be for an infinite one; refuse one without any."""
+    if math.isnan(time_limit):
+        raise ValueError("time_limit=nan: must be a number, or inf for no limit.")
+    episode_steps = round(min(time_limit / control_dt, float(MOST_STEPS)))
     if episode_steps < 1:
         raise ValueError(f"time_limit={time_limit} s: at least one control step of {control_dt} s is needed.")
     return episode_steps

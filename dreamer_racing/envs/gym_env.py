@@ -50,6 +50,15 @@ def row_of(batch: Any, index: int) -> Any:
     return row.item() if isinstance(row, np.generic) else row
 
 
+def rows_of(batch: dict[str, Any]) -> list[dict[str, Any]]:
+    """`row_of` every environment, column by column."""
+    columns = [
+        rows_of(value) if isinstance(value, dict) else value.tolist() if value.ndim == 1 else list(value)
+        for value in batch.values()
+    ]
+    return [dict(zip(batch, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
 def with_rows(batch: Observation, mask: np.ndarray, rows: Observation) -> Observation:
     """Observations of N environments with other ones in M rows, those masked (N,) bool; the batch stays as it was."""
     if isinstance(batch, dict):
@@ -111,7 +120,6 @@ class GymWorlds:
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
         self._onboard: Renderer | None = None
-        self._begun = False
 
     @property
     def frames_per_second(self) -> int:
@@ -143,13 +151,12 @@ class GymWorlds:
         Raises:
             ResetNeeded: masked, but no episode has begun yet: the other drones would fly from nowhere.
         """
-        if mask is not None and not self._begun:
+        if mask is not None and not self.worlds.begun:
             raise gymnasium.error.ResetNeeded(
                 f"The first reset() begins {int(mask.sum())} of {len(mask)} episodes: reset all, without a reset_mask, "
                 "before a part."
             )
         self.worlds.reset(None if mask is None else torch.from_numpy(mask))
-        self._begun = True
 
     def step(self, actions: Any) -> tuple[RaceStep, np.ndarray]:
         """Fly one control step; return what it did and the rewards (N,).
@@ -158,7 +165,7 @@ class GymWorlds:
             ResetNeeded: no episode has begun.
             TypeError, ValueError: actions of another type or shape.
         """
-        if not self._begun:
+        if not self.worlds.begun:
             raise gymnasium.error.ResetNeeded("step() before the first reset(): no episode has begun.")
         actions = np.asarray(actions)
         if actions.dtype.kind != "f":

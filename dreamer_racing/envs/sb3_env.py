@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, with_rows
+from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, rows_of, with_rows
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions
 
@@ -74,7 +74,7 @@ class DroneRaceVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.race.begin()
-        self.reset_infos = self._rows(self.race.info(None))
+        self.reset_infos = rows_of(self.race.info(None))
         return self.race.observe()
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -90,7 +90,7 @@ class DroneRaceVecEnv(VecEnv):
         outcome, rewards = self.race.step(self._actions)
         terminated, truncated = outcome.terminated.numpy(), outcome.truncated.numpy()
         ended = terminated | truncated
-        observation, infos = self.race.observe(), self._rows(self.race.info(outcome))
+        observation, infos = self.race.observe(), rows_of(self.race.info(outcome))
         for index, info in enumerate(infos):
             info["TimeLimit.truncated"] = bool(truncated[index])
             if ended[index]:
@@ -106,9 +106,6 @@ class DroneRaceVecEnv(VecEnv):
         for index in np.flatnonzero(mask).tolist():
             self.reset_infos[index] = row_of(info, index)
         return with_rows(observation, mask, self.race.observe(mask))
-
-    def _rows(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        return [row_of(info, index) for index in range(self.num_envs)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""

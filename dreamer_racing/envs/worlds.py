@@ -155,6 +155,7 @@ class RaceWorlds:
         self._from_pixels = from_pixels
         self._graph: GraphedFunction | None = None
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
+        self.begun = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
         """Make the rules, of training or of evaluation."""
@@ -214,7 +215,7 @@ class RaceWorlds:
         start = self._starts.sample(self.num_envs, self.evaluation)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
-        self._images = None
+        self._images, self.begun = None, True
 
     def step(self, action: Tensor) -> RaceStep:
         """Fly one control step.
@@ -224,9 +225,12 @@ class RaceWorlds:
                 has crashed: its episode ends and the others fly on.
 
         Raises:
+            RuntimeError: no episode has begun.
             TypeError: not of a floating-point type.
             ValueError: wrong shape or device.
         """
+        if not self.begun:
+            raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
             raise wrong_action_type(action.dtype)
         if action.shape != (self.num_envs, ACTION_SIZE):
@@ -322,6 +326,7 @@ class RaceWorlds:
             raise ValueError(
                 f"The saved state is of {saved} worlds, these are {self.num_envs}: resume with num_envs={saved}."
             )
+        self.begun = True
         generator = state_dict["generator"].cpu()
         if generator.shape != self._generator.get_state().shape:
             saved_on = "cpu" if self.device.type == "cuda" else "cuda"

@@ -28,10 +28,13 @@ class NoseCamera:
         camera: As given.
 
     Raises:
+        ValueError: There is no such back end.
         RendererUnavailableError: None works here; the message says why and what would help.
     """
 
     def __init__(self, track: Track, camera: Camera, backend: str = "auto") -> None:
+        if backend not in ("auto", *GL_LIBRARIES):
+            raise ValueError(f"renderer={backend}: there are auto, {', '.join(GL_LIBRARIES)}.")
         model = build_scene(track, QuadrotorParameters(), camera).compile()
         reasons = []
         for candidate in GL_LIBRARIES if backend == "auto" else (backend,):

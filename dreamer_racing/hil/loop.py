@@ -15,12 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from dreamer_racing.hil.aside import Aside
+from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
 from dreamer_racing.hil.operator import OperatorSource
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
-from dreamer_racing.hil.vehicle import Link, at_rest
+from dreamer_racing.hil.vehicle import Command, Link, at_rest
 from dreamer_racing.hil.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
@@ -126,6 +127,7 @@ class FlightLoop:
 
     Attributes:
         statistics: What ticks took.
+        flew: Whether the vehicle was armed.
     """
 
     def __init__(
@@ -140,6 +142,7 @@ class FlightLoop:
         clock: Clock | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
+        self.flew = False
         self._chain, self._poses, self._operator, self._link = chain, poses, operator, link
         self._period = 1.0 / rate
         self._recorder, self._watchers = recorder, watchers
@@ -148,6 +151,7 @@ class FlightLoop:
         self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was
+        self._broken = False  # whether the link has failed
         self._said: tuple[object, ...] = ()
 
     def stop(self, reason: str) -> None:
@@ -184,11 +188,14 @@ class FlightLoop:
             armed = outputs.verdict.command.armed
             if armed and not flew:
                 flew, began = True, start
+                self.flew = True
                 self._log(logging.INFO, "armed")
             deadline, overrun = self._next(deadline)
             if self._watchdog.acted:
                 longest = self._chain.safety.limits.tick_max
-                return f"cut: no command for more than {longest:g} s: the watchdog disarmed the vehicle"
+                met = self._watchdog.error
+                did = "disarmed the vehicle" if met is None else f"could not disarm the vehicle: {met}"
+                return f"cut: no command for more than {longest:g} s: the watchdog {did}"
             if flew and not armed:
                 return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
             most = duration if flew else patience
@@ -218,11 +225,11 @@ class FlightLoop:
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
         operator = self._operator.poll(armed)
-        inputs = Inputs(start, self._poses.poll(), operator, overrun, self._link.listen(), self._dropped)
+        inputs = Inputs(start, self._poses.poll(), operator, overrun, self._listen(), self._dropped)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
-        sent = self._watchdog.send(outputs.verdict.command)
+        sent = self._send(outputs.verdict.command)
         self._dropped = not sent
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
@@ -233,18 +240,44 @@ class FlightLoop:
         self.statistics.prepare.append(self._clock.now() - shown)
         return outputs
 
+    def _listen(self) -> list[Reading]:
+        """Return what the link has heard; nothing of one that fails, whose commands are dropped, too."""
+        try:
+            return self._link.listen()
+        except OSError as error:
+            self._note_broken(error)
+            return []
+
+    def _send(self, command: Command) -> bytes:
+        """Send a command; one that fails, as where an adapter was unplugged, counts as dropped: safety cuts then."""
+        try:
+            return self._watchdog.send(command)
+        except OSError as error:
+            self._note_broken(error)
+            return b""
+
+    def _note_broken(self, error: OSError) -> None:
+        """Say once what the link has met."""
+        if not self._broken:
+            self._log(logging.ERROR, "the link fails: %s", error)
+        self._broken = True
+
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
         """Write it down and show it; a full disk, or a page that fails, must not end a flight."""
         try:
             if self._recorder is not None:
                 message = {"in": describe_inputs(inputs), "out": describe_outputs(outputs), "took": took, "bytes": sent}
                 self._recorder.tick(inputs.time, message)
+        except Exception as error:
+            self._log(logging.ERROR, "the flight goes on, and is not recorded any longer", error=error)
+            self.statistics.unrecorded = True
+            self._recorder = None
+        try:
             for watch in self._watchers:
                 watch(outputs)
         except Exception as error:
-            self._log(logging.ERROR, "the flight goes on, and is neither recorded nor shown any longer", error=error)
-            self.statistics.unrecorded = True
-            self._recorder, self._watchers = None, ()
+            self._log(logging.ERROR, "the flight goes on, and is not shown any longer", error=error)
+            self._watchers = ()
 
     def _next(self, deadline: float) -> tuple[float, int]:
         """Return the next deadline, on the same grid however late it is, and how many were missed."""

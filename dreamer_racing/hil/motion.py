@@ -75,7 +75,7 @@ class Motion:
         self.repeats = False
         self.changed_at = -math.inf
         self._limits = limits
-        self._odometer = Odometer(limits.velocity_window)
+        self._odometer = Odometer(limits.velocity_window, gap=limits.cut_after)
         self._turns = TurnOdometer(limits.velocity_window, gap=limits.hold_after)
 
     def take(self, seen: Seen) -> Findings:

@@ -42,6 +42,7 @@ TIPPING = 2.0
 """Times the tilt within which it may arm, above which what is lifted counts as tipping over [choice]."""
 # Rates of zero, not such as would level it: a hold lasts 0.1 s, in which levelling would save some decimetres a second,
 # and the attitude to level from is the very thing that is no longer known: after 0.05 s at 10 rad/s it is off by 30°.
+_IDLE: Vector = (0.0, 0.0, 0.0, 0.0)
 _HOVER: Vector = (hover().collective_thrust, 0.0, 0.0, 0.0)
 
 
@@ -60,6 +61,7 @@ class Tick(NamedTuple):
         finish: Whether the flight is over.
         command_dropped: Whether the command of the tick before did not go out.
         lift: What is sent in place of what the actor wants, if that is usable, until the vehicle is seen to rise.
+        earlier: Poses that came since the tick before, but for ``pose``, oldest first: they are judged, too.
     """
 
     now: float
@@ -73,6 +75,7 @@ class Tick(NamedTuple):
     finish: bool = False
     command_dropped: bool = False
     lift: Setpoint | None = None
+    earlier: tuple[Pose, ...] = ()
 
 
 class Verdict(NamedTuple):
@@ -123,7 +126,7 @@ class Safety:
         self._now, self._elapsed = math.nan, 0.0
         self._overruns: deque[float] = deque(maxlen=int(limits.overruns_max) + 1)
         self._least: Vector = (float(limits.thrust_min), 0.0, 0.0, 0.0)  # thrust and body rates
-        self._sent: Vector = self._least
+        self._sent: Vector = _IDLE
         self._forget()
 
     @property
@@ -194,12 +197,13 @@ class Safety:
     def _command(self, tick: Tick) -> Command:
         """Return what is sent: the wanted one within its limits, and not faster than they may change."""
         if not self.armed:
-            self._sent = self._least
+            self._sent = _IDLE
             return at_rest()
         wanted: Vector | None = _read_setpoint(tick.setpoint)
-        if self._arming:
-            wanted = self._least
-        elif self.state is State.HOLD or wanted is None:
+        if self._arming:  # no flight controller arms but at its least throttle, whatever limits.thrust_min says
+            self._sent = _IDLE
+            return Command(True, Setpoint(0.0, np.zeros(3)))
+        if self.state is State.HOLD or wanted is None:
             wanted = _HOVER
         elif tick.lift is not None:
             wanted = _read_setpoint(tick.lift) or _HOVER
@@ -277,16 +281,18 @@ class Safety:
 
     def _take_pose(self, tick: Tick) -> Findings:
         """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""
-        if tick.pose is None:
-            return {}
-        seen, last = read_pose(tick.pose), self._motion.newest
-        if seen is None:
-            return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an attitude that is none"}
-        if seen.time > self._now + self.limits.hold_after or (last is not None and seen.time <= last.time):
-            return {}
-        age = to_number(tick.pose_age)
-        self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
-        return self._motion.take(seen)
+        findings: Findings = {}
+        for pose in (*tick.earlier, tick.pose):
+            if pose is None:
+                continue
+            seen, last = read_pose(pose), self._motion.newest
+            if seen is None:
+                findings[Reason.NOT_FINITE] = "the pose has numbers that are not finite, or an attitude that is none"
+            elif seen.time <= self._now + self.limits.hold_after and (last is None or seen.time > last.time):
+                age = to_number(tick.pose_age) if pose is tick.pose else self._now - seen.time
+                self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
+                findings |= self._motion.take(seen)
+        return findings
 
     def _check_flight(self) -> Findings:
         limits, seen = self.limits, self._motion.newest

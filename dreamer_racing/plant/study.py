@@ -132,5 +132,7 @@ class _Fastest(LockStep):
 
     def sleep_until(self, deadline: float) -> None:
         super().sleep_until(deadline)
+        if not self.plant.vehicle.armed:
+            return  # what falls once it is over is no flight
         velocity = self.plant.vehicle.pose().linear_velocity
         self.speed_max = max(self.speed_max, float((velocity @ velocity) ** 0.5))

@@ -16,7 +16,7 @@ from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
-from dreamer_racing.hil.links import HEARING, LinkConfig
+from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
 from dreamer_racing.hil.operator import (
     PORT,
     KeyboardOperator,
@@ -25,7 +25,7 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     is_remote_terminal,
 )
-from dreamer_racing.hil.pose_sources import PoseConfig
+from dreamer_racing.hil.pose_sources import POSE_SOURCES, PoseConfig
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
@@ -116,6 +116,9 @@ def check(config: HilConfig) -> None:
             f"give one of actor=, replay= and report=, not {' and '.join(wanted) or 'none'}: actor=kidney flies the "
             "agent that ships, actor=pilot track=kidney the scripted pilot."
         )
+    for name, there in (("link", LINKS), ("pose", POSE_SOURCES)):
+        if (value := getattr(config, name)) is not None and value not in there:
+            raise ValueError(f"{name}={value}: there are {', '.join(there)}.")
     if config.operator not in ("auto", *OPERATORS):
         raise ValueError(f"operator={config.operator}: there are auto, {', '.join(OPERATORS)}.")
     if config.operator == "timed" and config.link not in SIMULATED:

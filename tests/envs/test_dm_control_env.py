@@ -129,6 +129,7 @@ def test_flies_as_one_of_several_worlds() -> None:
     time_step = env.reset()
     start = [torch.from_numpy(time_step.observation[name]).repeat(3, 1) for name in STATE[:3]]
     everyone = torch.ones(3, dtype=torch.bool)
+    worlds.reset()
     worlds.simulator.reset(everyone, *start)
     worlds.race.begin(everyone, start[0], torch.from_numpy(time_step.observation["target_gate"]).repeat(3))
     assert len(compare(env, worlds, time_step, wild, 25)) > 5

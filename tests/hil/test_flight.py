@@ -320,6 +320,27 @@ def test_a_disk_that_is_full_does_not_end_a_flight():
     assert max(moment for moment, command in plant.sent if command.armed) > 2.4
 
 
+def test_a_link_that_breaks_in_flight_cuts_and_the_flight_ends_as_any_other(caplog):
+    """As where an adapter is unplugged: sending and listening fail from then on."""
+
+    class Unplugged(Watched):
+        def send(self, command: Command) -> bytes:
+            if self.elapsed > 2.0:
+                raise OSError(19, "No such device")
+            return super().send(command)
+
+        def listen(self) -> list:
+            if self.elapsed > 2.0:
+                raise OSError(19, "No such device")
+            return super().listen()
+
+    plant = Unplugged(CIRCLE)
+    chain = chain_of(Hover(), plant)
+    assert plant.fly(chain, Hover.rate, 30.0).startswith("cut: the link has taken no command for 0.1")
+    assert chain.safety.state is State.CUT
+    assert sum("the link fails" in line for line in caplog.messages) == 1
+
+
 def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
     class Clogged(Watched):
         def send(self, command):

@@ -294,6 +294,34 @@ def test_a_steady_turn_is_no_jump_however_far_it_goes():
         assert flight.tick(pose={"attitude": turned(2, 26.0 * step)}).state is State.FLYING
 
 
+def test_a_pose_that_another_of_the_same_tick_hides_is_judged_too():
+    flight = Flight(jump_tolerance=0.5).flying()
+    assert flight.tick(earlier=(pose_at(flight.now + 0.3 * PERIOD),)).state is State.FLYING
+    astray = pose_at(flight.now + 0.5 * PERIOD, position=(3.4, 0.0, 0.0))
+    verdict = flight.tick(earlier=(astray,), finish=True)
+    assert verdict.state is State.CUT and verdict.reasons[0] is Reason.POSE_JUMP
+
+
+def test_poses_that_come_seldom_are_held_to_what_they_claim():
+    """Those 0.12 s apart, at which it holds and flies on by turns: older than to fly on, not as old as to cut."""
+    flight = Flight(velocity_tolerance=4.0, velocity_window=0.0625).flying()
+    for step in range(1, 40):
+        fresh = step % 4 == 0
+        verdict = flight.tick(
+            pose={"position": (1.0 + 2.0 * step * PERIOD, 0.0, 0.0), "velocity": (-6.0, 0.0, 0.0)}, lost=not fresh
+        )
+        if verdict.state is State.CUT:
+            break
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.POSE_CONTRADICTION,), verdict.words
+    assert step <= 8
+
+
+def test_it_arms_at_no_thrust_whatever_the_least_of_flight_is():
+    flight = Flight(arm_time=0.125, thrust_min=2.0).ready()
+    assert [flight.tick().command.setpoint.collective_thrust for _ in range(5)] == [0.0, 0.0, 0.0, 0.0, 12.0]
+    assert flight.ticks(20, setpoint=Setpoint(0.5, np.zeros(3))).command.setpoint.collective_thrust == 2.0
+
+
 def test_what_contradicts_itself_does_not_arm():
     flight = Flight(velocity_tolerance=4.0, jump_tolerance=1.0, start_box=3.0).ready()
     verdict = flight.tick(pose={"position": (1.5, 0.0, 0.0)})

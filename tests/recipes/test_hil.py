@@ -32,6 +32,8 @@ flights = recipe_module("composing.flight")
         ({"actor": "pilot", "link_host": "127.x.example"}, "link_host=127.x.example is another machine"),
         ({"actor": "pilot", "link_host": "127.0.0.1.example"}, "link_host=127.0.0.1.example is another machine"),
         ({"actor": "pilot", "against": "x"}, "against=x is for report="),
+        ({"actor": "pilot", "link": "simulatd"}, "link=simulatd: there are "),
+        ({"actor": "pilot", "pose": "foo"}, "pose=foo: there are udp, mavlink, ros2"),
         ({"actor": "pilot", "rate": 3.0}, "rate=3.0: must be at least 10 and at most 500"),
         ({"actor": "pilot", "baud": 9600}, "baud=9600 is for device=, which is not given"),
         ({"actor": "pilot", "pose_device": "/dev/x"}, "pose_device=/dev/x is for pose=mavlink"),

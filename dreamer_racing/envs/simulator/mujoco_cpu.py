@@ -45,6 +45,8 @@ class MujocoSimulator(Simulator):
         generator: torch.Generator | None = None,
         looks: LooksRandomisation | None = None,
     ) -> None:
+        if num_threads is not None and num_threads < 1:
+            raise ValueError(f"num_threads={num_threads}: must be at least 1.")
         num_threads = min(num_threads or available_cpus(), num_envs)
         model = build_drone(parameters).compile()
         # a broken state must be seen and ended by the race, not hidden by an automatic reset

@@ -50,6 +50,11 @@ class Camera:
     near: float = 0.01  # m
     far: float = 100.0  # m
 
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            if (value := getattr(self, name)) < 1:
+                raise ValueError(f"camera.{name}={value}: an image has at least 1 pixel.")
+
 
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
     """Build the drone in an empty world: all that physics needs.

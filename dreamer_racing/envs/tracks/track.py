@@ -49,6 +49,11 @@ class Gate:
     kind: Literal["race", "decoy"] = "race"
     color: Vector | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", tuple(self.position))  # a list could not be hashed
+        if self.color is not None:
+            object.__setattr__(self, "color", tuple(self.color))
+
     @property
     def forward(self) -> Vector:
         """Unit vector of the direction of flight in the world."""
