@@ -120,9 +120,9 @@ def test_an_averaged_critic_judges_and_follows_the_one_that_is_trained():
     rollout = make_rollout(learner)
     loss.watch(rollout)
     seen = symlog(rollout["privileged", "vector"]).transpose(0, 1)
-    torch.testing.assert_close(loss._value(), loss.averaged_critic.mean(seen))
+    torch.testing.assert_close(loss._value(), loss.averaged_critic.mean(seen), rtol=1e-4, atol=1e-3)
     assert not torch.allclose(loss._value(), loss.state_critic.mean(seen))
-    torch.testing.assert_close(learner.judge()(rollout[:, 0]), loss.averaged_critic.mean(seen[0]))
+    torch.testing.assert_close(learner.judge()(rollout[:, 0]), loss.averaged_critic.mean(seen[0]), rtol=1e-4, atol=1e-3)
     loss.improve(1)  # one gradient step
     trained = loss.state_critic.state_dict()
     assert any(not torch.equal(value, trained[name]) for name, value in before["trained"].items())
