@@ -160,12 +160,12 @@ class Safety:
         if tick.operator is not None and tick.operator.enable:
             self._ready = False
         if self._arming:
-            findings[Reason.ARMING] = f"armed: the least thrust for {self.limits.arm_time:g} s"
+            findings[Reason.ARMING] = f"armed: no thrust for {self.limits.arm_time:g} s"
         return Verdict(self.state, self._command(tick), tuple(findings), tuple(findings.values()))
 
     @property
     def sends_from(self) -> float:
-        """When the least thrust after arming ends, and what is wanted is sent, s; of the last flight if not armed."""
+        """When the time without thrust after arming ends, and what is wanted is sent, s; of the last flight if not armed."""
         return self._armed_at + self.limits.arm_time
 
     @property

@@ -36,7 +36,7 @@ class SafetyLimits:
         start_tilt_degrees: from level, within which it may arm.
         start_speed: m/s, above which it does not arm, and has left the start when it is armed.
         release_time: s for which the enable must be seen released before it counts: a flicker begins no flight.
-        arm_time: s after arming in which the least thrust is sent: Betaflight arms at low throttle only.
+        arm_time: s after arming in which no thrust is sent: Betaflight arms at low throttle only.
         hold_after: s, age of a pose above which it holds.
         cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
             none, above which it cuts.
@@ -57,7 +57,7 @@ class SafetyLimits:
         still_time: s without more than `start_speed` after which what has flown counts as crashed: racers never hover.
         lift_off_time: s after arming by which it must have moved: what is held fast must not spin on.
         lift_time: s of a lift off the stand by which it must have been seen to rise: until then the lift is blind.
-        thrust_min: m/s², least collective thrust when armed.
+        thrust_min: m/s², least collective thrust in flight.
         thrust_max: m/s², largest.
         thrust_slew: m/s³, how fast it may change; the default lets the shipped actors swing fully in a tick of 25 Hz.
         rate_max: (3,) rad/s, largest body rates about x, y, z: those of the shipped actors.

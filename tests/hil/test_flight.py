@@ -437,7 +437,7 @@ def test_what_counts_as_having_left_the_start_without_a_lift(velocity, rate, lef
 def test_what_rose_before_it_was_lifted_does_not_count():
     flight = Scripted(LIFT, hold_after=0.03, cut_after=0.15)
     for _ in range(3):
-        flight.tick(RISES, 0.0, 0.02)  # of the first the least thrust was sent, and the second is the first lifted
+        flight.tick(RISES, 0.0, 0.02)  # in the first no thrust was sent, and the second is the first lifted
     assert not flight.chain._flying
     holding = [flight.tick(poses=False).verdict.state for _ in range(3)][-1]
     assert holding is State.HOLD
