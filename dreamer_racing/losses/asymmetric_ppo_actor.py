@@ -9,7 +9,6 @@ Shape legend: N environments, S steps kept of each environment, P privileged num
 
 from __future__ import annotations
 
-import copy
 from typing import Any, Self
 
 import torch
@@ -60,9 +59,6 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         self.state_critic = TwoHotHead(privileged_dim, self.critic_layers, self.critic_units, size.norm, size.bins)
         critic = {"params": list(self.state_critic.parameters()), "lr": self.ppo.critic_learning_rate}
         self.optimizer.add_param_group(critic)
-        self.averaged_critic = None
-        if self.ppo.critic_average is not None:
-            self.averaged_critic = copy.deepcopy(self.state_critic).requires_grad_(False)
 
     @classmethod
     def from_config(cls, agent: Agent, config: LossConfig, horizon: int = HORIZON, **own: Any) -> Self:
@@ -73,23 +69,14 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
     def judge(self, acted: TensorDictBase) -> Tensor:
         """Return what the critic expects of states ``[N]`` that a policy has acted on, ``(N, 1)``."""
         privileged = acted[PRIVILEGED].to(self.flown.device)
-        return self.judging_critic.mean(symlog(privileged))
-
-    @property
-    def judging_critic(self) -> TwoHotHead:
-        """What tells the value of a state: the averaged critic, where there is one.
-
-        Once a policy flies well its returns differ little, and a critic that is trained on swings by as much from one
-        improvement to the next: advantages are noise then (docs/experiments.md, 33).
-        """
-        return self.state_critic if self.averaged_critic is None else self.averaged_critic
+        return self.state_critic.mean(symlog(privileged))
 
     def _steps(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         return {**super()._steps(rollout), "privileged": symlog(rollout[PRIVILEGED])}
 
     @torch.no_grad()
     def _value(self) -> Tensor:
-        return self.judging_critic.mean(self.privileged)
+        return self.state_critic.mean(self.privileged)
 
     def _teach(self, returns: Tensor, value: Tensor) -> dict[str, Tensor]:
         """Teach the critic.
@@ -115,7 +102,4 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         log_probabilities = self.state_critic(state).log_softmax(-1)
         loss = self.state_critic.two_hot.cross_entropy(log_probabilities, target).mean()
         self._descend(loss, self.state_critic)
-        if self.averaged_critic is not None and self.ppo.critic_average is not None:
-            averaged, share = self.averaged_critic, self.ppo.critic_average
-            torch._foreach_lerp_(list(averaged.parameters()), list(self.state_critic.parameters()), share)
         return loss.detach()

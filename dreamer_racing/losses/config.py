@@ -32,8 +32,6 @@ class ActorPPOConfig:
             it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
         learning_rate: Of Adam; the largest, where there is a ``kl_target``.
         critic_learning_rate: ``actor=asymmetric_ppo``: of the critic that sees the simulator's state.
-        critic_average: Share by which each gradient step of that critic moves an average of its weights, which judges
-            in its place; None: the weights that are trained judge.
         gradient_clip: Largest norm of the gradient, of the actor or that critic.
     """
 
@@ -47,7 +45,6 @@ class ActorPPOConfig:
     kl_target: float | None = setting(None, POSITIVE)
     learning_rate: float = setting(3e-4, POSITIVE)
     critic_learning_rate: float = setting(1e-3, POSITIVE)
-    critic_average: float | None = setting(None, POSITIVE_SHARE)
     gradient_clip: float = setting(0.5, POSITIVE)
 
 

@@ -109,38 +109,14 @@ def test_what_flies_needs_no_state():
     assert not any("privileged" in str(key) for key in policy.in_keys)
 
 
-def test_an_averaged_critic_judges_and_follows_the_one_that_is_trained():
+def test_a_checkpoint_between_two_improvements_loses_nothing():
     torch.manual_seed(0)
-    learner = make_learner(ppo=replace(PPO, flown=N * T, epochs=1, minibatch=N * T, critic_average=0.25))
-    loss, before = actor_loss(learner), {}
-    assert loss.averaged_critic is not None
-    for name, part in (("trained", loss.state_critic), ("averaged", loss.averaged_critic)):
-        torch.nn.init.normal_(part.mlp.output.weight, std=0.1)
-        before[name] = copy.deepcopy(part.state_dict())
-    rollout = make_rollout(learner)
-    loss.watch(rollout)
-    seen = symlog(rollout["privileged", "vector"]).transpose(0, 1)
-    torch.testing.assert_close(loss._value(), loss.averaged_critic.mean(seen), rtol=1e-4, atol=1e-3)
-    assert not torch.allclose(loss._value(), loss.state_critic.mean(seen))
-    torch.testing.assert_close(learner.judge()(rollout[:, 0]), loss.averaged_critic.mean(seen[0]), rtol=1e-4, atol=1e-3)
-    loss.improve(1)  # one gradient step
-    trained = loss.state_critic.state_dict()
-    assert any(not torch.equal(value, trained[name]) for name, value in before["trained"].items())
-    for name, value in loss.averaged_critic.state_dict().items():
-        torch.testing.assert_close(value, torch.lerp(before["averaged"][name], trained[name], 0.25))
-    trained_by_learner = {id(p) for group in learner.optimizer.param_groups for p in group["params"]}
-    assert not trained_by_learner & {id(p) for p in loss.averaged_critic.parameters()}
-
-
-@pytest.mark.parametrize("critic_average", [None, 0.1])
-def test_a_checkpoint_between_two_improvements_loses_nothing(critic_average):
-    torch.manual_seed(0)
-    learner = make_learner(ppo=replace(PPO, critic_average=critic_average))
+    learner = make_learner()
     rollouts, batch = [make_rollout(learner) for _ in range(4)], make_seen_batch()
     for rollout in rollouts[:3]:  # one improvement, and half of the steps of the next
         learner.watch(rollout)
         learner.update(batch)
-    resumed = make_learner(ppo=replace(PPO, critic_average=critic_average))
+    resumed = make_learner()
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     for each in (learner, resumed):
         torch.manual_seed(5)
