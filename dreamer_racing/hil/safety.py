@@ -165,7 +165,7 @@ class Safety:
 
     @property
     def sends_from(self) -> float:
-        """When the time without thrust after arming ends, and what is wanted is sent, s; of the last flight if not armed."""
+        """When the time without thrust after arming ends, s; of the last flight if not armed."""
         return self._armed_at + self.limits.arm_time
 
     @property
