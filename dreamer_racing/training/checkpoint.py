@@ -252,9 +252,9 @@ class BestCheckpoint:
     def __init__(self, run_dir: str | Path, components: Mapping[str, Any], env_steps: int) -> None:
         self.directory = RunDirectory(Path(run_dir).absolute()).best.path
         self.score: float | None = None
-        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
         if parallel.is_first():  # who alone offers, and writes there
             self._find(env_steps)
+        self._checkpoints = RunCheckpoints(self.directory, components, keep_last=1)
 
     def _find(self, env_steps: int) -> None:
         """Take up what is kept, unless it is of later flights."""

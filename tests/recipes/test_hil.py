@@ -56,9 +56,7 @@ def test_what_does_not_go_together_is_refused(changes, message):
         ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
         ({"actor": "nobody"}, "There is no file nobody"),
         ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
-        ({"actor": "kidney", "link": "pigeon"}, "pigeon"),
         ({"actor": "kidney", "device": "/dev/x"}, "device=/dev/x is for crsf, sbus, .* link=simulated goes over UDP"),
-        ({"actor": "kidney", "pose": "stars"}, "stars.*udp, mavlink, ros2"),
         ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),
         (
             {"actor": "kidney", "link": "crsf", "betaflight_dump": "x", "arm_channel": 5},

@@ -118,6 +118,7 @@ def test_race_is_the_same_race(device: str) -> None:
               RaceWorlds("kidney", N, from_pixels=False, seed=0)]  # fmt: skip
     start = StartSampler(KIDNEY, generator("cpu", 1), dtype=torch.float64).sample(N)
     for each in worlds:
+        each.reset()
         mask = torch.ones(N, dtype=torch.bool, device=each.device)
         poses = (value.to(each.device) for value in (start.position, start.attitude, start.linear_velocity))
         each.simulator.reset(mask, *poses)
