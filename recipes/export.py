@@ -92,8 +92,6 @@ def export(config: ExportConfig) -> None:
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     about = describe(config, trained, checkpoint, step, contract) if config.agent else None
-    if about:
-        (output.parent / AGENT).unlink(missing_ok=True)  # of an earlier agent, whose files are replaced now
     deviation = export_actor(step, contract, flight, output, config.seed, about is not None, config.parts)
     print(f"replayed: {len(flight.actions)} steps, {flight.episodes} episodes, latents alike")
     for name, value in deviation.items():
@@ -221,7 +219,7 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
     """
-    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint)))
+    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
@@ -239,15 +237,20 @@ def read_evaluation(
     return {**{name: made[name] for name in names}, **statistics}
 
 
-def newest_evaluation(folder: Path) -> Path:
-    """Return the numbers that were written last of a run's evaluations, each of which has a folder of its own."""
+def newest_evaluation(folder: Path, weights_sha256: str) -> Path:
+    """Return the latest of a run's evaluations that is of these weights; if none is, the first, to be refused.
+
+    Each evaluation has a folder of its own.
+    """
     first = RunDirectory(folder).evaluation_file
     there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
-    return max(there, key=lambda path: path.stat().st_mtime, default=first)
+    of_these = (path for path in there if f'"weights_sha256": "{weights_sha256}"' in path.read_text(encoding="utf-8"))
+    return max(of_these, key=lambda path: path.stat().st_mtime, default=first)
 
 
 def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:
     """Write configuration and agent.json, the latter last: with it the folder is an agent."""
+    (folder / AGENT).unlink(missing_ok=True)
     env = replace(trained.env, device="cpu")
     OmegaConf.save(
         OmegaConf.structured(replace(trained, run_dir=None, resume=None, device="auto", env=env)), folder / CONFIG

@@ -171,11 +171,12 @@ class FlightChain:
         if not self._flying:  # each tick is the first of the flight
             self._flyer.reset()
             self.progress.reset()
-        poses = [pose for received in inputs.received if (pose := self.clock.read(received)) is not None]
-        for pose in poses:
-            self.progress.update(pose)
-            self._newest = pose
-            self._look_for_a_rise(pose)
+        for received in inputs.received:
+            pose = self.clock.read(received)
+            if pose is not None:
+                self.progress.update(pose)
+                self._newest = pose
+                self._look_for_a_rise(pose)
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
@@ -191,7 +192,6 @@ class FlightChain:
             finish=finish,
             command_dropped=inputs.dropped,
             lift=None if self._flying else self._lift(inputs.time),
-            earlier=tuple(poses[:-1]),
         )
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.

@@ -225,12 +225,13 @@ class FlightLoop:
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
         operator = self._operator.poll(armed)
-        inputs = Inputs(start, self._poses.poll(), operator, overrun, self._listen(), self._dropped)
+        heard = self._listen()
+        inputs = Inputs(start, self._poses.poll(), operator, overrun, heard or [], self._dropped)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
         sent = self._send(outputs.verdict.command)
-        self._dropped = not sent
+        self._dropped = not sent or heard is None
         done = self._clock.now()
         self._note(start - deadline, inputs, outputs, done)
         took = {"jitter": start - deadline, "render": outputs.render_s, "act": outputs.act_s, "sent": done - start}
@@ -240,13 +241,13 @@ class FlightLoop:
         self.statistics.prepare.append(self._clock.now() - shown)
         return outputs
 
-    def _listen(self) -> list[Reading]:
-        """Return what the link has heard; nothing of one that fails, whose commands are dropped, too."""
+    def _listen(self) -> list[Reading] | None:
+        """Return what the link has heard; None of one that fails: what it takes then counts as dropped, too."""
         try:
             return self._link.listen()
         except OSError as error:
             self._note_broken(error)
-            return []
+            return None
 
     def _send(self, command: Command) -> bytes:
         """Send a command; one that fails, as where an adapter was unplugged, counts as dropped: safety cuts then."""

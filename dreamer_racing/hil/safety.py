@@ -61,7 +61,6 @@ class Tick(NamedTuple):
         finish: Whether the flight is over.
         command_dropped: Whether the command of the tick before did not go out.
         lift: What is sent in place of what the actor wants, if that is usable, until the vehicle is seen to rise.
-        earlier: Poses that came since the tick before, but for ``pose``, oldest first: they are judged, too.
     """
 
     now: float
@@ -75,7 +74,6 @@ class Tick(NamedTuple):
     finish: bool = False
     command_dropped: bool = False
     lift: Setpoint | None = None
-    earlier: tuple[Pose, ...] = ()
 
 
 class Verdict(NamedTuple):
@@ -281,18 +279,16 @@ class Safety:
 
     def _take_pose(self, tick: Tick) -> Findings:
         """Take in a pose that is newer than the last; one that is not, or is from the future, only grows old."""
-        findings: Findings = {}
-        for pose in (*tick.earlier, tick.pose):
-            if pose is None:
-                continue
-            seen, last = read_pose(pose), self._motion.newest
-            if seen is None:
-                findings[Reason.NOT_FINITE] = "the pose has numbers that are not finite, or an attitude that is none"
-            elif seen.time <= self._now + self.limits.hold_after and (last is None or seen.time > last.time):
-                age = to_number(tick.pose_age) if pose is tick.pose else self._now - seen.time
-                self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
-                findings |= self._motion.take(seen)
-        return findings
+        if tick.pose is None:
+            return {}
+        seen, last = read_pose(tick.pose), self._motion.newest
+        if seen is None:
+            return {Reason.NOT_FINITE: "the pose has numbers that are not finite, or an attitude that is none"}
+        if seen.time > self._now + self.limits.hold_after or (last is not None and seen.time <= last.time):
+            return {}
+        age = to_number(tick.pose_age)
+        self._measured_at = min(seen.time, self._now - age) if math.isfinite(age) else -math.inf
+        return self._motion.take(seen)
 
     def _check_flight(self) -> Findings:
         limits, seen = self.limits, self._motion.newest

@@ -36,8 +36,6 @@ from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import check_settings
 
-"""What is read off an actor's loss, as `ActorLoss` has it."""
-
 
 class DreamerLearner:
     """One update of world model, actor and critic by their losses and an optimiser; all of them are given.

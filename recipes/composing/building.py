@@ -166,6 +166,7 @@ def make_run_replay(
     if files is None:
         check_fits(size, storage_device, asked)
     else:
+        shutil.rmtree(files, ignore_errors=True)  # of a run that was killed
         check_space(size * of_all, files, asked)
         files.mkdir(parents=True, exist_ok=True)
     where = f"memory of {storage_device}" if files is None else f"files below {files}, until the process ends"

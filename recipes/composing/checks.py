@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -16,7 +15,6 @@ from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
     CollectorKind,
-    CurriculumConfig,
     DreamerConfig,
     ExperimentConfig,
     PPORunConfig,
@@ -50,7 +48,6 @@ RACE_ONLY = (
     "env.camera_tilt",
     "env.renderer",
     "evaluation.start_noise",
-    *(f"curriculum.{setting.name}" for setting in fields(CurriculumConfig)),
 )
 """Settings that other suites have no use for, and that must be left at their defaults."""
 

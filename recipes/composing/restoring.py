@@ -170,7 +170,7 @@ def fresh_directory(path: str | Path, result: str) -> Path:
         path: the folder asked for.
         result: name of the file that is written last.
     """
-    asked = directory = Path(path).expanduser()
+    asked = directory = Path(path).expanduser().absolute()
     number = 1
     while not _claimed(directory):
         number += 1
@@ -178,7 +178,7 @@ def fresh_directory(path: str | Path, result: str) -> Path:
     if number > 1:
         held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
         print(f"{asked} holds {held}, which is kept: writing to {directory}")
-    return directory.absolute()
+    return directory
 
 
 def _claimed(directory: Path) -> bool:

@@ -358,7 +358,7 @@ class ExportConfig:
     weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged where they are kept
     output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
     agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
-    evaluation: str | None = None  # with agent=: its numbers; null: <run of the checkpoint>/evaluation/evaluation.json
+    evaluation: str | None = None  # with agent=: its numbers; null: the run's latest of these weights
     commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
     latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
     parts: bool = (

@@ -294,14 +294,6 @@ def test_a_steady_turn_is_no_jump_however_far_it_goes():
         assert flight.tick(pose={"attitude": turned(2, 26.0 * step)}).state is State.FLYING
 
 
-def test_a_pose_that_another_of_the_same_tick_hides_is_judged_too():
-    flight = Flight(jump_tolerance=0.5).flying()
-    assert flight.tick(earlier=(pose_at(flight.now + 0.3 * PERIOD),)).state is State.FLYING
-    astray = pose_at(flight.now + 0.5 * PERIOD, position=(3.4, 0.0, 0.0))
-    verdict = flight.tick(earlier=(astray,), finish=True)
-    assert verdict.state is State.CUT and verdict.reasons[0] is Reason.POSE_JUMP
-
-
 def test_poses_that_come_seldom_are_held_to_what_they_claim():
     """Those 0.12 s apart, at which it holds and flies on by turns: older than to fly on, not as old as to cut."""
     flight = Flight(velocity_tolerance=4.0, velocity_window=0.0625).flying()

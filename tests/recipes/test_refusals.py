@@ -108,7 +108,6 @@ REFUSED = [
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
     (["env=dmc", "env.renderer=egl"], ["env.renderer=egl", "for races", "leave it at auto"]),
-    (["env=dmc", "curriculum.threshold=60"], ["curriculum.threshold=60", "for races", "leave it at 50"]),
     (["env=dmc", "env.start_at_gate=0"], ["env.start_at_gate=0", "for races", "leave it at 0.5"]),
     (["env=dmc", "schedule.start_on_line.to=0"], ["schedule.start_on_line is for races", "leave it out"]),
     (["env=dmc", "evaluation.start_noise=1"], ["evaluation.start_noise=1", "for races"]),
