@@ -1,5 +1,6 @@
 """What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
 
+import os
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -177,7 +178,8 @@ def fresh_directory(path: str | Path, result: str) -> Path:
         directory = asked.with_name(f"{asked.name}_{number}")
     if number > 1:
         held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
-        print(f"{asked} holds {held}, which is kept: writing to {directory}")
+        here, there = (os.path.relpath(one) if one.is_relative_to(Path.cwd()) else one for one in (asked, directory))
+        print(f"{here} holds {held}, which is kept: writing to {there}")
     return directory
 
 
