@@ -1,10 +1,9 @@
 """dm_control's OpenGL. It is chosen as dm_control is imported, so whoever draws with that imports this before it."""
 
-import ctypes
 import os
 import sys
 
-from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, loads
 
 
 def choose_backend() -> None:
@@ -17,16 +16,8 @@ def choose_backend() -> None:
         return
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         return
-    usable = (name for name, libraries in GL_LIBRARIES.items() if any(_loads(library) for library in libraries))
+    usable = (name for name, libraries in GL_LIBRARIES.items() if any(loads(library) for library in libraries))
     os.environ["MUJOCO_GL"] = next(usable, "disable")
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
 
 
 choose_backend()

@@ -5,7 +5,6 @@ call `env.physics.render(480, 640, camera_id="spectator")` there. In either wind
 `[` and `]` switch between the free camera, the drone's `nose` and the `spectator`.
 """
 
-import ctypes
 import os
 import sys
 import threading
@@ -17,6 +16,7 @@ import mujoco
 import numpy as np
 from tensordict import TensorDictBase
 
+from dreamer_racing.envs.simulator.opengl import loads
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.worlds import RaceWorlds
 
@@ -210,7 +210,7 @@ def _missing_display(environment: Mapping[str, str]) -> list[str]:
     missing = []
     if not environment.get("DISPLAY") and not environment.get("WAYLAND_DISPLAY"):
         missing.append("no display (DISPLAY and WAYLAND_DISPLAY are not set; over ssh use ssh -X, or a desktop)")
-    if not any(_loads(library) for library in GL_WINDOW_LIBRARIES):
+    if not any(loads(library) for library in GL_WINDOW_LIBRARIES):
         missing.append(f"no OpenGL library {GL_WINDOW_LIBRARIES[0]} (Debian: apt-get install libgl1)")
     return missing
 
@@ -226,11 +226,3 @@ def _missing_glfw() -> list[str]:
     except glfw.GLFWError as error:
         return [f"GLFW did not start ({error})"]
     return [] if started else ["GLFW did not start: the display named by DISPLAY does not answer"]
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True

@@ -362,7 +362,7 @@ def test_headless_backend_choice(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(dm_control_gl.sys, "platform", "linux")
-    monkeypatch.setattr(dm_control_gl.ctypes, "CDLL", open_library)
+    monkeypatch.setattr(ctypes, "CDLL", open_library)
     dm_control_gl.choose_backend()
     assert os.environ.get("MUJOCO_GL") == chosen
 

@@ -123,7 +123,7 @@ def test_viewer_without_display_says_what_is_missing(monkeypatch: pytest.MonkeyP
 
 def test_viewer_without_opengl_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer.sys, "platform", "linux")
-    monkeypatch.setattr(viewer, "_loads", lambda library: False)
+    monkeypatch.setattr(viewer, "loads", lambda library: False)
     with pytest.raises(viewer.ViewerUnavailableError, match="no OpenGL library libGL"):
         viewer.check_viewer({"DISPLAY": ":0"})
 

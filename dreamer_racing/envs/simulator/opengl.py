@@ -120,17 +120,22 @@ def _leave_contexts() -> None:
         context._context = None
 
 
+def loads(library: str) -> bool:
+    """Whether a shared library, named as the loader finds it, is installed."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
 def require_library(backend: str) -> None:
     """Refuse a back end whose library is not installed.
 
     Raises:
         RendererUnavailableError: the message says how to install it.
     """
-    for library in GL_LIBRARIES[backend]:
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
+    if any(loads(library) for library in GL_LIBRARIES[backend]):
         return
     raise RendererUnavailableError(
         f"{backend} needs {GL_LIBRARIES[backend][0]}, which is not installed "
