@@ -23,7 +23,7 @@ from composing.building import (
 )
 from composing.checks import check_dreamer
 from composing.command_line import CONFIG_DIR
-from composing.devices import choose_device, computes_bfloat16
+from composing.devices import choose_device, choose_mixed_precision
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
@@ -222,9 +222,8 @@ def resolve(config: DictConfig) -> DictConfig:
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
     if config.model.mixed_precision is None:
-        config.model.mixed_precision = computes_bfloat16(device)
-        state, ability = ("on", "computes") if config.model.mixed_precision else ("off", "does not compute")
-        print(f"mixed precision: {state}, this {device.type} device {ability} in bfloat16")
+        config.model.mixed_precision, reason = choose_mixed_precision(device)
+        print(f"mixed precision: {'on' if config.model.mixed_precision else 'off'}, {reason}")
     if config.model.cuda_graph is None:
         config.model.cuda_graph = captures(config, device)
         if config.model.cuda_graph:

@@ -113,7 +113,7 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -
     dreamer = recipe_module("dreamer_v3")
     for module in (dreamer, recipe_module("composing.building")):
         monkeypatch.setattr(module, "choose_device", torch.device)
-    monkeypatch.setattr(dreamer, "computes_bfloat16", lambda device: True)
+    monkeypatch.setattr(dreamer, "choose_mixed_precision", lambda device: (True, "as the test says"))
     return dreamer.resolve(compose("dreamer_v3", f"device={device}", *overrides))
 
 
