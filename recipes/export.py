@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from composing.arena import worlds_of
+from composing.arena import track_of, worlds_of
 from composing.command_line import override_key, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
@@ -29,7 +29,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, hash_track, load_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
 from dreamer_racing.export.actor_step import (
     LATENTS,
@@ -128,7 +128,7 @@ def prepare(
         flight = record_flight(env, agent, config.steps)
     finally:
         env.close()
-    track = load_track(worlds_of(trained)["track"])
+    track = load_track(track_of(trained))
     contract = make_contract(
         step,
         env.worlds.parameters,
@@ -139,6 +139,7 @@ def prepare(
         track=name_of(track, trained.track),
         track_sha256=hash_track(track),
         preset=trained.env.preset,
+        **({} if trained.course is None else {"course": describe_track(track)}),
     )
     return step, contract, flight
 

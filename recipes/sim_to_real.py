@@ -22,10 +22,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import load_preset
-from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.figures.sim_to_real import plot_study
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, track_of
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
@@ -61,7 +61,7 @@ def main(config: DictConfig) -> None:
     with plain_errors():
         settings = cast(SimToRealConfig, OmegaConf.to_object(config))
         track, make_flyer = check(settings)
-        folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track)
+        folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track.name)
         folder.mkdir(parents=True, exist_ok=True)
         studies = [(settings.actor, make_flyer)]
         others = []
@@ -76,7 +76,7 @@ def main(config: DictConfig) -> None:
     print(f"written to {folder}")
 
 
-def fly(actor: str, make_flyer: Callable[[], Flyer], track: str, config: SimToRealConfig) -> dict[str, Any]:
+def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimToRealConfig) -> dict[str, Any]:
     """Fly every value of every sweep, print what came of each flight, and return all with where it comes from."""
     flown = []
     sweeps, processes = config.sweeps or list(SWEEPS), config.processes or available_cpus()
@@ -85,11 +85,11 @@ def fly(actor: str, make_flyer: Callable[[], Flyer], track: str, config: SimToRe
         lap = "–" if flight.lap_time is None else f"{flight.lap_time:.2f} s"
         words = f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}"
         print(f"{actor}: {words}", flush=True)
-    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": actor, "track": track}
+    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": actor, "track": track.name}
     return {"provenance": {**made, "preset": config.preset, "flights": config.flights}, "flights": flown}
 
 
-def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
+def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
     """Return the track and what makes the flyer.
 
     Raises:
@@ -105,18 +105,19 @@ def check(config: SimToRealConfig) -> tuple[str, Callable[[], Flyer]]:
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         if config.beside == PILOT:
             raise ValueError("beside=pilot and actor=pilot: it would fly the same twice; leave one out.")
-        return config.track, pilot_on(config.track, config)
+        track = load_track(config.track)
+        return track, pilot_on(track, config)
     path = agent_path(config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
-    track = config.track or contract["source"]["track"]
-    if note := check_contract(contract, load_track(track)):
+    track = load_track(config.track) if config.track else track_of(contract)
+    if note := check_contract(contract, track):
         print(f"note: {note}")
     return track, partial(ActorFlyer, path)
 
 
-def pilot_on(track: str, config: SimToRealConfig) -> Callable[[], Flyer]:
+def pilot_on(track: Track, config: SimToRealConfig) -> Callable[[], Flyer]:
     """Return what makes the pilot."""
-    return partial(PilotFlyer, load_track(track), config.preset, config.rate)
+    return partial(PilotFlyer, track, config.preset, config.rate)
 
 
 if __name__ == "__main__":

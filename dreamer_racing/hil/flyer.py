@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.envs.tracks import Track, hash_track
+from dreamer_racing.envs.tracks import Track, hash_track, load_track, read_track
 from dreamer_racing.export.onnx_actor import OnnxActor
 from dreamer_racing.hil.camera import camera_of
 from dreamer_racing.hil.safety_limits import SafetyLimits
@@ -74,6 +74,18 @@ class ActorFlyer:
     def prepare(self) -> None:
         """Advance the actor's memory by the action that it chose."""
         self._actor.prepare()
+
+
+def track_of(contract: dict[str, Any]) -> Track:
+    """Return the track that an actor was trained on, as its contract names or, where that was a file, describes it.
+
+    Raises:
+        TrackError: There is no such track here, or what is described is none.
+    """
+    source = contract["source"]
+    if (course := source.get("course")) is None:
+        return load_track(source["track"])
+    return read_track(course, "the contract's source.course")
 
 
 def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:

@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.chain import ChainConfig
 from dreamer_racing.hil.flyer import Flyer
 from dreamer_racing.hil.safety_limits import SafetyLimits
@@ -62,7 +63,7 @@ class StudyFlight(NamedTuple):
 
 def study(
     make_flyer: Callable[[], Flyer],
-    track: str,
+    track: Track,
     preset: str,
     flights: int,
     sweeps: Sequence[str] = tuple(SWEEPS),
@@ -72,7 +73,7 @@ def study(
 
     Args:
         make_flyer: Makes who flies; called once in each process, so it must be picklable.
-        track: Its name.
+        track: On which all are flown.
         preset: Physics of the vehicle before it is changed.
         flights: Of each value, with different noise.
         sweeps: Names out of `SWEEPS`.
@@ -89,7 +90,7 @@ _prepared: dict[str, Any] = {}
 """Of this process: the flyer takes seconds to make."""
 
 
-def _prepare(make_flyer: Callable[[], Flyer], track: str, preset: str) -> None:
+def _prepare(make_flyer: Callable[[], Flyer], track: Track, preset: str) -> None:
     _prepared.update(flyer=make_flyer(), track=track, preset=preset)
 
 
@@ -97,7 +98,7 @@ def _fly(sweep: str, value: float, seed: int) -> StudyFlight:
     return fly(_prepared["flyer"], _prepared["track"], _prepared["preset"], sweep, value, seed)
 
 
-def fly(flyer: Flyer, track: str, preset: str, sweep: str, value: float, seed: int) -> StudyFlight:
+def fly(flyer: Flyer, track: Track, preset: str, sweep: str, value: float, seed: int) -> StudyFlight:
     """Fly once with one thing changed."""
     mismatch, delivery = Mismatch(), dataclasses.replace(USUAL, seed=seed)
     for changed in (mismatch, delivery):

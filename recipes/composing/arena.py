@@ -11,7 +11,7 @@ from composing.schema import DreamerConfig, EnvConfig, RunConfig, is_race
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import with_decoys
+from dreamer_racing.envs.tracks import Track, read_track, with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
@@ -26,6 +26,12 @@ Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
 def scene_name(config: RunConfig) -> str:
     """The track or the task."""
     return config.track if is_race(config) else config.task
+
+
+def track_of(config: RunConfig) -> str | Track:
+    """Return the track of a run: of a file as it was when the run was begun, wherever that is now."""
+    track = config.track if config.course is None else read_track(config.course, f"course of track={config.track}")
+    return with_decoys(track, config.decoys) if config.decoys else track
 
 
 def worlds_device(device: torch.device, env: EnvConfig) -> str:
@@ -44,7 +50,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
     env = config.env
     return {
-        "track": with_decoys(config.track, config.decoys) if config.decoys else config.track,
+        "track": track_of(config),
         "preset": env.preset,
         "renderer": env.renderer,
         "camera": camera_of(config),

@@ -23,6 +23,7 @@ from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, describe_track, load_track
 from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
@@ -74,6 +75,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.device = worlds_device(device, config.env)
         if device.type != "cpu":
             print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
+    if config.env.suite == "race" and config.course is None and config.track not in BUILTIN_TRACKS:
+        config.course = describe_track(load_track(config.track))
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from composing.arena import track_of
 from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
@@ -27,7 +28,7 @@ from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import TrackError, load_track
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss, ActorPPOConfig, LossConfig, find_loss
@@ -64,6 +65,8 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
         raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
     if not race and config.decoys:
         raise ValueError(f"decoys={config.decoys} are for races, and env.suite={config.env.suite}: leave them out.")
+    if any(name.lstrip("+~").partition(".")[0] == "course" for name in given):
+        raise ValueError("course= is what a run notes of its track's file: give that, track=my_track.yaml.")
     if not race and "track" in given:
         raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
 
@@ -123,15 +126,14 @@ def check_race(config: RunConfig) -> None:
     Raises:
         ValueError: the message names the setting.
     """
+    track = load_track(track_of(config))
     for group, check_it in (
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
-        ("env", lambda: GateSweeper(load_track(config.track), miss_radius=config.env.miss_radius)),
-        ("evaluation", lambda: StartSampler(load_track(config.track), start_noise=config.evaluation.start_noise)),
+        ("env", lambda: GateSweeper(track, miss_radius=config.env.miss_radius)),
+        ("evaluation", lambda: StartSampler(track, start_noise=config.evaluation.start_noise)),
     ):
         try:
             check_it()
-        except TrackError:
-            raise
         except ValueError as error:
             raise ValueError(f"{group}.{error}") from error
     moves = isinstance(config, DreamerConfig) and config.schedule.start_on_line.to is not None

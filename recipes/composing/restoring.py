@@ -109,7 +109,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
     trained_on = trained.track
     if config.track:
-        trained.track, trained.decoys = config.track, None
+        trained.track, trained.course, trained.decoys = config.track, None, None
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer

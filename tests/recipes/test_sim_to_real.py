@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.plant.study import StudyFlight
 from tests.running_recipes import recipe_module
 
@@ -13,7 +14,7 @@ sim_to_real = recipe_module("sim_to_real")
 
 
 def test_an_actor_of_another_track_is_refused():
-    assert sim_to_real.check(sim_to_real.SimToRealConfig(actor="kidney"))[0] == "kidney"
+    assert sim_to_real.check(sim_to_real.SimToRealConfig(actor="kidney"))[0] == load_track("kidney")
     with pytest.raises(ValueError, match="source.track is 'kidney', .* track=circle"):
         sim_to_real.check(sim_to_real.SimToRealConfig(actor="kidney", track="circle"))
 
