@@ -56,6 +56,7 @@ from dreamer_racing.modules import SIZES, Interface, get_size, layers
 
 PRIVILEGED_DIM = 21
 WARM_UP = 3  # updates that are not counted
+BACKENDS = ("eager", "compile", "graph", "compile+graph")
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
@@ -71,7 +72,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"of {', '.join(SIZES)}")
     parser.add_argument("--losses", nargs="*", default=["reconstruction"])
     parser.add_argument("--actor-losses", nargs="*", default=["reinforce"])
-    parser.add_argument("--backends", nargs="*", default=["eager"], help="eager | compile | graph | compile+graph")
+    parser.add_argument("--backends", nargs="*", default=["eager"], choices=BACKENDS)
     parser.add_argument("--batch", nargs=2, type=int, default=(8, 32), metavar=("B", "T"))
     parser.add_argument("--horizon", type=int, default=15)
     parser.add_argument("--image-size", type=int, default=64, help="pixels; peers keep to 64")

@@ -22,6 +22,7 @@ from composing.schema import (
     ReplayRunConfig,
     RunConfig,
     SACRunConfig,
+    WorkersConfig,
     is_race,
 )
 from dreamer_racing import parallel
@@ -234,8 +235,12 @@ def check_workers(config: DreamerConfig) -> None:
     """
     workers, num_envs, asked = config.num_workers, config.env.num_envs, config.workers
     if config.collector is not CollectorKind.ray:
-        if workers is not None:
-            raise ValueError(f"num_workers={workers} is for collector=ray: add that, or leave it out.")
+        given = {} if workers is None else {"num_workers": workers}
+        given |= {
+            f"workers.{name}": value for name, value in vars(asked).items() if value != getattr(WorkersConfig, name)
+        }
+        for name, value in given.items():
+            raise ValueError(f"{name}={value} is for collector=ray: add that, or leave it out.")
         return
     assert workers is not None, "resolve_workers() says how many"
     if parallel.asked_for() > 1:

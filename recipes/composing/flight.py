@@ -148,15 +148,32 @@ def check_read(config: HilConfig) -> None:
     Raises:
         ValueError: the message names the setting and what it is for.
     """
-    for name, is_read, reader in (
-        ("baud", config.device is not None, "device="),
-        ("pose_device", config.pose == "mavlink", "pose=mavlink"),
-        ("pose_baud", config.pose_device is not None, "pose_device="),
-        ("pose_topic", config.pose == "ros2", "pose=ros2"),
-        ("pose_message", config.pose != "udp", "pose=mavlink or ros2"),
+    given = {name: value for name, value in vars(config).items() if value != getattr(HilConfig(), name)}
+    if config.actor is None:
+        read = {"replay", "renderer", "report", "against"}
+        if unread := sorted(given.keys() - read):
+            mode = "replay" if config.replay is not None else "report"
+            raise ValueError(f"{unread[0]}= is for flights, and {mode}= is of one that was flown: leave it out.")
+    throttle = config.link not in ("simulated", "udp")
+    for names, is_read, reader in (
+        (("preset",), config.actor == PILOT, "actor=pilot"),
+        (("baud",), config.device is not None, "device="),
+        (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
+        (("arm_channel",), config.link in BETAFLIGHT, f"link={', '.join(BETAFLIGHT)}"),
+        (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that takes a throttle"),
+        (("voltage_tolerance", "voltage_smoothing"), config.link in HEARING, f"link={', '.join(HEARING)}"),
+        (("pose_host", "pose_port"), config.pose_device is None and config.pose != "ros2", "poses over the network"),
+        (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
+        (("pose_baud",), config.pose_device is not None, "pose_device="),
+        (("pose_topic",), config.pose == "ros2", "pose=ros2"),
+        (("pose_message",), config.pose != "udp", "pose=mavlink or ros2"),
+        (("operator_host", "operator_port"), config.operator == "udp", "operator=udp"),
     ):
-        if (value := getattr(config, name)) is not None and not is_read:
-            raise ValueError(f"{name}={value} is for {reader}, which is not given: add that, or leave {name}= out.")
+        for name in given.keys() & set(names):
+            if not is_read:
+                raise ValueError(
+                    f"{name}={given[name]} is for {reader}, which is not given: add that, or leave {name}= out."
+                )
 
 
 def operator_of(config: HilConfig) -> str:

@@ -5,14 +5,14 @@ from functools import partial
 from typing import cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import Collector
 from torchrl.envs import TensorDictPrimer, TransformedEnv
 
 from composing.arena import Environment, make_env, worlds_device
 from composing.building import make_collector
 from composing.learners import make_agent
-from composing.schema import CollectorKind, DreamerConfig, is_race
+from composing.schema import CollectorKind, DreamerConfig, WorkersConfig, is_race
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.ahead import RolloutsAhead
@@ -40,7 +40,7 @@ def resolve_workers(config: DictConfig) -> None:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume and config.num_workers is not None:
         print(f"workers: none (collector={config.collector.value}), so num_workers={config.num_workers} is left out")
-        config.num_workers = None
+        config.num_workers, config.workers = None, OmegaConf.structured(WorkersConfig)
 
 
 def make_own_env(config: DreamerConfig) -> Environment:

@@ -40,6 +40,18 @@ flights = recipe_module("composing.flight")
         ({"actor": "pilot", "pose_baud": 9600}, "pose_baud=9600 is for pose_device="),
         ({"actor": "pilot", "pose_topic": "/p"}, "pose_topic=/p is for pose=ros2"),
         ({"actor": "pilot", "pose_message": "ODOMETRY"}, "pose_message=ODOMETRY is for pose=mavlink or ros2"),
+        ({"actor": "kidney", "preset": "easy"}, "preset=easy is for actor=pilot, which is not given"),
+        ({"actor": "kidney", "link": "udp", "mass": 0.7}, "mass=0.7 is for a link that takes a throttle"),
+        ({"actor": "kidney", "link": "mavlink", "arm_channel": 5}, "arm_channel=5 is for link=crsf, sbus, msp"),
+        ({"actor": "kidney", "link": "sbus", "voltage_tolerance": 0.1}, "voltage_tolerance=0.1 is for link=crsf, msp"),
+        (
+            {"actor": "kidney", "link": "mavlink", "device": "/dev/x", "link_port": 14550},
+            "link_port=14550 is for a link over the network, without device=",
+        ),
+        ({"actor": "kidney", "pose": "ros2", "pose_port": 9200}, "pose_port=9200 is for poses over the network"),
+        ({"actor": "kidney", "operator_port": 9200}, "operator_port=9200 is for operator=udp"),
+        ({"replay": "x", "track": "circle"}, "track= is for flights, and replay= is of one that was flown"),
+        ({"report": "x", "limits": flights.LimitsConfig(speed_max=9.0)}, "limits= is for flights, and report= is of"),
     ],
 )
 def test_what_does_not_go_together_is_refused(changes, message):

@@ -36,6 +36,7 @@ REFUSED = [
     (["env.device=cuda:7"], ["cuda:7", "finds no CUDA device", "cpu"]),
     (["env.device=cuda", "collector=overlapped"], ["overlapped", "env.device=cpu"]),
     (["num_workers=4"], ["num_workers=4 is for collector=ray"]),
+    (["workers.cpus=2"], ["workers.cpus=2", "is for collector=ray"]),
     (["collector=ray", "num_workers=3"], ["env.num_envs=32", "num_workers=3", "env.num_envs=33"]),
     (["collector=ray", "workers.weight_interval=500"], ["weight_interval=500", "256 env_steps", "512 env_steps old"]),
     (["collector=ray", "workers.cpus=0"], ["workers.cpus=0", "above 0"]),
