@@ -235,12 +235,11 @@ def check_workers(config: DreamerConfig) -> None:
     """
     workers, num_envs, asked = config.num_workers, config.env.num_envs, config.workers
     if config.collector is not CollectorKind.ray:
-        given = {} if workers is None else {"num_workers": workers}
-        given |= {
-            f"workers.{name}": value for name, value in vars(asked).items() if value != getattr(WorkersConfig, name)
-        }
-        for name, value in given.items():
-            raise ValueError(f"{name}={value} is for collector=ray: add that, or leave it out.")
+        default, settings = vars(WorkersConfig()), vars(asked).items()
+        given = [f"workers.{name}={value}" for name, value in settings if value != default[name]]
+        if given or workers is not None:
+            first = given[0] if workers is None else f"num_workers={workers}"
+            raise ValueError(f"{first} is for collector=ray: add that, or leave it out.")
         return
     assert workers is not None, "resolve_workers() says how many"
     if parallel.asked_for() > 1:
