@@ -174,9 +174,10 @@ class FlightChain:
         for received in inputs.received:
             pose = self.clock.read(received)
             if pose is not None:
-                self.progress.update(pose)
                 self._newest = pose
                 self._look_for_a_rise(pose)
+        if self._newest is not None:
+            self.progress.update(self._newest)  # what safety judges: a wrong pose between two ticks passes no gate
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all

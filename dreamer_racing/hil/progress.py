@@ -49,7 +49,10 @@ class GateProgress:
         self._last: Pose | None = None
 
     def update(self, pose: Pose) -> GatePass | None:
-        """Take in the next measured pose; return the gate passed since the one before, if there is one."""
+        """Take in a pose, of each tick the newest; return the gate passed since the one before, if there is one.
+
+        A straight line from one tick to the next, as the race of training draws it, too.
+        """
         last, self._last = self._last, pose
         if last is None:
             return None

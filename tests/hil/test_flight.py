@@ -87,6 +87,29 @@ def fly_hovering(plant: Watched, duration: float = 30.0) -> str:
     return plant.fly(chain_of(Hover(), plant), Hover.rate, duration)
 
 
+def test_a_pose_that_safety_does_not_judge_passes_no_gate():
+    """Safety sees the newest of a tick; a wrong one before it would count a gate that was never passed."""
+    gate = CIRCLE.gates[0]
+    before, beyond = (np.array(gate.position) + side * np.array(gate.forward) for side in (-0.2, 0.2))
+
+    def passes_after(*ticks: list[np.ndarray]) -> int:
+        chain = FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)), None)
+        level, still, operator = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), Operator(enable=False, kill=False)
+        for index, bunch in enumerate(ticks):
+            chain._flying = True
+            poses = [
+                PosePacket(10 * index + number, 0.0, place, level, still, still) for number, place in enumerate(bunch)
+            ]
+            now = 0.04 * (index + 1)
+            outputs = chain.tick(
+                Inputs(now, [Received(now, pose) for pose in poses], Operator(enable=False, kill=False), 0)
+            )
+        return outputs.passes
+
+    assert passes_after([before], [beyond]) == 1
+    assert passes_after([before], [before, beyond, before]) == 0
+
+
 def test_the_pilot_flies_three_laps_with_delay_and_loss():
     flyer = PilotFlyer(FIGURE8, "faithful")
     plant = Watched(FIGURE8, "faithful", Delivery(packet_loss=0.01), delay=0.02)
