@@ -101,9 +101,7 @@ def test_a_pose_that_safety_does_not_judge_passes_no_gate():
                 PosePacket(10 * index + number, 0.0, place, level, still, still) for number, place in enumerate(bunch)
             ]
             now = 0.04 * (index + 1)
-            outputs = chain.tick(
-                Inputs(now, [Received(now, pose) for pose in poses], Operator(enable=False, kill=False), 0)
-            )
+            outputs = chain.tick(Inputs(now, [Received(now, pose) for pose in poses], operator, 0))
         return outputs.passes
 
     assert passes_after([before], [beyond]) == 1
