@@ -145,9 +145,9 @@ def prepare(
 
 
 def name_of(track: Track, given: str) -> str:
-    """Return a name by which a track is found: that of a built-in one that is the same, decoys and all, or as given."""
+    """Return a track's name: of a built-in one that is the same, decoys and all, or of its file, without folders."""
     same = track.name in BUILTIN_TRACKS and hash_track(load_track(track.name)) == hash_track(track)
-    return track.name if same else given
+    return track.name if same else Path(given).name
 
 
 def check_agent(config: ExportConfig, checkpoint: Path) -> None:
@@ -182,7 +182,7 @@ def describe(
         training["starts"] = history
     return {
         "algorithm": trained.algorithm,
-        "track": trained.track,
+        "track": Path(trained.track).name,
         "decoys": trained.decoys,
         "preset": trained.env.preset,
         "control_rate": trained.env.control_rate,
@@ -252,10 +252,9 @@ def newest_evaluation(folder: Path, weights_sha256: str) -> Path:
 def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:
     """Write configuration and agent.json, the latter last: with it the folder is an agent."""
     (folder / AGENT).unlink(missing_ok=True)
-    env = replace(trained.env, device="cpu")
-    OmegaConf.save(
-        OmegaConf.structured(replace(trained, run_dir=None, resume=None, device="auto", env=env)), folder / CONFIG
-    )
+    env, track = replace(trained.env, device="cpu"), Path(trained.track).name  # a file's place is of this machine
+    ships = replace(trained, track=track, run_dir=None, resume=None, device="auto", env=env)
+    OmegaConf.save(OmegaConf.structured(ships), folder / CONFIG)
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

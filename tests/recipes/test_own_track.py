@@ -27,10 +27,11 @@ def track() -> Track:
 def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
-    file, directory = tmp_path / "mine.yaml", tmp_path / "run"
+    file, directory = tmp_path / "tracks" / "mine.yaml", tmp_path / "run"
+    file.parent.mkdir()
     file.write_text(yaml.safe_dump(describe_track(track)), encoding="utf-8")
     short = [override for override in TINY if not override.startswith("track=")]
-    begun = recipe("dreamer_v3", "track=mine.yaml", *short, "run_dir=run", cwd=tmp_path)
+    begun = recipe("dreamer_v3", "track=tracks/mine.yaml", *short, "run_dir=run", cwd=tmp_path)
     assert begun.returncode == 0, begun.stderr
     file.unlink()
     resumed = recipe("dreamer_v3", "resume=run", "total_env_steps=240", cwd=tmp_path)
@@ -38,9 +39,14 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     assert "other settings: total_env_steps=240 (was 200)\n" in resumed.stdout
     evaluated = recipe("evaluate", "checkpoint=run", "episodes=1", "num_envs=1", "video_steps=5", cwd=tmp_path)
     assert evaluated.returncode == 0, evaluated.stderr
-    exported = recipe("export", f"checkpoint={directory}", "output=actor.onnx", cwd=tmp_path)
+    exported = recipe("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234", cwd=tmp_path)
     assert exported.returncode == 0, exported.stderr
-    assert track_of(read_contract(tmp_path / "contract.json")) == track
+    contract = read_contract(tmp_path / "mine" / "contract.json")
+    assert (contract["source"]["track"], track_of(contract)) == ("mine.yaml", track)
+    texts = [path.read_text() for path in (tmp_path / "mine").iterdir() if path.suffix in (".json", ".yaml")]
+    assert not any(str(tmp_path) in text for text in texts), "paths of this machine"
+    flown = recipe("fly", f"agent={tmp_path / 'mine'}", cwd=tmp_path)
+    assert flown.returncode == 0, flown.stderr
 
 
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
