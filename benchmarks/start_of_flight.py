@@ -16,7 +16,7 @@ from pathlib import Path
 from measuring import print_table, write_json
 
 from dreamer_racing.hil.chain import LIFT, ChainConfig
-from dreamer_racing.hil.flyer import ActorFlyer
+from dreamer_racing.hil.flyer import ActorFlyer, trained_track
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.plant.lock_step import LockStep, make_chain
 from dreamer_racing.plant.study import LIMITS, USUAL
@@ -52,7 +52,7 @@ def main() -> None:
 
 def fly(flyer: ActorFlyer, preset: str, lift: float, latency: float, seed: int) -> tuple[int, str]:
     """Fly three laps; return the gates passed, and why the flight ended."""
-    vehicle = PlantVehicle(flyer.contract["source"]["track"], preset)
+    vehicle = PlantVehicle(trained_track(flyer.contract), preset)
     limits = SafetyLimits.of_track(vehicle.track, **LIMITS)
     chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=vehicle.track.laps, arm=True, lift=lift))
     try:

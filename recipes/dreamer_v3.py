@@ -222,7 +222,7 @@ def resolve(config: DictConfig) -> DictConfig:
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = numbers[name]
     if config.model.mixed_precision is None:
-        config.model.mixed_precision, reason = choose_mixed_precision(device)
+        config.model.mixed_precision, reason = parallel.agreed(choose_mixed_precision(device))
         print(f"mixed precision: {'on' if config.model.mixed_precision else 'off'}, {reason}")
     if config.model.cuda_graph is None:
         config.model.cuda_graph = captures(config, device)

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
-from composing.arena import make_report, track_of, worlds_of
+from composing.arena import make_report, track_as_begun, worlds_of
 from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
@@ -22,7 +22,7 @@ from composing.schema import EvaluateConfig, register
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.protocol import (
     CONDITIONS,
     EPISODES,
@@ -55,7 +55,7 @@ def main(config: DictConfig) -> None:
         settings = cast(EvaluateConfig, OmegaConf.to_object(config))
         check(settings)
         restored = restore(settings)
-        refuse_races(settings, load_track(track_of(restored.trained)))
+        refuse_races(settings, track_as_begun(restored.trained))
         directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
         report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None

@@ -14,12 +14,13 @@ import json
 import logging
 import shlex
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from composing.arena import track_of, worlds_of
-from composing.command_line import override_key, plain_errors, start_logging
+from composing.arena import describe_file, track_as_begun, worlds_of
+from composing.command_line import as_override, override_key, override_value, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import read_yaml, trained_config
@@ -87,6 +88,8 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; this recipe exports actors of dreamer_v3.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
+    if trained.track_description is None:  # also of a run that was begun before they were noted
+        trained.track_description = describe_file(trained.track)
     check_agent(config, checkpoint)
     output = check_output(config.output or Path(config.agent or results_of(checkpoint) / "export") / ACTOR)
     print(f"checkpoint: {checkpoint}")
@@ -128,7 +131,7 @@ def prepare(
         flight = record_flight(env, agent, config.steps)
     finally:
         env.close()
-    track = load_track(track_of(trained))
+    track = track_as_begun(trained)
     contract = make_contract(
         step,
         env.worlds.parameters,
@@ -139,7 +142,7 @@ def prepare(
         track=name_of(track, trained.track),
         track_sha256=hash_track(track),
         preset=trained.env.preset,
-        **({} if trained.course is None else {"course": describe_track(track)}),
+        **({} if trained.track_description is None else {"track_description": describe_track(track)}),
     )
     return step, contract, flight
 
@@ -196,7 +199,7 @@ def describe(
 def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
     """Return a run's starts before a checkpoint of so many env_steps, overrides without what is of one machine."""
     return [
-        start | {"overrides": [text for text in start["overrides"] if override_key(text) not in OF_A_MACHINE]}
+        start | {"overrides": without_machine(start["overrides"])}
         for start in RunDirectory(config_folder(checkpoint)).run.read_starts()
         if start["env_steps"] < env_steps
     ]
@@ -207,8 +210,15 @@ def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
     path = RunDirectory(config_folder(checkpoint)).run.overrides
     if not path.exists():
         return None
-    overrides = [text for text in map(str, read_yaml(path, ListConfig)) if override_key(text) not in OF_A_MACHINE]
+    overrides = without_machine(map(str, read_yaml(path, ListConfig)))
     return f"{command(trained.algorithm)} {shlex.join(overrides)}"
+
+
+def without_machine(overrides: Iterable[str]) -> list[str]:
+    """Return overrides without what is of one machine, the folders of a track's file among it."""
+    kept = [text for text in overrides if override_key(text) not in OF_A_MACHINE]
+    files = {text: Path(str(override_value(text))).name for text in kept if override_key(text) == "track"}
+    return [as_override("track", files[text]) if text in files else text for text in kept]
 
 
 def read_evaluation(
@@ -231,8 +241,10 @@ def read_evaluation(
         raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
-    if made["track"] != trained.track:
-        raise ValueError(f"{path} was flown on {made['track']}, and the agent was trained on {trained.track}. {how}")
+    flown = made.get("track_sha256")  # of an older evaluation the name has to do
+    if made["track"] != trained.track or flown not in (None, hash_track(track_as_begun(trained))):
+        there = "another track" if made["track"] == trained.track else made["track"]
+        raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
     return {**{name: made[name] for name in names}, **statistics}

@@ -40,7 +40,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.hil.battery import STALE
 from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import track_of
+from dreamer_racing.hil.flyer import trained_track
 from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
@@ -110,7 +110,7 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     """
     config.stamping = stamping_of(config)
     flyer, contract = make_flyer(config)
-    track = load_track(config.track) if config.track else track_of(contract)
+    track = load_track(config.track) if config.track else trained_track(contract)
     for note in check_flight(config, contract, track):
         print(f"note: {note}")
     chain = make_chain(config, flyer, track)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from composing.arena import track_of, worlds_of
+from composing.arena import track_as_begun, worlds_of
 from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
@@ -22,7 +22,7 @@ from composing.schema import PerceptionConfig, RunConfig, register
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.envs.tracks import Track, decoys_for, load_track, with_decoys
+from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
 from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
 from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
@@ -81,7 +81,7 @@ class Looked:
 
 def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
     """The track without decoys and, if it has a place for them, with them."""
-    track = load_track(track_of(trained))
+    track = track_as_begun(trained)
     if trained.decoys is None and not track.decoys:
         track = with_decoys(track, decoys_for(track))
     plain = {WITHOUT: with_decoys(track, "none")}

@@ -25,7 +25,7 @@ from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.figures.sim_to_real import plot_study
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, track_of
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, trained_track
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
@@ -109,7 +109,7 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
         return track, pilot_on(track, config)
     path = agent_path(config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
-    track = load_track(config.track) if config.track else track_of(contract)
+    track = load_track(config.track) if config.track else trained_track(contract)
     if note := check_contract(contract, track):
         print(f"note: {note}")
     return track, partial(ActorFlyer, path)

@@ -26,7 +26,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
         parameters: Of the drone that the agent was trained with.
         camera: Through which it saw.
         source: Where it comes from, JSON values: checkpoint, env_steps, track and its `hash_track`, preset,
-            and where the track was a file, ``course``, all of it.
+            and where the track was a file, all of it by `describe_track`, ``track_description``.
 
     Returns:
         What contract.json holds, but for ``files`` and ``verification``.

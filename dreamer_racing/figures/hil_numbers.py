@@ -17,6 +17,7 @@ from dreamer_racing.hil.chain import Inputs, read_inputs
 from dreamer_racing.hil.loop import percentiles
 from dreamer_racing.hil.progress import GatePass, GateProgress
 from dreamer_racing.hil.recording import Flight
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.stamping import PoseClock, Stamping
 from dreamer_racing.hil.vehicle import Pose
 
@@ -52,6 +53,8 @@ class FlownFlight:
     holds_track: bool
     """Whether its file holds the track; if not, `track` is that of its name as it is now."""
     track: Track
+    limits: SafetyLimits
+    """Of safety; only those by which poses may be apart are read."""
     time: np.ndarray
     """(T,) s, by the loop's clock, when each tick began."""
     armed: np.ndarray
@@ -115,7 +118,7 @@ def read_flown(path: Path) -> FlownFlight:
     try:
         config = flight.about.get("config") or {}
         track = flight.track()
-        clock = _clock_of(config)
+        clock, limits = _clock_of(config), _limits_of(config, track)
         arrays = _read_ticks(flight.ticks, clock)
     except TrackError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -123,7 +126,7 @@ def read_flown(path: Path) -> FlownFlight:
         what = f"{type(error).__name__}: {error}"
         raise ValueError(f"{path}: its content is not what recipes/hil.py writes ({what}).") from error
     return FlownFlight(
-        path, flight.about, flight.whole, flight.holds_track, track, out_of_order=clock.out_of_order, **arrays
+        path, flight.about, flight.whole, flight.holds_track, track, limits, out_of_order=clock.out_of_order, **arrays
     )
 
 
@@ -132,6 +135,13 @@ def _clock_of(config: dict[str, Any]) -> PoseClock:
     drift = (config.get("limits") or {}).get("clock_drift_max")
     given = {} if drift is None else {"drift_max": float(drift)}
     return PoseClock(Stamping(config.get("stamping", "receive")), float(config.get("latency", 0.0)), **given)
+
+
+def _limits_of(config: dict[str, Any], track: Track) -> SafetyLimits:
+    """Return the limits of a flight by which two poses may be apart."""
+    set_then = config.get("limits") or {}
+    names = [name for name in ("speed_max", "jump_tolerance") if set_then.get(name) is not None]
+    return SafetyLimits.of_track(track, **{name: float(set_then[name]) for name in names})
 
 
 def latencies(flight: FlownFlight) -> dict[str, Any]:
@@ -166,10 +176,11 @@ def latencies(flight: FlownFlight) -> dict[str, Any]:
 
 def gate_passes(flight: FlownFlight) -> list[GatePass]:
     """Return the gates passed since it was armed, by the poses as measured."""
-    progress = GateProgress(flight.track)
-    for pose, tick in zip(flight.poses, flight.arrived, strict=True):
+    progress = GateProgress(flight.track, flight.limits)
+    newest = np.diff(flight.arrived, append=-1) != 0  # of their ticks
+    for pose, tick, judged in zip(flight.poses, flight.arrived, newest, strict=True):
         if flight.flown.start <= tick < flight.flown.stop:
-            progress.update(pose)
+            progress.update(pose, judged=bool(judged))
     return progress.passes
 
 

@@ -139,7 +139,7 @@ class FlightChain:
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
-        self.progress = GateProgress(track)
+        self.progress = GateProgress(track, config.limits)
         self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)
         self.battery = None if config.battery is None else Battery(config.battery)
@@ -171,13 +171,11 @@ class FlightChain:
         if not self._flying:  # each tick is the first of the flight
             self._flyer.reset()
             self.progress.reset()
-        for received in inputs.received:
-            pose = self.clock.read(received)
-            if pose is not None:
-                self._newest = pose
-                self._look_for_a_rise(pose)
-        if self._newest is not None:
-            self.progress.update(self._newest)  # what safety judges: a wrong pose between two ticks passes no gate
+        poses = [pose for received in inputs.received if (pose := self.clock.read(received)) is not None]
+        for pose in poses:
+            self._newest = pose
+            self._look_for_a_rise(pose)
+            self.progress.update(pose, judged=pose is poses[-1])
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all

@@ -76,16 +76,16 @@ class ActorFlyer:
         self._actor.prepare()
 
 
-def track_of(contract: dict[str, Any]) -> Track:
+def trained_track(contract: dict[str, Any]) -> Track:
     """Return the track that an actor was trained on, as its contract names or, where that was a file, describes it.
 
     Raises:
         TrackError: There is no such track here, or what is described is none.
     """
     source = contract["source"]
-    if (course := source.get("course")) is None:
+    if (described := source.get("track_description")) is None:
         return load_track(source["track"])
-    return read_track(course, "the contract's source.course")
+    return read_track(described, "the contract's source.track_description")
 
 
 def check_contract(contract: dict[str, Any], track: Track, rate: float | None = None) -> str | None:

@@ -103,7 +103,7 @@ class Motion:
         limits, elapsed = self._limits, seen.time - last.time
         findings: Findings = {}
         moved, turned = math.dist(seen.position, last.position), seen.degrees_from(last)
-        allowed = limits.speed_max * elapsed + limits.jump_tolerance
+        allowed = limits.reach(elapsed)
         if not moved <= allowed:
             findings[Reason.POSE_JUMP] = f"the pose jumped by {moved:.3g} m (allowed since the last: {allowed:.3g})"
         allowed = math.degrees(limits.turn_rate_max * elapsed) + limits.turn_tolerance_degrees

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
 
 
@@ -29,17 +30,20 @@ class GateProgress:
 
     Args:
         track: The gates.
+        limits: Of safety: a pose that it does not judge, and that is further from the one before than it allows, is
+            left out. It judges the newest of each tick.
 
     Attributes:
         target: Index of the gate that comes next.
         passes: Those passed since `reset`, in order.
     """
 
-    def __init__(self, track: Track) -> None:
+    def __init__(self, track: Track, limits: SafetyLimits) -> None:
         self._centres = np.array([gate.position for gate in track.gates])  # (G, 3)
         self._forward = np.array([gate.forward for gate in track.gates])  # (G, 3)
         self._left = np.array([gate.left for gate in track.gates])  # (G, 3)
         self._half_width = track.shape.pass_half_width
+        self._limits = limits
         self.reset()
 
     def reset(self) -> None:
@@ -48,12 +52,19 @@ class GateProgress:
         self.passes: list[GatePass] = []
         self._last: Pose | None = None
 
-    def update(self, pose: Pose) -> GatePass | None:
-        """Take in a pose, of each tick the newest; return the gate passed since the one before, if there is one.
+    def update(self, pose: Pose, judged: bool = True) -> GatePass | None:
+        """Take in the next measured pose; return the gate passed since the one before, if there is one.
 
-        A straight line from one tick to the next, as the race of training draws it, too.
+        Args:
+            pose: The pose.
+            judged: Whether safety judges it.
         """
-        last, self._last = self._last, pose
+        last = self._last
+        if last is not None and not judged:
+            moved = float(np.linalg.norm(pose.position - last.position))
+            if not moved <= self._limits.reach(pose.time - last.time):
+                return None
+        self._last = pose
         if last is None:
             return None
         centre, forward, left = self._centres[self.target], self._forward[self.target], self._left[self.target]

@@ -117,6 +117,10 @@ class SafetyLimits:
         }
         return cls(**{**own, **{name: tuple(v) if isinstance(v, list) else v for name, v in changed.items()}})
 
+    def reach(self, elapsed: float) -> float:
+        """Return how far apart two poses may be, m, of which one is so many seconds after the other."""
+        return self.speed_max * elapsed + self.jump_tolerance
+
     def check(self) -> None:
         """Refuse limits that protect nothing, or that nothing can fly within.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -11,7 +12,7 @@ from composing.schema import DreamerConfig, EnvConfig, RunConfig, is_race
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import Track, read_track, with_decoys
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
@@ -28,10 +29,16 @@ def scene_name(config: RunConfig) -> str:
     return config.track if is_race(config) else config.task
 
 
-def track_of(config: RunConfig) -> str | Track:
-    """Return the track of a run: of a file as it was when the run was begun, wherever that is now."""
-    track = config.track if config.course is None else read_track(config.course, f"course of track={config.track}")
-    return with_decoys(track, config.decoys) if config.decoys else track
+def describe_file(track: str) -> str | None:
+    """Return what a run notes of its track: of a file all that it says, as JSON; None of a built-in one."""
+    return None if track in BUILTIN_TRACKS else json.dumps(describe_track(load_track(track)))
+
+
+def track_as_begun(config: RunConfig) -> Track:
+    """Return the track of a run: of a file as it was when the run was begun, whatever became of that."""
+    noted = config.track_description
+    track = config.track if noted is None else read_track(json.loads(noted), f"track_description of {config.track}")
+    return with_decoys(track, config.decoys)
 
 
 def worlds_device(device: torch.device, env: EnvConfig) -> str:
@@ -50,7 +57,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
     env = config.env
     return {
-        "track": track_of(config),
+        "track": track_as_begun(config),
         "preset": env.preset,
         "renderer": env.renderer,
         "camera": camera_of(config),

@@ -4,6 +4,7 @@ import math
 import random
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -13,7 +14,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import Collector
 
-from composing.arena import Environment, crash_causes, make_report, reward_terms, scene_name, worlds_device
+from composing.arena import (
+    Environment,
+    crash_causes,
+    describe_file,
+    make_report,
+    reward_terms,
+    scene_name,
+    worlds_device,
+)
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
@@ -23,7 +32,7 @@ from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, describe_track, load_track
+from dreamer_racing.envs.tracks import TrackError
 from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
@@ -75,11 +84,21 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
         config.env.device = worlds_device(device, config.env)
         if device.type != "cpu":
             print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
-    if config.env.suite == "race" and config.course is None and config.track not in BUILTIN_TRACKS:
-        config.course = describe_track(load_track(config.track))
+    if config.env.suite == "race":
+        note_track(config)
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device
+
+
+def note_track(config: DictConfig) -> None:
+    """Note what a track's file says, or where a run that goes on has noted it, say whether that has changed since."""
+    if config.track_description is None:
+        config.track_description = describe_file(config.track)
+        return
+    with suppress(TrackError):  # it is gone, or none any more
+        if describe_file(config.track) != config.track_description:
+            print(f"track: as {config.track} was when the run was begun, which it no longer is")
 
 
 def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import track_of
+from composing.arena import track_as_begun
+from composing.command_line import override_key
 from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
@@ -29,7 +30,6 @@ from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss, ActorPPOConfig, LossConfig, find_loss
@@ -60,14 +60,14 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         ValueError: the message says what to add or leave out.
     """
-    given = {override.partition("=")[0] for override in overrides}
+    given = {override_key(override) for override in overrides}
     race = config.env.suite == "race"
     if race and "task" in given:
         raise ValueError(f"task={config.task} is for the Control Suite: add env=dmc, or leave it out to race.")
     if not race and config.decoys:
         raise ValueError(f"decoys={config.decoys} are for races, and env.suite={config.env.suite}: leave them out.")
-    if any(name.lstrip("+~").partition(".")[0] == "course" for name in given):
-        raise ValueError("course= is what a run notes of its track's file: give that, track=my_track.yaml.")
+    if "track_description" in given:
+        raise ValueError("track_description= is what a run notes of its track's file: give that, track=my_track.yaml.")
     if not race and "track" in given:
         raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
 
@@ -127,7 +127,7 @@ def check_race(config: RunConfig) -> None:
     Raises:
         ValueError: the message names the setting.
     """
-    track = load_track(track_of(config))
+    track = track_as_begun(config)
     for group, check_it in (
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
         ("env", lambda: GateSweeper(track, miss_radius=config.env.miss_radius)),

@@ -38,25 +38,30 @@ WORTH_ROUNDING = 1.2
 
 def choose_mixed_precision(device: torch.device) -> tuple[bool, str]:
     """Return whether a device is to compute in bfloat16 where it may, and why."""
-    speed = bfloat16_speed(device)
-    reason = f"multiplies {speed:.1f} times as fast in" if speed else "does not compute in"
-    return speed > WORTH_ROUNDING, f"this {device.type} device {reason} bfloat16"
+    if not computes_bfloat16(device):
+        return False, f"this {device.type} device does not compute in bfloat16"
+    if device.type == "cuda":
+        return True, "this cuda device computes in bfloat16"
+    speed = bfloat16_speed()
+    return speed > WORTH_ROUNDING, f"this {device.type} device multiplies {speed:.1f} times as fast in bfloat16"
 
 
-def bfloat16_speed(device: torch.device) -> float:
-    """Return how many times as fast as in float32 a device multiplies in bfloat16; 0 if it has no instructions for it.
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether a device has instructions for bfloat16, which on a CPU are not always the faster ones."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
-    A CUDA device that has them counts as 2, unmeasured. On a CPU a product is timed, since instructions say little:
+
+def bfloat16_speed() -> float:
+    """Return how many times as fast as in float32 this CPU multiplies in bfloat16, by a product that is timed.
+
     Intel's `avx512_bf16` without AMX takes twice as long as float32, AMD's half as long.
     """
-    if device.type == "cuda":
-        return 2.0 if torch.cuda.is_bf16_supported(including_emulation=False) else 0.0
-    capabilities = torch.cpu.get_capabilities()
-    if not (capabilities.get("avx512_bf16") or capabilities.get("amx_bf16")):
-        return 0.0
-    factors = {kind: torch.ones(512, 512, dtype=kind) for kind in (torch.float32, torch.bfloat16)}
+    factors = {kind: torch.ones(256, 256, dtype=kind) for kind in (torch.float32, torch.bfloat16)}
     seconds = dict.fromkeys(factors, math.inf)
-    for _ in range(8):  # the fastest of which is free of the first call's preparation, and of what else runs
+    for _ in range(200):  # short ones, of which some are never interrupted, whatever else runs
         for kind, factor in factors.items():
             start = time.perf_counter()
             torch.mm(factor, factor)

@@ -148,15 +148,16 @@ def check_read(config: HilConfig) -> None:
     Raises:
         ValueError: the message names the setting and what it is for.
     """
-    given = {name: value for name, value in vars(config).items() if value != getattr(HilConfig(), name)}
+    default = vars(HilConfig())
+    given = {name: value for name, value in vars(config).items() if value != default[name]}
     if config.actor is None:
-        read = {"replay", "renderer", "report", "against"}
-        if unread := sorted(given.keys() - read):
-            mode = "replay" if config.replay is not None else "report"
+        mode, read = ("replay", "renderer") if config.replay is not None else ("report", "against")
+        if unread := [name for name in given if name not in (mode, read)]:
             raise ValueError(f"{unread[0]}= is for flights, and {mode}= is of one that was flown: leave it out.")
     throttle = config.link not in ("simulated", "udp")
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
+        (("renderer",), config.actor != PILOT, "an actor that sees"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
         (("arm_channel",), config.link in BETAFLIGHT, f"link={', '.join(BETAFLIGHT)}"),
@@ -166,11 +167,11 @@ def check_read(config: HilConfig) -> None:
         (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
         (("pose_baud",), config.pose_device is not None, "pose_device="),
         (("pose_topic",), config.pose == "ros2", "pose=ros2"),
-        (("pose_message",), config.pose != "udp", "pose=mavlink or ros2"),
+        (("pose_message", "smoothing"), config.pose != "udp", "pose=mavlink or ros2"),
         (("operator_host", "operator_port"), config.operator == "udp", "operator=udp"),
     ):
-        for name in given.keys() & set(names):
-            if not is_read:
+        for name in names:
+            if name in given and not is_read:
                 raise ValueError(
                     f"{name}={given[name]} is for {reader}, which is not given: add that, or leave {name}= out."
                 )

@@ -63,11 +63,14 @@ def launch(
         if not parallel.is_first():
             follow_quietly()
         overrides = list(HydraConfig.get().overrides.task)
+        noted = None
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
+            noted = config.track_description
         if tune and config.tuned == "auto":
             overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
             config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
+            config.track_description = noted
         check_overrides(config, overrides)
         if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
             print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
@@ -153,6 +156,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     merged = merge_overrides([*begun_with(algorithm, run_dir), as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
+    config.track_description = known.track_description  # whatever is taken anew
     return config, merged
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 
-from composing.arena import Environment, make_env, worlds_device
+from composing.arena import Environment, make_env, track_as_begun, worlds_device
 from composing.command_line import AGENTS, agent_path
 from composing.devices import choose_device
 from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
@@ -21,6 +21,7 @@ from composing.schema import (
     is_race,
 )
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import hash_track
 from dreamer_racing.export.actor_step import ActorStep
 from dreamer_racing.export.contract import hash_weights
 from dreamer_racing.export.shipped_agent import (
@@ -79,6 +80,7 @@ class Restored:
             "env_steps": self.env_steps,
             "trained_on": self.trained_on,
             "track": self.trained.track,
+            "track_sha256": hash_track(track_as_begun(self.trained)),
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
             "control_rate": self.trained.env.control_rate,
@@ -109,7 +111,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe evaluates races.")
     trained_on = trained.track
     if config.track:
-        trained.track, trained.course, trained.decoys = config.track, None, None
+        trained.track, trained.track_description, trained.decoys = config.track, None, None
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer

@@ -1,7 +1,6 @@
 """Configurations of runs, read back: typed as this version knows them, and compared."""
 
 from collections.abc import Collection
-from dataclasses import is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -95,7 +94,7 @@ def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> lis
     dropped = [f"{prefix}{name}={saved.pop(name)}" for name in unknown]
     for name in map(str, saved):
         inner, known = saved[name], schema._get_node(name)
-        if isinstance(inner, DictConfig) and isinstance(known, DictConfig) and is_dataclass(OmegaConf.get_type(known)):
+        if isinstance(inner, DictConfig) and isinstance(known, DictConfig):
             dropped += drop_unknown(inner, known, f"{prefix}{name}.")
     return dropped
 
@@ -159,7 +158,7 @@ def changed_settings(config: DictConfig) -> list[str]:
     return [
         f"{name}={word(value)} (was {word(before.get(name))})"
         for name, value in flat_settings(config).items()
-        if value != before.get(name) and name not in ("resume", "run_dir") and not name.startswith("course")
+        if value != before.get(name) and name not in ("resume", "run_dir", "track_description")
     ]
 
 

@@ -38,8 +38,10 @@ def resolve_workers(config: DictConfig) -> None:
     """Say how many workers there are, where that is left open; a run that goes on without any needs no number."""
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
-    elif config.resume and config.num_workers is not None:
-        print(f"workers: none (collector={config.collector.value}), so num_workers={config.num_workers} is left out")
+    elif config.resume:
+        if config.num_workers is not None:
+            left_out = f"num_workers={config.num_workers}"
+            print(f"workers: none (collector={config.collector.value}), so {left_out} is left out")
         config.num_workers, config.workers = None, OmegaConf.structured(WorkersConfig)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from dreamer_racing.envs.tracks import Gate, make_track
 from dreamer_racing.hil.progress import GateProgress
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose
 
 TRACK = make_track("line", [Gate((0.0, 0.0, 1.35), 0.0), Gate((5.0, 0.0, 1.35), 0.0)])
@@ -17,7 +18,7 @@ def at(time: float, *position: float) -> Pose:
 
 
 def fly(*poses: Pose) -> GateProgress:
-    progress = GateProgress(TRACK)
+    progress = GateProgress(TRACK, SafetyLimits.of_track(TRACK))
     for pose in poses:
         progress.update(pose)
     return progress
@@ -43,6 +44,20 @@ def test_a_pass_has_a_time_and_an_offset():
 )
 def test_what_is_no_pass(poses):
     assert not fly(*poses).passes
+
+
+def test_a_pose_that_safety_does_not_judge_counts_where_it_would_allow_it():
+    """5 ms after the one before it may be 0.175 m further; several gates may be passed from one tick to the next."""
+    near = make_track("near", [Gate((0.0, 0.0, 1.35), 0.0), Gate((0.3, 0.0, 1.35), 0.0)])
+    progress = GateProgress(near, SafetyLimits.of_track(near))
+    for number, x in enumerate((-0.05, 0.05, 0.15, 0.25, 0.35)):
+        progress.update(at(0.005 * number, x, 0.0, 1.35), judged=x > 0.3)
+    assert [passed.gate for passed in progress.passes] == [0, 1]
+    progress.reset()
+    progress.update(at(1.0, -0.2, 0.0, 1.35))
+    assert progress.update(at(1.005, 0.2, 0.0, 1.35), judged=False) is None
+    assert progress.update(at(1.010, -0.1, 0.0, 1.35)) is None
+    assert progress.passes == []
 
 
 def test_laps_go_on_and_a_reset_begins_anew():

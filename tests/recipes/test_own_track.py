@@ -11,8 +11,10 @@ from omegaconf import OmegaConf
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.flyer import track_of
+from dreamer_racing.hil.flyer import trained_track
 from tests.running_recipes import TINY, compose, recipe, recipe_module
+
+EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
 
 
 @pytest.fixture
@@ -27,42 +29,52 @@ def track() -> Track:
 def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
-    file, directory = tmp_path / "tracks" / "mine.yaml", tmp_path / "run"
-    file.parent.mkdir()
-    file.write_text(yaml.safe_dump(describe_track(track)), encoding="utf-8")
+    file, directory, agent = tmp_path / "tracks" / "mine.yaml", tmp_path / "run", tmp_path / "mine"
+    write(track, file)
     short = [override for override in TINY if not override.startswith("track=")]
-    begun = recipe("dreamer_v3", "track=tracks/mine.yaml", *short, "run_dir=run", cwd=tmp_path)
+    begun = recipe("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path)
     assert begun.returncode == 0, begun.stderr
-    file.unlink()
-    resumed = recipe("dreamer_v3", "resume=run", "total_env_steps=240", cwd=tmp_path)
+    write(load_track("circle"), file)
+    resumed = recipe("dreamer_v3", "resume=run", "budget=none", "total_env_steps=240", cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
-    assert "other settings: total_env_steps=240 (was 200)\n" in resumed.stdout
-    evaluated = recipe("evaluate", "checkpoint=run", "episodes=1", "num_envs=1", "video_steps=5", cwd=tmp_path)
+    assert f"track: as {file} was when the run was begun, which it no longer is\n" in resumed.stdout
+    of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path)
+    assert of_now.returncode == 0, of_now.stderr
+    export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
+    refused = recipe(*export, cwd=tmp_path)
+    assert refused.returncode == 2 and "was flown on another track" in refused.stderr, refused.stderr
+    file.unlink()
+    evaluated = recipe("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path)
     assert evaluated.returncode == 0, evaluated.stderr
-    exported = recipe("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234", cwd=tmp_path)
+    exported = recipe(*export, cwd=tmp_path)
     assert exported.returncode == 0, exported.stderr
-    contract = read_contract(tmp_path / "mine" / "contract.json")
-    assert (contract["source"]["track"], track_of(contract)) == ("mine.yaml", track)
-    texts = [path.read_text() for path in (tmp_path / "mine").iterdir() if path.suffix in (".json", ".yaml")]
+    contract = read_contract(agent / "contract.json")
+    assert (contract["source"]["track"], trained_track(contract)) == ("mine.yaml", track)
+    texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
     assert not any(str(tmp_path) in text for text in texts), "paths of this machine"
-    flown = recipe("fly", f"agent={tmp_path / 'mine'}", cwd=tmp_path)
+    flown = recipe("fly", f"agent={agent}", cwd=tmp_path)
     assert flown.returncode == 0, flown.stderr
 
 
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text(yaml.safe_dump(describe_track(track)), encoding="utf-8")
+    write(track, file)
     dreamer, arena = recipe_module("dreamer_v3"), recipe_module("composing.arena")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
-    assert arena.track_of(config) == track
+    assert arena.track_as_begun(config) == track
     file.write_text("gates: []", encoding="utf-8")
-    assert arena.track_of(config) == track
+    assert arena.track_as_begun(config) == track
     built_in = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=kidney", "model=debug")))
-    assert (arena.track_of(built_in), built_in.course) == ("kidney", None)
+    assert (arena.track_as_begun(built_in), built_in.track_description) == (load_track("kidney"), None)
 
 
-@pytest.mark.parametrize("override", ["course={name:mine}", "+course.name=mine"])
-def test_what_a_run_notes_is_not_to_be_given(override: str) -> None:
+def test_what_a_run_notes_is_not_to_be_given() -> None:
     checks = recipe_module("composing.checks")
-    with pytest.raises(ValueError, match=r"course= is what a run notes of its track's file: give that, track=my_track"):
-        checks.check_overrides(compose("dreamer_v3"), [override])
+    with pytest.raises(ValueError, match=r"track_description= is what a run notes of its track's file"):
+        checks.check_overrides(compose("dreamer_v3"), ["track_description={}"])
+
+
+def write(track: Track, file: Path) -> None:
+    """Write a track's file."""
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(yaml.safe_dump(describe_track(track)), encoding="utf-8")
