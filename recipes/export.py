@@ -230,7 +230,8 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
     """
-    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256))
+    track_sha256 = hash_track(track_as_begun(trained))
+    path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256, track_sha256))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
@@ -241,24 +242,29 @@ def read_evaluation(
         raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
-    flown = made.get("track_sha256")  # of an older evaluation the name has to do
-    if made["track"] != trained.track or flown not in (None, hash_track(track_as_begun(trained))):
-        there = "another track" if made["track"] == trained.track else made["track"]
+    # of an older evaluation the name has to do
+    if made.get("track_sha256", track_sha256) != track_sha256 or (
+        "track_sha256" not in made and made["track"] != trained.track
+    ):
+        there = "another track, or with other decoys" if made["track"] == trained.track else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
     return {**{name: made[name] for name in names}, **statistics}
 
 
-def newest_evaluation(folder: Path, weights_sha256: str) -> Path:
-    """Return the latest of a run's evaluations that is of these weights; if none is, the first, to be refused.
+def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> Path:
+    """Return the latest of a run's evaluations of these weights on this track; if none is, one that is to be refused.
 
     Each evaluation has a folder of its own.
     """
     first = RunDirectory(folder).evaluation_file
     there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
-    of_these = (path for path in there if f'"weights_sha256": "{weights_sha256}"' in path.read_text(encoding="utf-8"))
-    return max(of_these, key=lambda path: path.stat().st_mtime, default=first)
+    texts = {path: path.read_text(encoding="utf-8") for path in there}
+    of_these = [path for path, text in texts.items() if f'"weights_sha256": "{weights_sha256}"' in text]
+    named = f'"track_sha256": "{track_sha256}"'  # an older evaluation says nothing of it
+    fitting = [path for path in of_these if named in texts[path] or '"track_sha256"' not in texts[path]]
+    return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
 
 
 def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:

@@ -86,9 +86,9 @@ def fly(config: HilConfig) -> int:
             opened.close()
             summary = conclude(config, flight, ended)
     say(summary)
-    if config.laps is not None:
-        return 0 if len(summary["passes"]) >= config.laps * flight.track.num_gates else 1
-    return 0 if flight.loop.flew and not ended.startswith("cut") else 1
+    wanted = 0 if config.laps is None else config.laps * flight.track.num_gates
+    flown = flight.loop.flew and len(summary["passes"]) >= wanted
+    return 0 if flown and not ended.startswith("cut") else 1
 
 
 class Prepared(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import hashlib
 import json
 import math
 import os
@@ -197,7 +198,10 @@ def _read_config(directory: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not YAML") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path} holds no settings")
-    return dict(_flatten(config))
+    flat = dict(_flatten(config))
+    if described := flat.get("track_description"):  # long; it need only tell one track from another
+        flat["track_description"] = hashlib.sha256(str(described).encode()).hexdigest()[:8]
+    return flat
 
 
 def _read_overrides(directory: Path) -> dict[str, str]:
@@ -317,13 +321,15 @@ def _differences(parts: Sequence[Sequence[RunData]]) -> list[str]:
     configs = [_of_learning({name: value for run in part for name, value in run.config.items()}) for part in parts]
     pairs = combinations(configs, 2)
     different = sorted({name for first, second in pairs for name in _different(first, second)})
-    enough = next(n for n in range(1, len(different) + 1) if _tells_apart(configs, different[:n]))
+    counts = range(1, len(different) + 1)
+    if (enough := next((n for n in counts if _tells_apart(configs, different[:n])), None)) is None:
+        return [f"({number})" for number in range(1, len(parts) + 1)]  # what tells them apart is in every key
     more = ", …" if enough < len(different) else ""
     return [f"{label}{more}" for label in _name_by(configs, different[:enough])]
 
 
 def _of_learning(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if not name.startswith((*SAME_CURVE, *IN_KEY))}
+    return {name: value for name, value in settings.items() if name not in IN_KEY and not name.startswith(SAME_CURVE)}
 
 
 def _name_by(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:

@@ -30,8 +30,7 @@ class GateProgress:
 
     Args:
         track: The gates.
-        limits: Of safety: a pose that it does not judge, and that is further from the one before than it allows, is
-            left out. It judges the newest of each tick.
+        limits: Of safety: no gate is passed by a pose that is further from the one before than they allow.
 
     Attributes:
         target: Index of the gate that comes next.
@@ -57,15 +56,17 @@ class GateProgress:
 
         Args:
             pose: The pose.
-            judged: Whether safety judges it.
+            judged: Whether safety judges it, as it does the newest of each tick; another that is too far away is left
+                out, and progress goes on from the one before.
         """
         last = self._last
-        if last is not None and not judged:
-            moved = float(np.linalg.norm(pose.position - last.position))
-            if not moved <= self._limits.reach(pose.time - last.time):
-                return None
-        self._last = pose
         if last is None:
+            self._last = pose
+            return None
+        reached = float(np.linalg.norm(pose.position - last.position)) <= self._limits.reach(pose.time - last.time)
+        if reached or judged:
+            self._last = pose
+        if not reached:
             return None
         centre, forward, left = self._centres[self.target], self._forward[self.target], self._left[self.target]
         before, after = float((last.position - centre) @ forward), float((pose.position - centre) @ forward)

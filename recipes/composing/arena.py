@@ -31,7 +31,9 @@ def scene_name(config: RunConfig) -> str:
 
 def describe_file(track: str) -> str | None:
     """Return what a run notes of its track: of a file all that it says, as JSON; None of a built-in one."""
-    return None if track in BUILTIN_TRACKS else json.dumps(describe_track(load_track(track)))
+    if track in BUILTIN_TRACKS:
+        return None
+    return json.dumps(describe_track(load_track(track))).replace("$", "\\u0024")  # which OmegaConf would read
 
 
 def track_as_begun(config: RunConfig) -> Track:

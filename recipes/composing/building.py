@@ -94,7 +94,9 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
 def note_track(config: DictConfig) -> None:
     """Note what a track's file says, or where a run that goes on has noted it, say whether that has changed since."""
     if config.track_description is None:
-        config.track_description = describe_file(config.track)
+        found: list[str | None] = []
+        parallel.together(lambda: found.append(describe_file(config.track)))
+        config.track_description = parallel.agreed(found[0])
         return
     with suppress(TrackError):  # it is gone, or none any more
         if describe_file(config.track) != config.track_description:

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 
-from composing.arena import Environment, make_env, track_as_begun, worlds_device
+from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
 from composing.command_line import AGENTS, agent_path
 from composing.devices import choose_device
 from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
@@ -112,6 +112,7 @@ def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
     trained_on = trained.track
     if config.track:
         trained.track, trained.track_description, trained.decoys = config.track, None, None
+    trained.track_description = trained.track_description or describe_file(trained.track)  # as it is flown
     trained.decoys = config.decoys or trained.decoys
     trained.env.preset = config.preset or trained.env.preset
     trained.env.renderer = config.renderer

@@ -192,8 +192,8 @@ class RunConfig:
 
     algorithm: str = MISSING  # the recipe
     track: str = "kidney"  # name of a built-in track, or path to a YAML file
-    # not to be given: what a track's file said when the run was begun, which the run and what comes of it keep flying
-    track_description: str | None = None  # JSON
+    # not to be given: what a track's file said when the run was begun, as JSON; the run and what comes of it fly that
+    track_description: str | None = None
     decoys: str | None = None  # +decoys=paper: gates that are only drawn, on tracks that have a place for them
     task: str = "walker_walk"  # with env=dmc: domain_task of the Control Suite
     budget: str = "none"  # none | smoke | cpu | paper: how long a run is, and what goes with it

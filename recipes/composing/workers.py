@@ -39,10 +39,12 @@ def resolve_workers(config: DictConfig) -> None:
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume:
-        if config.num_workers is not None:
-            left_out = f"num_workers={config.num_workers}"
-            print(f"workers: none (collector={config.collector.value}), so {left_out} is left out")
-        config.num_workers, config.workers = None, OmegaConf.structured(WorkersConfig)
+        default = OmegaConf.structured(WorkersConfig)
+        left_out = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
+        left_out += [f"workers.{name}={value}" for name, value in config.workers.items() if value != default[name]]
+        if left_out:
+            print(f"workers: none (collector={config.collector.value}); left out: {', '.join(left_out)}")
+        config.num_workers, config.workers = None, default
 
 
 def make_own_env(config: DreamerConfig) -> Environment:

@@ -315,6 +315,17 @@ def test_settings_name_curves_whose_command_lines_do_not(tmp_path):
     ]
 
 
+def test_a_track_file_that_was_edited_between_two_runs_makes_two_curves(tmp_path):
+    for seed, described in enumerate(('{"name": "mine"}', '{"name": "mine", "laps": 2}')):
+        write_run(tmp_path, f"ppo_mine_seed{seed}", seed=seed, track="mine.yaml", track_description=described)
+    runs, _ = read_runs(find_runs([tmp_path]))
+    assert [len(key.variant) for key in group_runs(runs)] == [len("track_description=01234567")] * 2
+    for seed, folder in enumerate(("a", "b")):  # from before tracks were noted
+        write_run(tmp_path / "old", f"ppo_mine_seed{seed}", seed=seed, track=f"{folder}/mine.yaml")
+    runs, _ = read_runs(find_runs([tmp_path / "old"]))
+    assert [key.variant for key in group_runs(runs)] == ["(1)", "(2)"]
+
+
 def test_a_setting_that_an_older_version_did_not_have_is_no_difference(tmp_path):
     for seed, decoys in enumerate(({}, {"decoys": None}, {"decoys": {"count": 4}})):
         write_run(tmp_path, f"dreamer_v3_circle_seed{seed}", seed=seed, **decoys)

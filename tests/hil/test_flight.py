@@ -87,10 +87,11 @@ def fly_hovering(plant: Watched, duration: float = 30.0) -> str:
     return plant.fly(chain_of(Hover(), plant), Hover.rate, duration)
 
 
-def test_a_pose_that_safety_does_not_judge_passes_no_gate():
-    """Safety sees the newest of a tick; a wrong one before it would count a gate that was never passed."""
+def test_a_wrong_pose_passes_no_gate():
+    """Safety judges the newest of a tick; a wrong one before it would count a gate that was never passed."""
     gate = CIRCLE.gates[0]
     before, beyond = (np.array(gate.position) + side * np.array(gate.forward) for side in (-0.2, 0.2))
+    beside = beyond + np.array([0.0, 0.0, 3.0])
 
     def passes_after(*ticks: list[np.ndarray]) -> int:
         chain = FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE)), None)
@@ -106,6 +107,7 @@ def test_a_pose_that_safety_does_not_judge_passes_no_gate():
 
     assert passes_after([before], [beyond]) == 1
     assert passes_after([before], [before, beyond, before]) == 0
+    assert passes_after([beside], [before], [beyond]) == 1, "one that comes back counts on"
 
 
 def test_the_pilot_flies_three_laps_with_delay_and_loss():

@@ -46,7 +46,7 @@ def test_what_is_no_pass(poses):
     assert not fly(*poses).passes
 
 
-def test_a_pose_that_safety_does_not_judge_counts_where_it_would_allow_it():
+def test_a_pose_counts_where_safety_would_allow_it():
     """5 ms after the one before it may be 0.175 m further; several gates may be passed from one tick to the next."""
     near = make_track("near", [Gate((0.0, 0.0, 1.35), 0.0), Gate((0.3, 0.0, 1.35), 0.0)])
     progress = GateProgress(near, SafetyLimits.of_track(near))
@@ -57,6 +57,7 @@ def test_a_pose_that_safety_does_not_judge_counts_where_it_would_allow_it():
     progress.update(at(1.0, -0.2, 0.0, 1.35))
     assert progress.update(at(1.005, 0.2, 0.0, 1.35), judged=False) is None
     assert progress.update(at(1.010, -0.1, 0.0, 1.35)) is None
+    assert progress.update(at(1.015, 0.2, 0.0, 1.35)) is None, "safety judges it, and cuts"
     assert progress.passes == []
 
 

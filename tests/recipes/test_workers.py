@@ -74,7 +74,7 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
 
     done = recipe("dreamer_v3", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
     assert done.returncode == 0, done.stderr
-    assert "workers: none (collector=local), so num_workers=1 is left out" in done.stdout
+    assert "workers: none (collector=local); left out: num_workers=1, workers.patience=120.0\n" in done.stdout
     assert "collector=local (was ray)" in done.stdout
     assert f"at 448 env_steps, {again.counters['updates']:,} updates" in done.stdout, "all that was learned"
     assert latest_checkpoint(tmp_path).name.endswith("480")
