@@ -242,11 +242,9 @@ def read_evaluation(
         raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
-    # of an older evaluation the name has to do
-    if made.get("track_sha256", track_sha256) != track_sha256 or (
-        "track_sha256" not in made and made["track"] != trained.track
-    ):
-        there = "another track, or with other decoys" if made["track"] == trained.track else made["track"]
+    same_name = made["track"] == trained.track  # which has to do for an older evaluation
+    if not (made["track_sha256"] == track_sha256 if "track_sha256" in made else same_name):
+        there = "another track, or with other decoys" if same_name else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
