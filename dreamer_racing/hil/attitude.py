@@ -3,8 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+
+
+def product(first: Sequence[float], second: Sequence[float]) -> tuple[float, ...]:
+    """Multiply two quaternions, each (4,) wxyz: the rotation `second`, then `first`."""
+    a, b, c, d = first
+    w, x, y, z = second
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def conjugate(attitude: Sequence[float]) -> tuple[float, ...]:
+    """Return the inverse of an attitude (4,) wxyz of unit length."""
+    w, x, y, z = attitude
+    return (w, -x, -y, -z)
 
 
 def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -12,16 +31,7 @@ def turn(attitude: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     angle = float(np.linalg.norm(rotation))
     half = 0.5 * angle
     scale = 0.5 if angle < 1e-9 else np.sin(half) / angle
-    w, (x, y, z) = np.cos(half), scale * rotation
-    a, b, c, d = attitude
-    turned = np.array(
-        (
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        )
-    )
+    turned = np.array(product(attitude, (np.cos(half), *(scale * rotation))))
     return turned / np.linalg.norm(turned)
 
 
@@ -34,10 +44,8 @@ def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         first: (4,) wxyz, unit length.
         second: (4,) wxyz, unit length.
     """
-    a, b, c, d = first
-    w, x, y, z = second
-    cosine = a * w + b * x + c * y + d * z  # of half the angle
-    axis = np.array((a * x - b * w - c * z + d * y, a * y + b * z - c * w - d * x, a * z - b * y + c * x - d * w))
+    cosine, *axis = product(conjugate(first), second)  # cosine of half the angle, sine times axis
+    axis = np.array(axis)
     sine = float(np.linalg.norm(axis))
     half = math.atan2(sine, abs(cosine))
     scale = 2.0 if sine < 1e-9 else 2.0 * half / sine

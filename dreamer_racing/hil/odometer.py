@@ -6,6 +6,7 @@ import math
 from collections import deque
 from typing import ClassVar, NamedTuple
 
+from dreamer_racing.hil import attitude
 from dreamer_racing.hil.safety_limits import Vector
 from dreamer_racing.hil.velocity import GAP
 
@@ -105,27 +106,14 @@ class TurnOdometer(Odometer):
         if not math.isfinite(angle):
             return 4 * (math.nan,)
         scale = math.sin(0.5 * angle) / angle if angle else 0.0
-        return _product(led, (math.cos(0.5 * angle), *(scale * part for part in step)))
+        return attitude.product(led, (math.cos(0.5 * angle), *(scale * part for part in step)))
 
     @staticmethod
     def _change(first: Vector, last: Vector) -> Vector:
-        w, x, y, z = first
-        turned = _product((w, -x, -y, -z), last)
+        turned = attitude.product(attitude.conjugate(first), last)
         return turned if turned[0] >= 0.0 else tuple(-part for part in turned)  # both are the same rotation
 
     @staticmethod
     def _apart(went: Vector, meant: Vector) -> float:
         distance = math.dist(went, meant)
         return 4.0 * math.asin(min(1.0, 0.5 * distance)) if math.isfinite(distance) else math.inf
-
-
-def _product(first: Vector, second: Vector) -> Vector:
-    """Multiply two quaternions."""
-    a, b, c, d = first
-    w, x, y, z = second
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
