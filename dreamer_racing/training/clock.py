@@ -37,7 +37,8 @@ class RunClock:
     def total(self) -> dict[str, float]:
         """`wall_clock` and `cpu_clock`, s, since the run began, as far as known; settable, to go on with a run's.
 
-        Of a run that was continued from before there was a clock, that clock stays unknown.
+        Of a run that was continued from before there was a clock, that clock stays unknown. Once set, the next reading
+        is of what comes from now on, not of what was counted before.
         """
         return {name: now - self._born[name] for name, now in _now().items() if name in self._born}
 
@@ -46,6 +47,7 @@ class RunClock:
         self._born = {
             name: now - seconds[name] for name, now in _now().items() if name in self._born and name in seconds
         }
+        self._restart()
 
     def _restart(self) -> None:
         self._since = time.perf_counter()

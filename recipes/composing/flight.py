@@ -25,7 +25,7 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     is_remote_terminal,
 )
-from dreamer_racing.hil.pose_sources import POSE_SOURCES, PoseConfig
+from dreamer_racing.hil.pose_sources import MAKING_VELOCITIES, POSE_SOURCES, PoseConfig
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
@@ -155,6 +155,7 @@ def check_read(config: HilConfig) -> None:
         if unread := [name for name in given if name not in (mode, read)]:
             raise ValueError(f"{unread[0]}= is for flights, and {mode}= is of one that was flown: leave it out.")
     throttle = config.link not in ("simulated", "udp")
+    message = config.pose_message or {"ros2": "PoseStamped"}.get(config.pose)
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
         (("renderer",), config.actor != PILOT, "an actor that sees"),
@@ -167,7 +168,8 @@ def check_read(config: HilConfig) -> None:
         (("pose_device",), config.pose == "mavlink", "pose=mavlink"),
         (("pose_baud",), config.pose_device is not None, "pose_device="),
         (("pose_topic",), config.pose == "ros2", "pose=ros2"),
-        (("pose_message", "smoothing"), config.pose != "udp", "pose=mavlink or ros2"),
+        (("pose_message",), config.pose != "udp", "pose=mavlink or ros2"),
+        (("smoothing",), message in MAKING_VELOCITIES, f"poses without velocities, {', '.join(MAKING_VELOCITIES)}"),
         (("operator_host", "operator_port"), config.operator == "udp", "operator=udp"),
     ):
         for name in names:

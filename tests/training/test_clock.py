@@ -32,6 +32,14 @@ def test_a_continued_run_goes_on_where_it_was():
     assert 100.0 <= clock.read()["wall_clock"] < 110.0 and 60.0 <= clock.read()["cpu_clock"] < 70.0
 
 
+def test_what_was_made_before_a_run_was_continued_is_not_in_its_rates():
+    counters = {"updates": 0}
+    clock = RunClock(counters)
+    counters["updates"] = 1_000_000  # restored
+    clock.total = {"wall_clock": 100.0, "cpu_clock": 60.0}
+    assert clock.read()["rate/updates"] == 0.0
+
+
 def test_what_an_older_run_did_not_record_stays_unknown():
     """From zero it would say that all before the start was free."""
     clock = RunClock({})

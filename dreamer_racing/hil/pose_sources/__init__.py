@@ -89,6 +89,9 @@ def _ros2(config: PoseConfig) -> PoseSource:
     )
 
 
+MAKING_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
+"""Messages of poses without velocities, which `PoseConfig.smoothing` is for."""
+
 POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
 """What makes a source of poses, by its name."""
 
