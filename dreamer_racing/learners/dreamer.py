@@ -168,6 +168,7 @@ class DreamerLearner:
         """Show the actor's loss a collector's rollout ``[N, T]``, flown by `policy`, perhaps with older weights."""
         self.actor_loss.watch(rollout)
 
+    @torch.no_grad()
     def _average(self) -> None:
         """Move the averaged weights; while there are few updates they are the plain mean of all."""
         if self.averaged is not None and self.config.average_rate is not None:

@@ -444,6 +444,7 @@ def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
         learner.update(make_batch())
     for name, value in learner.averaged.named_parameters():
         torch.testing.assert_close(value, torch.lerp(before[name], trained[name].detach(), 0.25))
+        assert value.is_leaf and not value.requires_grad, name  # else every update would stay in a graph for ever
     resumed = learner_of(seed=1, **CONFIG | {"average_rate": 0.25})
     resumed.load_state_dict(copy.deepcopy(learner.state_dict()))
     for name, value in resumed.averaged.named_parameters():
