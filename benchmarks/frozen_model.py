@@ -88,7 +88,7 @@ def measure(checkpoint: Path, mode: str, improvements: int, every: int) -> Itera
         experience["old"] = torch.cat((old.mean, old.std), -1)
         kl = improve(actor, critic, optimizer, experience, log_prob) if number < improvements else math.nan
         if number % every == 0:
-            flown = course.evaluate(EPISODES)
+            flown = course.evaluate()
             yield {
                 "benchmark": "frozen_model", "track": config.track, **counters, "mode": mode,
                 "improvements": number + (number < improvements), "gates": flown.gates_per_episode,

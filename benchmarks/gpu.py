@@ -328,7 +328,7 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
         each.update(replay.sample())
         each.check_finite()
     course = Course(learner.evaluation_policy(), {"track": "circle", "device": device}, 2)
-    flown = course.evaluate(2)
+    flown = course.evaluate()
     course.close()
     first, last = (float(torch.stack(part).mean()) for part in (losses[:3], losses[-3:]))
     if not last < first:

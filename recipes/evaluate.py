@@ -102,7 +102,6 @@ def refuse_races(config: EvaluateConfig, track: Track) -> None:
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
     """Make the races that the policy is to fly as it was trained to."""
-    options = {"num_envs": config.num_envs, "seed": config.seed}
     report = make_report(
         restored.trained,
         directory,
@@ -110,7 +109,8 @@ def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: P
         config.episodes,
         config.video_steps,
         config.start_noise,
-        **options,
+        num_envs=config.num_envs,
+        seed=config.seed,
     )
     return cast(EvaluationReport, report)
 

@@ -232,8 +232,8 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
         worlds = worlds_of(restored.trained) | {"seed": config.seed}
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
-    course = Course(restored.flyer.evaluation_policy(), worlds, num_envs=1)
-    return PlannedFlight(course.base, partial(course.evaluate, 1, judge=restored.flyer.judge()))
+    course = Course(restored.flyer.evaluation_policy(), worlds, episodes=1)
+    return PlannedFlight(course.base, partial(course.evaluate, judge=restored.flyer.judge()))
 
 
 def write(directory: Path, track: Track, result: Evaluation) -> None:

@@ -27,28 +27,30 @@ class Course:
     """Worlds to evaluate a policy in, as often as wanted.
 
     Each time it meets the same starts, drones and looks in the first episode of every world; in later ones, where
-    episodes are more than worlds, they depend on how the episodes before went. What a policy samples comes from torch's
-    generator.
+    ``num_envs`` makes worlds fewer than episodes, they depend on how the episodes before went. What a policy samples
+    comes from torch's generator.
 
     Args:
         policy: what is flown, on whichever device it is.
         worlds: arguments of ``DroneRacingEnv``: track, preset, renderer, camera, seed (0 if they do not say), device
             (the CPU if they do not say) ...
-        num_envs: N, episodes flown side by side.
+        episodes: E, of an evaluation.
+        num_envs: N, worlds that they are flown in side by side, at most E; None: one for each episode.
     """
 
-    def __init__(self, policy: Policy, worlds: Mapping[str, Any], num_envs: int) -> None:
+    def __init__(self, policy: Policy, worlds: Mapping[str, Any], episodes: int, num_envs: int | None = None) -> None:
         worlds = {"seed": 0, **worlds}
+        num_envs = min(num_envs or episodes, episodes)
         self.base = DroneRacingEnv(num_envs=num_envs, evaluation=True, **worlds)
-        self._policy = policy
+        self._policy, self._episodes = policy, episodes
         self._seed = worlds["seed"]
         self._env = with_memory(self.base, policy.make_primer())
 
-    def evaluate(self, episodes: int, deterministic: bool = True, **recording: Any) -> Evaluation:
-        """Fly so many episodes; ``recording`` are arguments of ``evaluate``."""
+    def evaluate(self, deterministic: bool = True, **recording: Any) -> Evaluation:
+        """Fly the episodes; ``recording`` are arguments of ``evaluate``."""
         self._policy.deterministic = deterministic
         self.base.worlds.seed(self._seed)
-        return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), episodes, **recording)
+        return evaluate(self._env, lambda tensordict: act(self._policy, tensordict), self._episodes, **recording)
 
     def close(self) -> None:
         """Free the simulators."""

@@ -115,7 +115,7 @@ def run_protocol(
     *,
     conditions: Sequence[Condition] = CONDITIONS,
     presets: Sequence[str] = PRESETS,
-    num_envs: int = 20,
+    num_envs: int | None = None,
     seed: int = 0,
 ) -> Iterator[Result]:
     """Fly a policy under all conditions, with each preset, in both modes, and yield what came of each.
@@ -128,8 +128,9 @@ def run_protocol(
         episodes: of each condition.
         conditions: which.
         presets: of physics.
-        num_envs: episodes flown side by side.
-        seed: of starts, displaced gates, physics and looks: the same races for both modes, and for every policy.
+        num_envs: as of `Course`.
+        seed: of starts, displaced gates, physics and looks: the same races for both modes, and for every policy, as far
+            as `Course` says.
     """
     track = load_track(worlds["track"])
     for preset in presets:
@@ -173,7 +174,7 @@ def fly(
     worlds: Mapping[str, Any],
     episodes: int,
     deterministic: bool = True,
-    num_envs: int = 20,
+    num_envs: int | None = None,
     **recording: Any,
 ) -> Evaluation:
     """Make races, fly a policy in them, and free them.
@@ -183,12 +184,12 @@ def fly(
         worlds: arguments of `DroneRacingEnv`.
         episodes: how many.
         deterministic: the mode of the policy.
-        num_envs: episodes flown side by side.
+        num_envs: as of `Course`.
         recording: arguments of `evaluate`: ``num_trajectories``, ``max_recorded_steps``, ``record_pixels``.
     """
-    course = Course(policy, worlds, min(num_envs, episodes))
+    course = Course(policy, worlds, episodes, num_envs)
     try:
-        return course.evaluate(episodes, deterministic, **recording)
+        return course.evaluate(deterministic, **recording)
     finally:
         course.close()
 

@@ -37,7 +37,7 @@ class EvaluationReport:
         worlds: arguments of `DroneRacingEnv`: track, preset, renderer, camera.
         episodes: episodes of an evaluation.
         video_steps: control steps K that the video shows at most.
-        num_envs: episodes flown side by side.
+        num_envs: as of `Course`.
         seed: of the evaluation's environment, anew at each evaluation: all meet the same starts and drones.
     """
 
@@ -48,7 +48,7 @@ class EvaluationReport:
         worlds: dict[str, Any],
         episodes: int,
         video_steps: int = 500,
-        num_envs: int = 8,
+        num_envs: int | None = None,
         seed: int = 0,
     ) -> None:
         self.directory = RunDirectory(Path(directory))
@@ -57,7 +57,7 @@ class EvaluationReport:
         self.on_episode: Callable[[int, int], None] | None = None
         self.attempt: Callable[[str], AbstractContextManager] = nullcontext
         self._learner = learner
-        self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, min(num_envs, episodes))
+        self._course = Course(learner.evaluation_policy(), {**worlds, "seed": seed}, episodes, num_envs)
 
     def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
         """Evaluate the deterministic policy, and the stochastic one too if asked; write everything.
@@ -80,7 +80,7 @@ class EvaluationReport:
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
         judge = self._learner.judge()
-        return self._course.evaluate(self.episodes, deterministic, judge=judge, on_episode=self.on_episode)
+        return self._course.evaluate(deterministic, judge=judge, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.

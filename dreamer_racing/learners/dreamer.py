@@ -199,8 +199,10 @@ class DreamerLearner:
 
         Raises:
             TypeError: If `LossConfig` has no number of such a name.
-            ValueError: If none of the losses has it as an attribute.
+            ValueError: If none of the losses has it as an attribute, or ``world_model_rate`` is given alone.
         """
+        if rates is None and world_model_rate != 1.0:
+            raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a share of rates: give rates=, too.")
         if unknown := numbers.keys() - {field.name for field in fields(LossConfig)}:
             raise TypeError(f"adjust({', '.join(sorted(unknown))}=...): LossConfig has no such number.")
         if rates is not None:

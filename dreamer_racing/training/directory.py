@@ -158,6 +158,28 @@ class RunDirectory:
         names = (path.stem for path in self.evaluations.glob("*.json"))
         return max((name for name in names if name.isdecimal()), key=int, default=None)
 
+    def set_aside_after(self, env_steps: int) -> None:
+        """Move what evaluations left after where the run goes on to ``evaluations.replaced``, and so on.
+
+        They are of flights that are to be flown again, perhaps otherwise.
+        """
+        moved: set[int] = set()
+        for folder in (self.evaluations, self.plots, self.videos):
+            for file in folder.glob("*"):
+                number = file.stem.partition("_")[0]
+                if number.isdecimal() and int(number) > env_steps:
+                    aside = folder.with_name(folder.name + REPLACED)
+                    aside.mkdir(exist_ok=True)
+                    file.replace(aside / file.name)
+                    moved.add(int(number))
+        if moved:
+            logger.warning(
+                "evaluations at %s env_steps are from after where the run goes on: their files are in *%s of %s",
+                ", ".join(f"{number:,}" for number in sorted(moved)),
+                REPLACED,
+                self.path,
+            )
+
     def note_start(self, env_steps: int, overrides: Sequence[str], commit: str | None) -> None:
         """Note that the run was begun, or continued at so many env_steps, with which overrides at which commit."""
         line = {"env_steps": env_steps, "overrides": list(overrides), "commit": commit}

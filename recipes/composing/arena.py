@@ -138,9 +138,6 @@ def make_report(
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
         worlds = {**worlds_of(config), "start_noise": start_noise}
-        if start_noise:  # a world's second start would depend on how its first went
-            options["num_envs"] = episodes
-            print(f"evaluation: {episodes} worlds, one for each episode, so that every agent meets the same starts")
         return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
     seed = config.seed + 1
     env = make_suite(config, min(8, episodes), seed)

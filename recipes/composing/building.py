@@ -372,6 +372,7 @@ def assemble(
     best = BestCheckpoint(directory.path, flown, counters["env_steps"])
     parallel.together(lambda: None)  # all have read what is written anew now
     if parallel.is_first():
+        directory.set_aside_after(counters["env_steps"])
         write_configuration(directory, config, overrides, counters["env_steps"])
     metrics = make_metrics(config, directory, journal.pending)
     print(f"run directory: {directory.path}")

@@ -23,6 +23,7 @@ from composing.schema import (
     ReplayRunConfig,
     RunConfig,
     SACRunConfig,
+    Storage,
     WorkersConfig,
     is_race,
 )
@@ -32,7 +33,19 @@ from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
-from dreamer_racing.losses import ACTOR_LOSSES, ActorLoss, ActorPPOConfig, LossConfig, find_loss
+from dreamer_racing.losses import (
+    ACTOR_LOSSES,
+    ActorLoss,
+    ActorPPOConfig,
+    AsymmetricPPOActorLoss,
+    DecoderFreeLoss,
+    FlownPPOActorLoss,
+    LossConfig,
+    PPOActorLoss,
+    PrivilegedLoss,
+    WorldModelLoss,
+    find_loss,
+)
 from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
@@ -70,6 +83,54 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
         raise ValueError("track_description= is what a run notes of its track's file: give that, track=my_track.yaml.")
     if not race and "track" in given:
         raise ValueError(f"track={config.track} is for races, and env.suite={config.env.suite}: leave one of them out.")
+
+
+def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse settings of DreamerV3 that nothing reads as losses and replay are chosen; a loss of one's own may read all.
+
+    Args:
+        config: composed.
+        overrides: as they were written; what files of a group set goes with other choices of theirs.
+
+    Raises:
+        ValueError: the message names the setting, and what it is for.
+    """
+    actor, model = find_loss(ActorLoss, config.loss.actor), find_loss(WorldModelLoss, config.loss.world_model)
+    names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
+    given = [leaf for name in names for leaf in _leaves(config, name)]
+    for name, reads, reader in (
+        ("loss.ppo", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
+        ("schedule.kl_target", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
+        ("loss.ppo.updates", _is(actor, PPOActorLoss), "loss.actor=ppo"),
+        ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo or asymmetric_ppo"),
+        ("loss.ppo.critic_learning_rate", _is(actor, AsymmetricPPOActorLoss), "loss.actor=asymmetric_ppo"),
+        ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
+        ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
+        ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),
+        ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
+        ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
+        ("schedule.wait_every", config.schedule.wait_for_model is not None, "schedule.wait_for_model"),
+    ):
+        for leaf in given:
+            if not reads and (leaf == name or leaf.startswith(f"{name}.")):
+                raise ValueError(
+                    f"{leaf}={OmegaConf.select(config, leaf)} is for {reader}, which is not chosen: choose that, or "
+                    f"leave {leaf}= out."
+                )
+
+
+def _is(loss: type, reading: type) -> bool:
+    """Whether a loss is one of those that read a setting, or may be, as one of a user's own."""
+    return issubclass(loss, reading) or not loss.__module__.startswith("dreamer_racing.")
+
+
+def _leaves(config: DictConfig, name: str) -> list[str]:
+    """Return the dotted names of the settings below a name that are given anything."""
+    if (value := OmegaConf.select(config, name)) is None:
+        return []
+    if not isinstance(value, DictConfig):
+        return [name]
+    return [leaf for key in value for leaf in _leaves(config, f"{name}.{key}")]
 
 
 def refuse_to_replace(config: RunConfig) -> None:

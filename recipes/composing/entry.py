@@ -31,8 +31,8 @@ WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
 TEXTS = (
-    "run_dir", "resume", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
-    "run", "against",
+    "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
+    "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
 )  # fmt: skip
 """Settings that are no numbers, whatever they look like."""
 

@@ -14,7 +14,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from composing.checks import check_overrides
+from composing.checks import check_overrides, check_read
 from composing.command_line import (
     as_override,
     follow_quietly,
@@ -40,7 +40,13 @@ from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest
 from dreamer_racing.training.run import train
 from dreamer_racing.training.schedule import Ramp, RampClock
 
-TRAINED_ON = ("track", "task", "decoys", "env.control_rate")  # what a run that is resumed cannot change
+TRAINED_ON = (
+    "track",
+    "task",
+    "decoys",
+    "env.control_rate",
+    "env.camera_tilt",
+)  # what a run that is resumed cannot change
 
 
 def launch(
@@ -62,7 +68,7 @@ def launch(
         parallel.join()
         if not parallel.is_first():
             follow_quietly()
-        overrides = list(HydraConfig.get().overrides.task)
+        overrides = given = list(HydraConfig.get().overrides.task)
         noted = None
         if config.resume:
             config, overrides = resumed_config(config.algorithm, config.resume, overrides)
@@ -72,6 +78,8 @@ def launch(
             config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
             config.track_description = noted
         check_overrides(config, overrides)
+        if config.algorithm == "dreamer_v3":
+            check_read(config, given)
         if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
             print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
             parallel.leave()

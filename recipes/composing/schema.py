@@ -324,7 +324,8 @@ class EvaluateConfig:
     # with protocol=nominal: of starts, as a multiple of the noise of training
     start_noise: float = setting(0.0, NOT_NEGATIVE)
     episodes: int = setting(100, COUNT)  # of each condition
-    num_envs: int = setting(20, COUNT)
+    # flown side by side; null: every episode has a world of its own, so that every policy meets the same races
+    num_envs: int | None = setting(None, COUNT)
     track: str | None = None  # null: the track it was trained on
     decoys: str | None = None  # +decoys=paper | none; null: as it was trained
     preset: str | None = None  # null: the physics it was trained on
@@ -342,7 +343,7 @@ class PerceptionConfig:
     checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
     weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
     episodes: int = setting(100, COUNT)  # of each kind of flight
-    num_envs: int = setting(100, COUNT)  # the first flight in each is looked at
+    num_envs: int | None = setting(None, COUNT)  # as of `recipes/evaluate.py`; the first flight in each is looked at
     track: str | None = None  # null: the track it was trained on
     decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
     preset: str | None = None  # null: the physics it was trained on

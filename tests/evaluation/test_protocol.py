@@ -110,8 +110,7 @@ def test_every_condition_is_flown_by_both_policies():
 def test_both_policies_meet_the_same_starts():
     (race,) = by_name("start_noise").races(load_track("circle"), seed=1)
     first, second = (
-        fly(Falling(), WORLDS | race, 5, deterministic, num_envs=5, num_trajectories=5)
-        for deterministic in (True, False)
+        fly(Falling(), WORLDS | race, 5, deterministic, num_trajectories=5) for deterministic in (True, False)
     )
     starts = torch.stack([flight.position[0] for flight in first.trajectories])
     assert torch.equal(starts, torch.stack([flight.position[0] for flight in second.trajectories]))

@@ -88,7 +88,7 @@ def test_after_the_capture_a_learner_is_measured_saved_and_flown(tmp_path: Path)
     for name, value in before.items():
         assert torch.equal(value, other.agent.state_dict()[name]), name
     course = Course(learner.evaluation_policy(), {"track": "circle", "device": "cuda"}, 2)
-    assert len(course.evaluate(2).episodes) == 2
+    assert len(course.evaluate().episodes) == 2
     course.close()
     assert learner.update(batch("cuda"))["loss"].isfinite(), "the graph still replays"
     assert other.update(batch("cuda"))["loss"].isfinite()

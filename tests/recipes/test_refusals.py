@@ -154,6 +154,46 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
 
 
 @pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["loss.actor=reinforce", "loss.ppo.epochs=2"], "loss.ppo.epochs=2 is for loss.actor=ppo, flown_ppo"),
+        (["loss.actor=reinforce", "schedule.kl_target={to: 0.01}"], "schedule.kl_target.to=0.01 is for loss.actor=ppo"),
+        (["loss.actor=asymmetric_ppo", "loss.ppo.updates=2"], "loss.ppo.updates=2 is for loss.actor=ppo"),
+        (["loss.actor=ppo", "loss.ppo.flown=200"], "loss.ppo.flown=200 is for loss.actor=flown_ppo or"),
+        (["loss.actor=flown_ppo", "loss.ppo.critic_learning_rate=1"], "is for loss.actor=asymmetric_ppo, which is not"),
+        (["loss=reconstruction", "loss.privileged_scale=3"], "privileged_scale=3.* is for loss=privileged or informed"),
+        (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
+        (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
+        (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
+        (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
+        (["schedule.wait_every=9"], "schedule.wait_every=9 is for schedule.wait_for_model, which is not chosen"),
+    ],
+)
+def test_what_nothing_would_read_is_refused(overrides: list[str], words: str) -> None:
+    config = compose("dreamer_v3", *overrides)
+    with pytest.raises(ValueError, match=words):
+        recipe_module("composing.checks").check_read(config, overrides)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["tuned=race", "loss.actor=reinforce", "schedule.kl_target.to=null"],
+        ["loss.actor=ppo", "loss.ppo.updates=2", "model.imagination_starts=8"],
+        ["loss=informed", "loss.privileged_scale=3", "replay.recent_share=0.1", "replay.recent_records=9"],
+        ["loss.actor=dreamer_racing_of_mine:Loss", "loss.ppo.flown=9"],
+    ],
+)
+def test_what_is_read_or_left_out_or_may_be_read_passes(
+    overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = "from dreamer_racing.losses import ReinforceLoss\n\n\nclass Loss(ReinforceLoss):\n    pass\n"
+    (tmp_path / "dreamer_racing_of_mine.py").write_text(own)
+    monkeypatch.syspath_prepend(tmp_path)
+    recipe_module("composing.checks").check_read(compose("dreamer_v3", *overrides), overrides)
+
+
+@pytest.mark.parametrize(
     ("name", "overrides"),
     [
         ("evaluate", ["checkpoint=nowhere", "episodes=0"]),

@@ -58,6 +58,24 @@ def test_the_latest_evaluation_is_that_of_the_deterministic_policy(tmp_path: Pat
     assert run.latest_evaluation() == "1000000064"
 
 
+def test_evaluations_of_after_where_a_run_goes_on_step_aside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = RunDirectory(tmp_path)
+    for folder, ending in ((run.evaluations, "_stochastic_trajectory.csv"), (run.plots, ".png"), (run.videos, ".mp4")):
+        folder.mkdir()
+        for name in ("000000100", "000000200", "1000000064", "notes"):
+            (folder / f"{name}{ending}").write_text(name)
+    run.set_aside_after(100)
+    assert sorted(file.name for file in run.plots.iterdir()) == ["000000100.png", "notes.png"]
+    aside = tmp_path / "evaluations.replaced"
+    assert (aside / "000000200_stochastic_trajectory.csv").read_text() == "000000200" and len(
+        list(aside.iterdir())
+    ) == 2
+    assert "200, 1,000,000,064 env_steps" in caplog.text
+    caplog.clear()
+    run.set_aside_after(100)
+    assert not caplog.text
+
+
 def test_a_damaged_line_of_the_history_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = RunDirectory(tmp_path)
     run.note_start(0, [], None)
