@@ -86,7 +86,7 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse settings of DreamerV3 that nothing reads as losses and replay are chosen; a loss of one's own may read all.
+    """Refuse settings of DreamerV3 that nothing reads as losses and replay are chosen; one's own losses may read all.
 
     Args:
         config: composed.
