@@ -5,7 +5,6 @@ import random
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -131,11 +130,7 @@ def seed_generators(seed: int) -> None:
 
 def make_curriculum(config: RunConfig) -> BodyRateCurriculum | None:
     """Make the schedule of the race's body-rate penalty; other suites have none."""
-    if not is_race(config):
-        return None
-    settings = asdict(config.curriculum)
-    del settings["relabel"]
-    return BodyRateCurriculum(**settings)
+    return BodyRateCurriculum(config.curriculum) if is_race(config) else None
 
 
 def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:

@@ -20,7 +20,7 @@ from forked import SERVER
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
-from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
+from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, BodyRateSchedule
 from dreamer_racing.experience.replay import StreamReplay, make_replay
 from dreamer_racing.training import publishing
 from dreamer_racing.training.checkpoint import (
@@ -44,7 +44,7 @@ class Run:
         self.learner = torch.nn.Linear(size, size)
         self.optimiser = torch.optim.Adam(self.learner.parameters(), lr=0.1)
         self.replay: StreamReplay = make_replay(200, 2, 4, 5)
-        self.curriculum = BodyRateCurriculum(window=1, cooldown=1, maximum=1.0)
+        self.curriculum = BodyRateCurriculum(BodyRateSchedule(window=1, cooldown=1, maximum=1.0))
         self.counters = {"env_steps": 0, "updates": 0}
         self.checkpoints = RunCheckpoints(run_dir, self.components, keep_last=keep_last)
 

@@ -18,13 +18,21 @@ from torchrl.envs.transforms import Transform
 
 @dataclass
 class BodyRateSchedule:
-    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1: arguments of `BodyRateCurriculum`."""
+    """Schedule of b₂, the weight of the body-rate penalty in paper Eq. 1, see `BodyRateCurriculum`.
 
-    threshold: float = 50.0  # mean return above which b₂ grows
+    Attributes:
+        threshold: mean return above which b₂ grows.
+        increment: what b₂ grows by, 1/(rad/s).
+        maximum: cap of b₂, 1/(rad/s).
+        window: episodes that the mean is over; no growth before there are as many.
+        cooldown: least number of episodes between two growths.
+    """
+
+    threshold: float = 50.0
     increment: float = 0.001
     maximum: float = 0.01
-    window: int = 100  # episodes
-    cooldown: int = 100  # episodes
+    window: int = 100
+    cooldown: int = 100
 
 
 class BodyRateCurriculum:
@@ -34,44 +42,34 @@ class BodyRateCurriculum:
     ``increment``, but at most once in ``cooldown`` episodes and never beyond ``maximum``. It never decreases.
 
     Args:
-        threshold: mean return above which b₂ grows.
-        increment: what b₂ grows by, 1/(rad/s).
-        maximum: cap of b₂, 1/(rad/s).
-        window: episodes that the mean is over; no growth before there are as many.
-        cooldown: least number of episodes between two growths.
+        schedule: its numbers.
+
+    Raises:
+        ValueError: a number is out of its range.
 
     Example:
-        >>> curriculum = BodyRateCurriculum(window=2, cooldown=2)
+        >>> curriculum = BodyRateCurriculum(BodyRateSchedule(window=2, cooldown=2))
         >>> curriculum.update([60.0, 60.0, 60.0, 60.0])
         0.002
     """
 
-    def __init__(
-        self,
-        threshold: float = BodyRateSchedule.threshold,
-        increment: float = BodyRateSchedule.increment,
-        maximum: float = BodyRateSchedule.maximum,
-        window: int = BodyRateSchedule.window,
-        cooldown: int = BodyRateSchedule.cooldown,
-    ) -> None:
-        if window < 1 or cooldown < 1 or increment < 0 or maximum < 0:
+    def __init__(self, schedule: BodyRateSchedule | None = None) -> None:
+        self.schedule = schedule = schedule or BodyRateSchedule()
+        if schedule.window < 1 or schedule.cooldown < 1 or schedule.increment < 0 or schedule.maximum < 0:
             raise ValueError(
                 "The body-rate curriculum needs window >= 1, cooldown >= 1, increment >= 0 and maximum >= 0, got "
-                f"window={window}, cooldown={cooldown}, increment={increment}, maximum={maximum}."
+                f"window={schedule.window}, cooldown={schedule.cooldown}, increment={schedule.increment}, "
+                f"maximum={schedule.maximum}."
             )
-        self.threshold = threshold
-        self.increment = increment
-        self.maximum = maximum
-        self.cooldown = cooldown
-        self._returns: deque[float] = deque(maxlen=window)
+        self._returns: deque[float] = deque(maxlen=schedule.window)
         self._growths = 0
-        self._since_growth = cooldown
+        self._since_growth = schedule.cooldown
 
     @property
     def body_rate_weight(self) -> float:
         """Today's b₂, 1/(rad/s)."""
         # A product, not a sum of increments: ten times 0.001 shall be 0.01.
-        return min(self._growths * self.increment, self.maximum)
+        return min(self._growths * self.schedule.increment, self.schedule.maximum)
 
     def update(self, episode_returns: Tensor | Sequence[float]) -> float:
         """Accounts for finished training episodes, one by one in the given order.
@@ -86,14 +84,15 @@ class BodyRateCurriculum:
         for value in values:
             self._returns.append(float(value))
             self._since_growth += 1
-            if self._may_grow() and sum(self._returns) / len(self._returns) > self.threshold:
+            if self._may_grow() and sum(self._returns) / len(self._returns) > self.schedule.threshold:
                 self._growths += 1
                 self._since_growth = 0
         return self.body_rate_weight
 
     def _may_grow(self) -> bool:
         window_is_full = len(self._returns) == self._returns.maxlen
-        return window_is_full and self._since_growth >= self.cooldown and self.body_rate_weight < self.maximum
+        cooled_down = self._since_growth >= self.schedule.cooldown
+        return window_is_full and cooled_down and self.body_rate_weight < self.schedule.maximum
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""

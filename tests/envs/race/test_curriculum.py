@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
+from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, BodyRateSchedule, RelabelReward
 from dreamer_racing.experience.replay import make_replay
 
 
@@ -18,7 +18,7 @@ def test_starts_at_zero_and_waits_for_a_full_window():
 
 
 def test_threshold_is_exclusive():
-    curriculum = BodyRateCurriculum(window=2, cooldown=1)
+    curriculum = BodyRateCurriculum(BodyRateSchedule(window=2, cooldown=1))
     assert curriculum.update([50.0, 50.0]) == 0
     assert curriculum.update([50.1]) == 0.001
 
@@ -33,14 +33,14 @@ def test_cooldown_cap_and_no_decrease():
 
 
 def test_window_forgets():
-    curriculum = BodyRateCurriculum(window=3, cooldown=1)
+    curriculum = BodyRateCurriculum(BodyRateSchedule(window=3, cooldown=1))
     assert curriculum.update([0.0, 0.0, 0.0, 100.0]) == 0  # mean 33
     assert curriculum.update([100.0]) == 0.001  # mean 67
 
 
 def test_one_call_equals_many_and_takes_tensors():
     returns = torch.randn(3000, generator=torch.Generator().manual_seed(0)) * 30 + 50
-    one, many = BodyRateCurriculum(maximum=1.0), BodyRateCurriculum(maximum=1.0)
+    one, many = BodyRateCurriculum(BodyRateSchedule(maximum=1.0)), BodyRateCurriculum(BodyRateSchedule(maximum=1.0))
     for chunk in returns.split(37):
         many.update(chunk)
     assert one.update(returns) == many.body_rate_weight == pytest.approx(one.update([]))
@@ -59,7 +59,7 @@ def test_state_continues_exactly():
 
 def test_nonsense_is_refused():
     with pytest.raises(ValueError, match="window=0"):
-        BodyRateCurriculum(window=0)
+        BodyRateCurriculum(BodyRateSchedule(window=0))
 
 
 def rollout(num_envs: int, steps: int, weight: float) -> TensorDict:
@@ -75,7 +75,7 @@ def rollout(num_envs: int, steps: int, weight: float) -> TensorDict:
 
 
 def test_samples_carry_todays_reward():
-    curriculum = BodyRateCurriculum(window=1, cooldown=1)
+    curriculum = BodyRateCurriculum(BodyRateSchedule(window=1, cooldown=1))
     relabelled = make_replay(100, 2, 8, 5, transform=RelabelReward(curriculum))
     stored = make_replay(100, 2, 8, 5)
     data = rollout(2, 20, weight=0.0)
@@ -93,7 +93,7 @@ def test_samples_carry_todays_reward():
 
 
 def test_relabelling_agrees_with_the_environment_at_the_same_weight():
-    curriculum = BodyRateCurriculum(window=1, cooldown=1)
+    curriculum = BodyRateCurriculum(BodyRateSchedule(window=1, cooldown=1))
     weight = curriculum.update([60.0] * 4)
     replay = make_replay(100, 2, 8, 5, transform=RelabelReward(curriculum))
     data = rollout(2, 20, weight=weight)
