@@ -62,7 +62,7 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
     alive = alive * (1 - batch["terminated"].squeeze(-1)[:, SEEN - 1 : SEEN].float())
     reward = batch["reward"].squeeze(-1)[:, SEEN:] * alive
 
-    open_loop = _open_loop_features(learner, start, batch["previous_action"][:, SEEN:])  # (W, H, F)
+    open_loop = join_features(*model.predict(*start, batch["previous_action"][:, SEEN:]))  # (W, H, F)
     predicted = (model.reward_head.mean(open_loop).squeeze(-1) * alive).sum(1)
     goes_on_at_first = ~(batch["terminated"] | batch["truncated"])[:, SEEN - 1, 0]  # (W,)
     if goes_on_at_first.any():
@@ -92,16 +92,6 @@ def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) 
     """
     cut_off = (batch["truncated"].squeeze(-1)[:, SEEN:] & alive.bool()).any(1)
     return goes_on_at_first & ~cut_off
-
-
-def _open_loop_features(learner: DreamerLearner, start: tuple[Tensor, Tensor], actions: Tensor) -> Tensor:
-    """Predict features ``(W, H, F)`` from actions ``(W, H, A)`` alone."""
-    belief, state = start
-    features = []
-    for action in actions.unbind(1):
-        belief, state = learner.agent.world_model.rssm.imagine_step(belief, state, action)
-        features.append(join_features(belief, state))
-    return torch.stack(features, 1)
 
 
 def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], horizon: int, discount: Tensor) -> Tensor:

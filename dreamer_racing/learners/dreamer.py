@@ -318,6 +318,8 @@ class DreamerLearner:
     def open_loop(self, batch: TensorDictBase, context: int) -> tuple[Tensor, Tensor]:
         """Observe the first ``context`` records of a batch ``[B, T]``, then predict the others from their actions.
 
+        By the networks that are trained, also where averaged ones fly: a loss's own decoder has no average.
+
         Returns:
             Beliefs ``(B, T, D)`` and states ``(B, T, S)``.
         """

@@ -148,12 +148,26 @@ class WorldModel(nn.Module):
         posterior = self.observe(
             {key: observation[key][:, seen] for key in self.encoder.keys}, previous_action[:, seen], is_init[:, seen]
         )
-        beliefs, states = list(posterior.belief.unbind(1)), list(posterior.state.unbind(1))
-        for action in previous_action[:, context:].unbind(1):
-            belief, state = self.rssm.imagine_step(beliefs[-1], states[-1], action)
+        predicted = self.predict(posterior.belief[:, -1], posterior.state[:, -1], previous_action[:, context:])
+        return torch.cat((posterior.belief, predicted[0]), 1), torch.cat((posterior.state, predicted[1]), 1)
+
+    def predict(self, belief: Tensor, state: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict from actions alone.
+
+        Args:
+            belief: ``(B, D)``, before the first action.
+            state: ``(B, S)``, before the first action.
+            actions: ``(B, H, A)``.
+
+        Returns:
+            Beliefs ``(B, H, D)`` and states ``(B, H, S)``, one after each action.
+        """
+        beliefs, states = [belief], [state]
+        for action in actions.unbind(1):
+            belief, state = self.rssm.imagine_step(belief, state, action)
             beliefs.append(belief)
             states.append(state)
-        return torch.stack(beliefs, 1), torch.stack(states, 1)
+        return torch.stack(beliefs, 1)[:, 1:], torch.stack(states, 1)[:, 1:]
 
     def images(self, belief: Tensor, state: Tensor) -> Tensor:
         """Decode images uint8 ``(B, T, height, width, 3)`` from beliefs ``(B, T, D)`` and states ``(B, T, S)``.
