@@ -165,8 +165,7 @@ def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
     """Collect as the recipe does, with or without workers."""
     env = make_own_env(config)
     learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
-    collector, ahead = make_rollouts(config, env, learner)
-    rollouts = iter(collector) if ahead is None else ahead
+    collector, rollouts = make_rollouts(config, env, learner)
     for _ in range(WARM_UP):
         next(rollouts)
     flown, age, rounds, taken = 0.0, 0, 0, 0.0
@@ -174,12 +173,10 @@ def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
     while taken < seconds:
         next(rollouts)
         rounds, taken = rounds + 1, time.perf_counter() - start
-        if isinstance(ahead, RayRollouts):
-            flown, age = flown + ahead.seconds, max(age, ahead.weights_age)
-    if ahead is not None:
-        ahead.close()
-    else:
-        collector.shutdown()
+        if isinstance(rollouts, RayRollouts):
+            flown, age = flown + rollouts.seconds, max(age, rollouts.weights_age)
+    rollouts.close()
+    collector.shutdown()
     env.close(raise_if_closed=False)
     if config.collector is not CollectorKind.ray:
         return found(config, rounds, taken)

@@ -38,7 +38,6 @@ from torch import device as Device
 from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
@@ -89,8 +88,6 @@ class DreamerRun(ReplayRun):
         """Take note of the gates passed, and of how they were flown, too."""
         episodes = super().take_in(rollout)
         self.learner.watch(rollout)
-        if isinstance(self.rollouts, RolloutsAhead):
-            self.metrics.push(self.rollouts.metrics())
         if len(episodes) and "gates_passed" in episodes:
             share = self.passes.update(episodes, self.counters["env_steps"])
             self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})
@@ -157,24 +154,11 @@ class DreamerRun(ReplayRun):
             assert latents is not None, "the update left them"
             self.replay.refresh(batch["index"], latents["belief"], latents["state"])
 
-    def settle(self) -> None:
-        """Take in the rollout that is under way, if there is one."""
-        if isinstance(self.rollouts, RolloutsAhead) and (rollout := self.rollouts.drain()) is not None:
-            self.take_in(rollout)
-
     def save(self) -> Path:
         """Save everything, if the processes' networks are still the same."""
         self.learner.check_finite()  # first: weights that are no numbers are never the same
         parallel.check_same(self.learner.weights)
         return super().save()
-
-    def close(self) -> None:
-        """End what collects ahead, if anything does."""
-        if isinstance(self.rollouts, RolloutsAhead):
-            self.rollouts.close()
-            if not self.rollouts.has_worlds:
-                self.env.close()  # which else belongs to the collector
-        super().close()
 
 
 def lag_error(metrics: dict[str, Tensor], prefix: str = "") -> Tensor | None:

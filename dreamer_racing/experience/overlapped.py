@@ -13,7 +13,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from dreamer_racing.experience.ahead import RolloutsAhead
+from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.modules import DreamerPolicy
 
 
@@ -22,7 +22,7 @@ def acting_copy(policy: DreamerPolicy) -> DreamerPolicy:
     return copy.deepcopy(policy).requires_grad_(False)
 
 
-class OverlappedRollouts(RolloutsAhead):
+class OverlappedRollouts(Rollouts):
     """Collects one rollout ahead.
 
     Args:
@@ -36,7 +36,7 @@ class OverlappedRollouts(RolloutsAhead):
     """
 
     def __init__(self, collector: Any, acting: DreamerPolicy, policy: DreamerPolicy) -> None:
-        self._rollouts = iter(collector)
+        super().__init__(collector)
         self._acting, self._policy = acting, policy
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="collector")
         self._next: Future[TensorDictBase] | None = None
@@ -45,7 +45,7 @@ class OverlappedRollouts(RolloutsAhead):
         """Return the rollout that was collected meanwhile, and begin the next."""
         if self._next is None:
             self._copy_weights()
-            rollout = next(self._rollouts)
+            rollout = super().__next__()
         else:
             rollout = self._next.result()
         rollout = rollout.clone()  # the collector writes the next one over it

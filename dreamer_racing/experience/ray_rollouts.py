@@ -32,9 +32,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from dreamer_racing.experience import ray_cluster
-from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
 from dreamer_racing.experience.ray_worker import Flight, Request
+from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.modules import DreamerPolicy
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ REMIND = 30.0  # s, after which it is said that workers are waited for
 FAREWELL = 10.0  # s that a run which is to stop waits for the round under way
 
 
-class RayRollouts(RolloutsAhead):
+class RayRollouts(Rollouts):
     """Rounds of rollouts, one ahead of the learner.
 
     Args:

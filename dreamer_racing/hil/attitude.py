@@ -7,8 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+Numbers = Sequence[float] | np.ndarray
 
-def product(first: Sequence[float], second: Sequence[float]) -> tuple[float, ...]:
+
+def product(first: Numbers, second: Numbers) -> tuple[float, ...]:
     """Multiply two quaternions, each (4,) wxyz: the rotation `second`, then `first`."""
     a, b, c, d = first
     w, x, y, z = second
@@ -20,7 +22,7 @@ def product(first: Sequence[float], second: Sequence[float]) -> tuple[float, ...
     )
 
 
-def conjugate(attitude: Sequence[float]) -> tuple[float, ...]:
+def conjugate(attitude: Numbers) -> tuple[float, ...]:
     """Return the inverse of an attitude (4,) wxyz of unit length."""
     w, x, y, z = attitude
     return (w, -x, -y, -z)
@@ -44,8 +46,8 @@ def rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         first: (4,) wxyz, unit length.
         second: (4,) wxyz, unit length.
     """
-    cosine, *axis = product(conjugate(first), second)  # cosine of half the angle, sine times axis
-    axis = np.array(axis)
+    cosine, *vector = product(conjugate(first), second)  # cosine of half the angle, and its sine times the axis
+    axis = np.array(vector)
     sine = float(np.linalg.norm(axis))
     half = math.atan2(sine, abs(cosine))
     scale = 2.0 if sine < 1e-9 else 2.0 * half / sine

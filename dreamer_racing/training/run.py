@@ -24,8 +24,8 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing import parallel
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
-from dreamer_racing.experience.ahead import RolloutsAhead, WorkerError
 from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.machine import KeptMemory
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import RunClock
@@ -68,7 +68,7 @@ class Run:
     directory: RunDirectory
     env: EnvBase
     collector: Collector
-    rollouts: Iterator[TensorDictBase]
+    rollouts: Rollouts
     tracker: EpisodeTracker
     curriculum: BodyRateCurriculum | None
     learner: Any  # the recipe's Learner
@@ -105,6 +105,7 @@ class Run:
         episodes = parallel.gathered_rows(self.tracker.update(rollout))
         self.counters["episodes"] += len(episodes)
         self.metrics.push(self.tracker.summary(episodes), len(episodes))
+        self.metrics.push(self.rollouts.metrics())
         if self.curriculum:
             self.env.body_rate_weight = self.curriculum.update(episodes["return"])
             self.metrics.push({"curriculum/body_rate_weight": self.env.body_rate_weight})
@@ -138,12 +139,13 @@ class Run:
             self.unsaved.pop(what, None)
 
     def settle(self) -> None:
-        """Take in what is collected already; nothing, unless collection is ahead of learning."""
+        """Take in the rollout that is under way, if there is one."""
+        if (rollout := self.rollouts.drain()) is not None:
+            self.take_in(rollout)
 
     def wait(self) -> None:
         """Wait until nothing else draws from the random numbers of this process, to set them back after a look."""
-        if isinstance(self.rollouts, RolloutsAhead):
-            self.rollouts.wait()
+        self.rollouts.wait()
 
     def keep_up(self, progress: Progress) -> None:
         """Evaluate and log if it is due by now; of several processes the first does, and all take note."""
@@ -198,7 +200,10 @@ class Run:
             return "there is no checkpoint yet"
 
     def close(self) -> None:
-        """Free simulators and files."""
+        """End collection; free simulators and files."""
+        self.rollouts.close()
+        if not self.rollouts.has_worlds:
+            self.env.close()  # which else belongs to the collector
         self.collector.shutdown()
         self.report.close()
         self.metrics.close()
@@ -260,8 +265,7 @@ def train(run: Run) -> None:
     ):
         stop.say = progress.answer
         run.say, run.report.on_episode, run.report.attempt = progress.say, progress.evaluating, run.attempt
-        if isinstance(run.rollouts, RolloutsAhead):
-            run.rollouts.stopping = lambda: stop.signal_name is not None
+        run.rollouts.stopping = lambda: stop.signal_name is not None
         if leads and run.directory.finished_env_steps() > counters["env_steps"]:
             run.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
         try:

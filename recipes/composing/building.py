@@ -32,9 +32,9 @@ from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.envs.tracks import TrackError
-from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
@@ -292,17 +292,11 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
-def begin_anew(
-    env: Environment,
-    curriculum: BodyRateCurriculum | None,
-    rollouts: RolloutsAhead | None,
-    env_steps: int,
-) -> None:
+def begin_anew(env: Environment, curriculum: BodyRateCurriculum | None, rollouts: Rollouts, env_steps: int) -> None:
     """Tell worlds that begin anew, in the midst of a run, how far it is."""
     if curriculum:
         env.body_rate_weight = curriculum.body_rate_weight
-    if rollouts:
-        rollouts.begin_at(env_steps)
+    rollouts.begin_at(env_steps)
 
 
 def go_on_owing(owed: UpdatesOwed | None, config: RunConfig, env_steps: int) -> None:
@@ -324,7 +318,7 @@ def assemble(
     learner: Learner,
     collector: Collector,
     curriculum: BodyRateCurriculum | None,
-    rollouts: RolloutsAhead | None = None,
+    rollouts: Rollouts | None = None,
     **own: Any,
 ) -> R:
     """Put a run together in its directory, restored from a checkpoint if it continues one.
@@ -336,18 +330,18 @@ def assemble(
         lock: of its directory.
         env: to train in.
         learner: what learns.
-        collector: of its rollouts.
+        collector: what flies.
         curriculum: of rewards, if there is one.
-        rollouts: an iterator over the collector; None for its own.
+        rollouts: what it flies; None for one rollout after the other.
         own: further fields of ``kind``; a ``replay`` is saved with the run.
     """
-    directory = RunDirectory(lock.directory)
+    directory, rollouts = RunDirectory(lock.directory), rollouts or Rollouts(collector)
     tracker = EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
     counters = {"env_steps": 0, "updates": 0, "episodes": 0}
     parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
     parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
     parts |= {name: own[name] for name in ("replay", "owed", "lag", "passes") if name in own}
-    if rollouts and not rollouts.has_worlds:
+    if not rollouts.has_worlds:
         del parts["env"], parts["collector"]
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
         parts["actor_loss"] = LossState(learner.losses["actor"])
@@ -376,7 +370,7 @@ def assemble(
         directory=directory,
         env=env,
         collector=collector,
-        rollouts=rollouts or iter(collector),
+        rollouts=rollouts,
         tracker=tracker,
         curriculum=curriculum,
         learner=learner,

@@ -130,7 +130,7 @@ def _leaves(config: DictConfig, name: str) -> list[str]:
         return []
     if not isinstance(value, DictConfig):
         return [name]
-    return [leaf for key in value for leaf in _leaves(config, f"{name}.{key}")]
+    return [leaf for key in value for leaf in _leaves(config, name + "." + str(key))]
 
 
 def refuse_to_replace(config: RunConfig) -> None:

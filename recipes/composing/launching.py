@@ -28,7 +28,7 @@ from composing.saved import begun_with, changed_settings, keep_saved, saved_conf
 from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
-from dreamer_racing.experience.ahead import WorkerError
+from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,

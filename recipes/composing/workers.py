@@ -15,9 +15,9 @@ from composing.learners import make_agent
 from composing.schema import CollectorKind, DreamerConfig, WorkersConfig, is_race
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
-from dreamer_racing.experience.ahead import RolloutsAhead
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
 from dreamer_racing.experience.ray_rollouts import RayRollouts
+from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.modules import DreamerPolicy, Interface
@@ -52,10 +52,8 @@ def make_own_env(config: DreamerConfig) -> Environment:
     return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
 
 
-def make_rollouts(
-    config: DreamerConfig, env: Environment, learner: DreamerLearner
-) -> tuple[Collector, RolloutsAhead | None]:
-    """Make the collector of a run, and the iterator over it if it is not the collector's own.
+def make_rollouts(config: DreamerConfig, env: Environment, learner: DreamerLearner) -> tuple[Collector, Rollouts]:
+    """Make the collector of a run, and the rollouts that come of it.
 
     Raises:
         ValueError: workers cannot be had; the message says what was found.
@@ -64,7 +62,8 @@ def make_rollouts(
     if config.collector is CollectorKind.ray:
         return make_workers(config, env, policy)
     if config.collector is CollectorKind.local:
-        return make_collector(config, env, policy), None
+        collector = make_collector(config, env, policy)
+        return collector, Rollouts(collector)
     acting = acting_copy(policy)
     collector = make_collector(config, env, acting)
     return collector, OverlappedRollouts(collector, acting, policy)

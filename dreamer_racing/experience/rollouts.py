@@ -1,7 +1,8 @@
-"""Rollouts that are collected while those before them are learned from."""
+"""What a run learns from: rollouts, one after the other."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
 
 from tensordict import TensorDictBase
 
@@ -10,10 +11,13 @@ class WorkerError(RuntimeError):
     """Who flies failed, or is gone and does not come back: what is under way is given up, all before was delivered."""
 
 
-class RolloutsAhead(Iterator[TensorDictBase]):
-    """Rollouts ``[N, T]``, of which after each ``next()`` one more is under way.
+class Rollouts(Iterator[TensorDictBase]):
+    """Rollouts ``[N, T]`` of a collector, each flown when it is asked for; subclasses have the next one under way then.
 
     Who takes them learns from what was delivered before the next ``next()``.
+
+    Args:
+        collector: What flies, e.g. a TorchRL collector.
 
     Attributes:
         has_worlds: Whether the worlds that are flown live in this process, and are saved with the run.
@@ -22,6 +26,13 @@ class RolloutsAhead(Iterator[TensorDictBase]):
 
     has_worlds = True
     stopping: Callable[[], bool] = staticmethod(lambda: False)
+
+    def __init__(self, collector: Iterable[TensorDictBase]) -> None:
+        self._rollouts = iter(collector)
+
+    def __next__(self) -> TensorDictBase:
+        """Return the next rollout."""
+        return next(self._rollouts)
 
     def metrics(self) -> dict[str, float]:
         """Return what is to be said of the rollout that was delivered last."""
@@ -33,13 +44,12 @@ class RolloutsAhead(Iterator[TensorDictBase]):
     def wait(self) -> None:
         """Wait until nothing under way draws from this process's random numbers; it is delivered as ever."""
 
-    @abstractmethod
     def drain(self) -> TensorDictBase | None:
         """Return the rollout under way, if there is one, and begin no other: nothing moves until the next ``next()``.
 
         What a checkpoint holds of replay, environment and collector then belongs together.
         """
+        return None
 
-    @abstractmethod
     def close(self) -> None:
-        """End collection; a rollout under way is not delivered any more."""
+        """End what is under way; it is not delivered any more."""
