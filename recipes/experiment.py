@@ -104,7 +104,8 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     check_variant(config)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
-    overrides = merge_overrides(chosen, [override for override in given if override_key(override) not in OWN])
+    of_recipe = [override for override in given if override_key(override).partition(".")[0] not in OWN]
+    overrides = merge_overrides(chosen, of_recipe)
     overrides += config.variants[config.variant]
     wanted = cast(RunConfig, compose(config.algorithm, overrides))
     recipe = [sys.executable, str(FOLDER / f"{config.algorithm}.py")]

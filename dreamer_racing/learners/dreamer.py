@@ -240,7 +240,10 @@ class DreamerLearner:
         """Compute losses and gradients of a batch; return detached scalars."""
         with self.autocast(), self._weights():
             metrics = self.compute_losses(batch, timed)
-        total = torch.stack([value for key, value in metrics.items() if key.startswith("loss_")]).sum()
+        losses = {key: value for key, value in metrics.items() if key.startswith("loss_")}
+        if shapes := {key: tuple(value.shape) for key, value in losses.items() if value.dim()}:
+            raise ValueError(f"losses must be scalars, and these have shapes: {shapes}; take their means.")
+        total = torch.stack(list(losses.values())).sum()
         with timed("optimise"):
             total.backward()
             norms = gradient_norms(self._networks)

@@ -363,7 +363,6 @@ def assemble(
     if parallel.is_first():
         directory.set_aside_after(counters["env_steps"])
         write_configuration(directory, config, overrides, counters["env_steps"])
-    metrics = make_metrics(config, directory, journal.pending)
     print(f"run directory: {directory.path}")
     return kind(
         config=config,
@@ -375,7 +374,7 @@ def assemble(
         curriculum=curriculum,
         learner=learner,
         report=make_run_report(config, directory.path, learner),
-        metrics=metrics,
+        metrics=make_metrics(config, directory, journal.pending),
         schedule=journal.schedule,
         checkpoints=checkpoints,
         best=best,

@@ -7,9 +7,11 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -111,7 +113,8 @@ def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[
 
 def no_such_setting(name: str, recipe_name: str) -> str:
     """Say that there is no setting of a name, and which may be meant."""
-    with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+    ready = GlobalHydra.instance().is_initialized()  # in the midst of an experiment
+    with nullcontext() if ready else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         known = setting_names(hydra.compose(recipe_name))
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(name, known, n=1) or [

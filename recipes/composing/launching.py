@@ -36,7 +36,7 @@ from dreamer_racing.machine import (
     out_of_memory_advice,
 )
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
-from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
+from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint
 from dreamer_racing.training.run import train
 from dreamer_racing.training.schedule import Ramp, RampClock
 
@@ -155,6 +155,8 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
         name, value = override_key(override), override.partition("=")[2]
         if name == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
             raise ValueError(f"{override}: the run goes on in its own directory, {run_dir}. Leave it out.")
+        if name == "init_from" and override_value(override) != OmegaConf.select(known, name):
+            raise ValueError(f"{override}: the run goes on with its own weights. Leave it out, or begin anew with it.")
         trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
         if name in TRAINED_ON and OmegaConf.from_dotlist([f"value={value}"]).value != trained:
             raise ValueError(
@@ -187,13 +189,16 @@ def is_finished(config: DictConfig) -> bool:
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
     """Say where best policy, latest film and latest plot of a finished run are, and which commands go on from there."""
-    left = {"run": directory.path, "best policy": directory.best.path}
+    left = {"run": directory.path}
+    if any(directory.best.checkpoints.glob(f"{PREFIX}-*")):
+        left["best policy"] = directory.best.path
     if (evaluation := directory.latest_evaluation()) is not None:
         left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
     place, longer = _from_here(directory.path), 2 * config.total_env_steps
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
+    noisy = " start_noise=1" if is_race(config) else ""  # else all of the deterministic policy's flights are alike
     commands = {
-        "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100",
+        "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100{noisy}",
         "watch it fly": f"{command('fly')} {given['agent']}" if is_race(config) else "",
         "draw it": f"{command('plot')} {given['runs']} output=figures",
         "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{_rising(config)}",

@@ -1,5 +1,6 @@
 """What is made of an experiment at its end: hydra calls this after a multirun."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ class DrawFigures(Callback):
 
     def __init__(self, axis: str = "env_steps") -> None:
         self._axis = axis
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Forget what failed in an earlier multirun: what fails again says so again."""
+        shutil.rmtree(Path(config.hydra.sweep.dir) / FAILURES, ignore_errors=True)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Draw everything for which there is something to draw; end with status 1 if a run has failed."""

@@ -430,6 +430,14 @@ def test_state_of_an_actor_that_learned_otherwise_is_refused_before_anything_cha
     assert_refused(saved, learner, "loss.actor|trained with another loss")
 
 
+def test_a_loss_that_is_no_scalar_is_refused_by_name():
+    learner = learner_of(seed=0, **CONFIG)
+    compute = learner.losses["critic"].forward
+    learner.losses["critic"].forward = lambda *args: compute(*args).set("loss_mine", torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"losses must be scalars, .*'loss_mine': \(2, 3\)"):
+        learner.update(make_batch())
+
+
 def test_averaged_weights_move_by_their_rate_and_fly_evaluations():
     learner = learner_of(seed=0, **CONFIG | {"average_rate": 0.25})
     assert learner.evaluation_policy().actor is learner.averaged.actor

@@ -43,6 +43,12 @@ def test_whole_numbers_may_be_written_short_and_paths_as_they_are(argument: str,
     assert recipe_module("composing.entry").readable(argument) == taken
 
 
+def test_a_setting_that_is_none_is_said_in_the_midst_of_an_experiment_too() -> None:
+    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
+        words = recipe_module("composing.entry").no_such_setting("loss.discount", "ppo")
+    assert "loss.discount: there is no such setting of recipes/ppo.py (did you mean ppo.discount?)" in words
+
+
 @pytest.mark.parametrize("text", ["runs/a-b_1.2", "läufe/k1", "a,b", "it's", "a\\'b\\", "(x)[y]{z}=1#&", "null", "1e3"])
 def test_any_text_can_be_said_to_hydra(text: str) -> None:
     command_line = recipe_module("composing.command_line")

@@ -51,6 +51,21 @@ def test_a_run_starts_with_what_was_given_and_what_its_variant_adds(tmp_path: Pa
     assert next_command(tmp_path, *CHOSEN) == ["sac.py", f"run_dir={tmp_path / RUN}", *OVERRIDES]
 
 
+def test_a_variant_of_the_command_line_is_not_handed_to_the_recipe(tmp_path: Path) -> None:
+    chosen = [word for word in CHOSEN if not word.startswith("variant=")]
+    command = next_command(tmp_path, *chosen, "+variants.slow=['env.num_envs=4']", "variant=slow")
+    assert command is not None and command[-1] == "env.num_envs=4" and not any("variants" in word for word in command)
+
+
+def test_failures_of_an_earlier_command_are_forgotten(tmp_path: Path) -> None:
+    report = recipe_module("composing.report")
+    note = tmp_path / report.FAILURES / "ppo_circle_slip_seed0.txt"
+    note.parent.mkdir()
+    note.write_text("variant=slip: there are default")
+    report.DrawFigures().on_multirun_start(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+    assert not note.exists()
+
+
 @pytest.mark.parametrize("content", [b"{", b"a: b", b"\xff\xfe\x00", b"!!python/name:os.system", b"- 'x=['"])
 def test_damaged_overrides_are_refused_in_words(tmp_path: Path, content: bytes) -> None:
     run_dir = leave_run(tmp_path / RUN, 999_999, OVERRIDES, finished=False)

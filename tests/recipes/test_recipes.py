@@ -105,6 +105,8 @@ def test_a_resumed_run_cannot_change_its_track(run_dir: Path) -> None:
         training.resumed_config("dreamer_v3", str(run_dir), ["+decoys=paper"])
     with pytest.raises(ValueError, match="trained with env.camera_tilt=25"):
         training.resumed_config("dreamer_v3", str(run_dir), ["env.camera_tilt=10"])
+    with pytest.raises(ValueError, match="init_from=kidney: the run goes on with its own weights"):
+        training.resumed_config("dreamer_v3", str(run_dir), ["init_from=kidney"])
     recipe_module("composing.schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         _, overrides = training.resumed_config("dreamer_v3", str(run_dir), ["track=circle", "seed=1"])
