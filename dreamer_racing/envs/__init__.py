@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv as ControlSuiteEnv
     from dreamer_racing.envs.dm_control_env import load as load
+    from dreamer_racing.envs.simulator.scene import Camera as Camera
     from dreamer_racing.envs.torchrl_env import DroneRacingEnv as DroneRacingEnv
     from dreamer_racing.envs.tracks import load_track as load_track
     from dreamer_racing.envs.worlds import RaceWorlds as RaceWorlds
 
 _HOMES = {
+    "Camera": "simulator.scene",
     "ControlSuiteEnv": "control_suite",
     "DroneRacingEnv": "torchrl_env",
     "RaceWorlds": "worlds",
@@ -21,7 +23,7 @@ _HOMES = {
     "load_track": "tracks",
 }
 
-__all__ = ["ControlSuiteEnv", "DroneRacingEnv", "RaceWorlds", "load", "load_track"]
+__all__ = ["Camera", "ControlSuiteEnv", "DroneRacingEnv", "RaceWorlds", "load", "load_track"]
 
 
 def __getattr__(name: str) -> Any:

@@ -94,7 +94,7 @@ class WorldModelLoss(LossModule):
     reads_privileged: ClassVar[bool] = False
     """Whether the loss needs ``("privileged", "vector")`` of the environment."""
     represent_keys: ClassVar[tuple[str, ...]] = ()
-    """What ``represent`` writes."""
+    """What ``represent`` writes, all of it."""
 
     def __init__(
         self,
@@ -148,6 +148,9 @@ class WorldModelLoss(LossModule):
         )
         features = join_features(posterior.belief, posterior.state)
         losses = self.represent(posterior, features, embedding, tensordict)
+        if unwritten := set(self.represent_keys) - losses.keys():
+            names = ", ".join(sorted(unwritten))
+            raise ValueError(f"{type(self).__name__}.represent left out {names}, which represent_keys promises.")
         losses |= self._head_losses(features, tensordict.get("reward"), tensordict.get("terminated"))
         losses |= self._kl_losses(posterior)
         context = TensorDict({"belief": posterior.belief, "state": posterior.state}, tensordict.batch_size)

@@ -92,6 +92,13 @@ def test_documented_keys_exist_and_are_finite(name):
         assert value.requires_grad == key.startswith("loss_"), key
 
 
+def test_a_promised_key_that_is_not_written_is_named():
+    loss = make_loss("reconstruction")
+    loss.represent_keys = (*loss.represent_keys, "loss_mine")
+    with pytest.raises(ValueError, match="ReconstructionLoss.represent left out loss_mine"):
+        loss(make_batch())
+
+
 @pytest.mark.parametrize("sight", SIGHTS)
 @pytest.mark.parametrize("name", ADDED)
 def test_losses_read_what_the_agent_sees(name, sight):
