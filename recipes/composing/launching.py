@@ -40,13 +40,8 @@ from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of
 from dreamer_racing.training.run import train
 from dreamer_racing.training.schedule import Ramp, RampClock
 
-TRAINED_ON = (
-    "track",
-    "task",
-    "decoys",
-    "env.control_rate",
-    "env.camera_tilt",
-)  # what a run that is resumed cannot change
+TRAINED_ON = ("track", "task", "decoys", "env.control_rate", "env.camera_tilt")
+"""What a run that is resumed cannot change."""
 
 
 def launch(
