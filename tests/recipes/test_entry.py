@@ -44,6 +44,7 @@ def test_whole_numbers_may_be_written_short_and_paths_as_they_are(argument: str,
 
 
 def test_a_setting_that_is_none_is_said_in_the_midst_of_an_experiment_too() -> None:
+    recipe_module("composing.schema").register()
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         words = recipe_module("composing.entry").no_such_setting("loss.discount", "ppo")
     assert "loss.discount: there is no such setting of recipes/ppo.py (did you mean ppo.discount?)" in words
