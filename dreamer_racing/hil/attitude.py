@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 Numbers = Sequence[float] | np.ndarray
+"""Of a quaternion, (4,) wxyz."""
 
 
 def product(first: Numbers, second: Numbers) -> tuple[float, ...]:

@@ -25,7 +25,7 @@ from dreamer_racing.hil.operator import (
     UdpOperator,
     is_remote_terminal,
 )
-from dreamer_racing.hil.pose_sources import MAKING_VELOCITIES, POSE_SOURCES, PoseConfig
+from dreamer_racing.hil.pose_sources import POSE_SOURCES, WITHOUT_VELOCITIES, PoseConfig
 from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
@@ -169,7 +169,7 @@ def check_read(config: HilConfig) -> None:
         (("pose_baud",), config.pose_device is not None, "pose_device="),
         (("pose_topic",), config.pose == "ros2", "pose=ros2"),
         (("pose_message",), config.pose != "udp", "pose=mavlink or ros2"),
-        (("smoothing",), message in MAKING_VELOCITIES, f"poses without velocities, {', '.join(MAKING_VELOCITIES)}"),
+        (("smoothing",), message in WITHOUT_VELOCITIES, f"poses without velocities, {', '.join(WITHOUT_VELOCITIES)}"),
         (("operator_host", "operator_port"), config.operator == "udp", "operator=udp"),
     ):
         for name in names:

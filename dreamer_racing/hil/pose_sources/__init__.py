@@ -89,7 +89,7 @@ def _ros2(config: PoseConfig) -> PoseSource:
     )
 
 
-MAKING_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
+WITHOUT_VELOCITIES = ("VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "PoseStamped")
 """Messages of poses without velocities, which `PoseConfig.smoothing` is for."""
 
 POSE_SOURCES: dict[str, Callable[[PoseConfig], PoseSource]] = {"udp": _udp, "mavlink": _mavlink, "ros2": _ros2}
