@@ -68,6 +68,10 @@ class LossConfig:
         representation_scale: Weight of the representation loss.
         free_nats: KL below which there is no gradient, nats.
         kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
+        image_scale: Weight of the images' reconstruction: losses ``reconstruction`` and ``informed``. The reference has
+            1; less leaves rewards and values more of the gradient.
+        image_share: Share of a window's records, at least one, whose images are decoded, drawn anew in every update;
+            the reference decodes all. Less makes an update cheaper.
         privileged_scale: Weight of decoding the privileged state: losses ``informed`` and ``privileged``.
         barlow_scale: Weight of the redundancy reduction: loss ``decoder_free``.
         continuation: Whether predicted ends of episodes cut imagined returns.
@@ -92,6 +96,8 @@ class LossConfig:
     representation_scale: float = setting(0.1, NOT_NEGATIVE)
     free_nats: float = setting(1.0, NOT_NEGATIVE)
     kl_mode: str = "separate"
+    image_scale: float = setting(1.0, NOT_NEGATIVE)
+    image_share: float = setting(1.0, POSITIVE_SHARE)
     privileged_scale: float = setting(1.0, NOT_NEGATIVE)
     barlow_scale: float = setting(0.05, NOT_NEGATIVE)
     continuation: bool = True

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Self
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -23,20 +24,42 @@ from dreamer_racing.modules.world_model import WorldModel
 class ReconstructionLoss(WorldModelLoss):
     """Reconstruct what the agent sees: DreamerV3.
 
-    Adds, as scalars, ``loss_image`` (squared error summed over an image's pixels, values in [0, 1]) and the metric
-    ``image_error`` (mean squared error of a pixel) where the agent sees images; ``loss_vector`` (squared error of
-    symlogs, summed) where it sees numbers. Everything else as ``WorldModelLoss``.
+    Adds, as scalars, ``loss_image`` (squared error summed over an image's pixels, values in [0, 1], scaled) and the
+    metric ``image_error`` (mean squared error of a pixel) where the agent sees images; ``loss_vector`` (squared error
+    of symlogs, summed) where it sees numbers. Everything else as ``WorldModelLoss``.
+
+    Args:
+        world_model: The module to train.
+        image_scale: Weight of the images' squared error.
+        image_share: Share of a window's records, at least one, whose images are decoded: those of the same random
+            places in all windows, drawn anew in every call. With 1 nothing is drawn.
+        kwargs: Of ``WorldModelLoss``.
     """
 
     decodes = True
 
-    def __init__(self, world_model: WorldModel, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        world_model: WorldModel,
+        *,
+        image_scale: float = LossConfig.image_scale,
+        image_share: float = LossConfig.image_share,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(world_model, **kwargs)
+        self.image_scale = image_scale
+        self.image_share = image_share
         images = ["loss_image", "image_error"] if world_model.decoder is not None else []
         numbers = ["loss_vector"] if world_model.vector_decoder is not None else []
         self.out_keys = [*images, *numbers, *self.out_keys]
         if world_model.decoder is None and world_model.vector_decoder is None:
             raise ValueError(f"{type(self).__name__} needs a world model with decoders: WorldModel(..., decode=True).")
+
+    @classmethod
+    def from_config(cls, agent: Agent, config: LossConfig, **own: Any) -> Self:
+        """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
+        images = {"image_scale": config.image_scale, "image_share": config.image_share}
+        return super().from_config(agent, config, **images, **own)
 
     def represent(
         self, posterior: Posterior, features: Tensor, embedding: Tensor, tensordict: TensorDictBase
@@ -44,13 +67,22 @@ class ReconstructionLoss(WorldModelLoss):
         """Return the reconstruction losses."""
         losses: dict[str, Tensor] = {}
         if self.world_model.decoder is not None:
-            pixels = tensordict.get(PIXELS)
-            error = self.world_model.decoder.squared_error(posterior.belief, posterior.state, pixels)
+            belief, state, pixels = self._drawn(posterior.belief, posterior.state, tensordict.get(PIXELS))
+            error = self.world_model.decoder.squared_error(belief, state, pixels)
             # Mean over the batch of the sum over an image.
-            losses |= {"loss_image": error * pixels.shape[-3:].numel(), "image_error": error.detach()}
+            image = self.image_scale * error * pixels.shape[-3:].numel()
+            losses |= {"loss_image": image, "image_error": error.detach()}
         if self.world_model.vector_decoder is not None:
             losses["loss_vector"] = self.world_model.vector_decoder.squared_error(features, tensordict.get(VECTOR))
         return losses
+
+    def _drawn(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """Return each ``(B, T, ...)`` at ``image_share`` of its T records."""
+        if self.image_share == 1:
+            return values
+        time = values[0].shape[1]
+        places = torch.rand(time, device=values[0].device).argsort()[: max(1, round(self.image_share * time))]
+        return tuple(value.index_select(1, places) for value in values)
 
 
 class PrivilegedLoss(WorldModelLoss):

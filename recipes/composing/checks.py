@@ -43,6 +43,7 @@ from dreamer_racing.losses import (
     LossConfig,
     PPOActorLoss,
     PrivilegedLoss,
+    ReconstructionLoss,
     WorldModelLoss,
     find_loss,
 )
@@ -104,6 +105,8 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.ppo.updates", _is(actor, PPOActorLoss), "loss.actor=ppo"),
         ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo or asymmetric_ppo"),
         ("loss.ppo.critic_learning_rate", _is(actor, AsymmetricPPOActorLoss), "loss.actor=asymmetric_ppo"),
+        ("loss.image_scale", _is(model, ReconstructionLoss), "loss=reconstruction or informed"),
+        ("loss.image_share", _is(model, ReconstructionLoss), "loss=reconstruction or informed"),
         ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
         ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
         ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),

@@ -159,6 +159,49 @@ def test_image_loss_is_the_squared_error_summed_over_an_image():
     assert losses["image_error"].item() == pytest.approx(error.mean(), rel=1e-5)
 
 
+@pytest.mark.parametrize("name", ["reconstruction", "informed"])
+def test_image_scale_multiplies_the_image_loss_alone(name):
+    batch, found = make_batch(), []
+    for scale in (1.0, 0.25):
+        loss = make_loss(name, image_scale=scale)
+        torch.manual_seed(2)
+        found.append(loss(batch).exclude("replay_context"))
+    whole, scaled = found
+    whole["loss_image"] *= 0.25
+    torch.testing.assert_close(whole.to_dict(), scaled.to_dict())
+
+
+@pytest.mark.parametrize(("share", "records"), [(0.01, 1), (0.25, 1), (0.5, 2), (0.8, 3)])
+def test_image_share_decodes_some_records_of_a_window_and_others_next_time(share, records):
+    loss, batch = make_loss("reconstruction", image_share=share), make_batch()
+    decoded = []
+    whole = loss.world_model.decoder.squared_error
+    errors = []
+
+    def squared_error(belief, state, pixels):
+        places = [t for t in range(4) if (batch["pixels"][:, t].unsqueeze(1) == pixels).flatten(2).all(-1).all(0).any()]
+        assert belief.shape[:2] == state.shape[:2] == pixels.shape[:2] == (2, records)
+        decoded.append(tuple(places))
+        errors.append(whole(belief, state, pixels))
+        return errors[-1]
+
+    loss.world_model.decoder.squared_error = squared_error
+    for _ in range(20):
+        losses = loss(batch)
+        assert losses["image_error"] == errors[-1]
+        assert losses["loss_image"].item() == pytest.approx(errors[-1].item() * 64 * 64 * 3)
+    assert all(len(places) == records for places in decoded)
+    assert {place for places in decoded for place in places} == {0, 1, 2, 3}
+
+
+def test_all_images_decoded_draw_nothing():
+    """Runs of before ``image_share`` go on bit for bit."""
+    loss, batch = make_loss("reconstruction"), make_batch()
+    state = torch.get_rng_state()
+    loss._drawn(batch["pixels"])
+    assert (torch.get_rng_state() == state).all()
+
+
 def test_vector_loss_is_the_squared_error_of_symlogs_summed_over_the_vector():
     loss, batch = make_loss("reconstruction", "both"), make_batch()
     posterior = observed(loss, batch)

@@ -162,6 +162,8 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.actor=ppo", "loss.ppo.flown=200"], "loss.ppo.flown=200 is for loss.actor=flown_ppo or"),
         (["loss.actor=flown_ppo", "loss.ppo.critic_learning_rate=1"], "is for loss.actor=asymmetric_ppo, which is not"),
         (["loss=reconstruction", "loss.privileged_scale=3"], "privileged_scale=3.* is for loss=privileged or informed"),
+        (["loss=privileged", "loss.image_scale=3"], "image_scale=3.* is for loss=reconstruction or informed"),
+        (["loss=decoder_free", "loss.image_share=0.5"], "image_share=0.5 is for loss=reconstruction or informed"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
         (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
@@ -181,6 +183,7 @@ def test_what_nothing_would_read_is_refused(overrides: list[str], words: str) ->
         ["tuned=race", "loss.actor=reinforce", "schedule.kl_target.to=null"],
         ["loss.actor=ppo", "loss.ppo.updates=2", "model.imagination_starts=8"],
         ["loss=informed", "loss.privileged_scale=3", "replay.recent_share=0.1", "replay.recent_records=9"],
+        ["loss=informed", "loss.image_scale=3", "loss.image_share=0.5"],
         ["loss.actor=dreamer_racing_of_mine:Loss", "loss.ppo.flown=9"],
     ],
 )
