@@ -1,12 +1,16 @@
-"""How fast a fresh world model learns to see, on the replay of a run: the error of the decoded state, by updates.
+"""How fast a fresh world model learns to see, on the replay of a run: what can be told of the state, by updates.
 
     OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --variant "" "model.learning_rate=2e-3" size.cnn_depth=32
+    OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --updates 600 --variant loss.world_model=privileged \
+        loss.world_model=reconstruction "loss.world_model=reconstruction loss.image_scale=0.003"
 
 A variant is a list of overrides of the run's settings, or `size.<field>` of the networks' size. The loss of the world
 model alone is trained, on windows as the run draws them, but without stored latents; no actor is there.
-`error` is the mean square of symlogs on records that the run never trains on, `trained` that of the last batch,
-`seconds` the process's time in updates. The checkpoint must hold a replay, so no best/, and the loss must decode the
-state.
+`probe` is the error of a small network that learns beside it to tell the state from the latents and teaches them
+nothing, so that losses can be compared; `error` that of the loss's own decoder, if it has one; both mean squares of
+symlogs on windows that the run never trains on, the same ones for all variants. `share` is `probe` by their variance,
+`trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
+best/, and the run must have been given the state: `loss=privileged`, or `loss.actor=asymmetric_ppo`.
 """
 
 import argparse
@@ -21,6 +25,8 @@ import torch
 from learning_signal import restore, restore_replay
 from measuring import print_table, write_json
 from omegaconf import OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
@@ -29,14 +35,16 @@ from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
-from dreamer_racing.losses import make_losses
-from dreamer_racing.modules import Agent, ModelSize
+from dreamer_racing.losses import WorldModelLoss, find_loss, make_losses
+from dreamer_racing.modules import Agent, ModelSize, join_features, symlog
+from dreamer_racing.modules.decoder import VectorDecoder
+from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
-COLUMNS = ["variant", "updates", "seconds", "error", "trained", "kl"]
+COLUMNS = ["variant", "updates", "seconds", "probe", "share", "error", "image_error", "reward_error", "kl"]
 
 
 def main() -> None:
@@ -65,13 +73,17 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
     config, size = varied(trained, variant)
     model = config.model
     replay = restore_replay(config, checkpoint, learner, model.batch_size, model.batch_length)
+    torch.manual_seed(0)  # the same windows for every variant
     test = replay.held_out(HELD_OUT, LENGTH, RECENT)
     assert test is not None, "a replay with worlds held out"
+    assert PRIVILEGED in test.keys(include_nested=True), "a run whose environment gave the state"
     test.pop(CONTEXT, None)
-    torch.manual_seed(0)
-    agent = Agent(size, learner.agent.interface, False, config.loss.min_std, config.loss.max_std)
+    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
+    agent = Agent(size, learner.agent.interface, decodes, config.loss.min_std, config.loss.max_std)
     losses = make_losses(agent, config.loss)
     optimizer, loss = make_optimizer(agent, losses, model), losses["world_model"]
+    probe = Probe(size.features, test[PRIVILEGED].shape[-1])
+    variance = symlog(test[PRIVILEGED]).var((0, 1)).mean()
     context, seconds = autocast(torch.device("cpu"), bool(model.mixed_precision)), 0.0
     for number in range(1, updates + 1):
         batch = replay.sample()
@@ -83,14 +95,42 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         seconds += time.process_time() - begun
+        probe.learn(metrics, batch)
         if number % every == 0:
             with torch.no_grad(), context:
                 seen = loss(test)
+                probed = probe.error(seen, test)
             yield {
                 "benchmark": "seeing", "track": config.track, **counters, "variant": variant, "updates": number,
-                "seconds": seconds, "error": seen["privileged_error"].item(),
-                "trained": metrics["privileged_error"].item(), "kl": seen["loss_dynamics"].item(),
+                "seconds": seconds, "probe": probed.item(), "share": (probed / variance).item(),
+                "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
+
+
+def errors(metrics: TensorDictBase) -> dict[str, float]:
+    """Return what the loss's own decoders say, by column."""
+    names = {"privileged_error": "error", "image_error": "image_error", "reward_error": "reward_error"}
+    return {column: metrics[name].item() for name, column in names.items() if name in metrics.keys()}  # noqa: SIM118
+
+
+class Probe:
+    """A decoder of its own from latents to the state; F features, P privileged numbers."""
+
+    def __init__(self, features: int, privileged: int) -> None:
+        self.decoder = VectorDecoder(features, privileged, layers=2, units=256)
+        self.optimizer = torch.optim.Adam(self.decoder.parameters(), 1e-3)
+
+    def error(self, metrics: TensorDictBase, batch: TensorDictBase) -> Tensor:
+        """Return the mean squared error of symlogs on the latents that a world-model loss has found, a scalar."""
+        latents, state = metrics["replay_context"].detach(), batch[PRIVILEGED]
+        features = join_features(latents["belief"], latents["state"]).float()
+        return self.decoder.squared_error(features, state) / state.shape[-1]
+
+    def learn(self, metrics: TensorDictBase, batch: TensorDictBase) -> None:
+        """Make one gradient step."""
+        self.optimizer.zero_grad()
+        self.error(metrics, batch).backward()
+        self.optimizer.step()
 
 
 def varied(config: DreamerConfig, variant: str) -> tuple[DreamerConfig, ModelSize]:
