@@ -15,7 +15,7 @@ from typing import ClassVar, cast
 
 from composing.building import (
     assemble,
-    claim,
+    claimed,
     make_curriculum,
     make_sequence_replay,
     resolve_common,
@@ -252,25 +252,25 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check_dreamer(config)
     own = share_of(config)
-    lock = claim(config)
-    env = make_own_env(own)
-    with seeded(config.seed):
-        agent = make_agent(own, Interface.of(env))
-        losses = make_losses(agent, own.loss, own.model.imagination_horizon)
-    learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, own.model), own.model)
-    if config.init_from and not config.resume:
-        print(begin_with(learner, config, env))
-    seed_generators(own.seed)
-    curriculum = make_curriculum(config)
-    collector, rollouts = make_rollouts(own, env, learner)
-    latents = learner.latent_format if config.replay.context else None
-    parts = {
-        "replay": make_sequence_replay(own, env, curriculum, latents),
-        "owed": UpdatesOwed(config.replay_ratio),
-        "lag": ModelLag(config.schedule.wait_for_model),
-        "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
-    }
-    return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)
+    with claimed(config) as lock:
+        env = make_own_env(own)
+        with seeded(config.seed):
+            agent = make_agent(own, Interface.of(env))
+            losses = make_losses(agent, own.loss, own.model.imagination_horizon)
+        learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, own.model), own.model)
+        if config.init_from and not config.resume:
+            print(begin_with(learner, config, env))
+        seed_generators(own.seed)
+        curriculum = make_curriculum(config)
+        collector, rollouts = make_rollouts(own, env, learner)
+        latents = learner.latent_format if config.replay.context else None
+        parts = {
+            "replay": make_sequence_replay(own, env, curriculum, latents),
+            "owed": UpdatesOwed(config.replay_ratio),
+            "lag": ModelLag(config.schedule.wait_for_model),
+            "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
+        }
+        return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)
 
 
 if __name__ == "__main__":

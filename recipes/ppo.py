@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from composing.arena import make_env
-from composing.building import assemble, claim, make_collector, make_curriculum, resolve_baseline, seed_generators
+from composing.building import assemble, claimed, make_collector, make_curriculum, resolve_baseline, seed_generators
 from composing.checks import check_ppo
 from composing.entry import recipe
 from composing.launching import launch
@@ -61,12 +61,12 @@ def resolve(config: DictConfig) -> DictConfig:
 def build(config: PPORunConfig, overrides: list[str]) -> PPORun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check_ppo(config)
-    lock = claim(config)
-    env = make_env(config)
-    learner = make_learner(config, Interface.of(env), config.device)
-    seed_generators(config.seed)
-    collector = make_collector(config, env, learner.policy())
-    return assemble(PPORun, config, overrides, lock, env, learner, collector, make_curriculum(config))
+    with claimed(config) as lock:
+        env = make_env(config)
+        learner = make_learner(config, Interface.of(env), config.device)
+        seed_generators(config.seed)
+        collector = make_collector(config, env, learner.policy())
+        return assemble(PPORun, config, overrides, lock, env, learner, collector, make_curriculum(config))
 
 
 if __name__ == "__main__":

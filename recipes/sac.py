@@ -13,7 +13,7 @@ from typing import ClassVar
 from composing.arena import make_env
 from composing.building import (
     assemble,
-    claim,
+    claimed,
     make_collector,
     make_curriculum,
     make_run_replay,
@@ -62,25 +62,25 @@ def resolve(config: DictConfig) -> DictConfig:
 def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
     """Make all parts of the run, restored from a checkpoint if it continues one."""
     check_sac(config)
-    lock = claim(config)
-    env = make_env(config)
-    learner = make_learner(config, Interface.of(env), config.device)
-    seed_generators(config.seed)
-    collector = make_collector(config, env, learner.policy())
-    curriculum = make_curriculum(config)
-    replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
-    return assemble(
-        SACRun,
-        config,
-        overrides,
-        lock,
-        env,
-        learner,
-        collector,
-        curriculum,
-        replay=replay,
-        owed=UpdatesOwed(config.replay_ratio),
-    )
+    with claimed(config) as lock:
+        env = make_env(config)
+        learner = make_learner(config, Interface.of(env), config.device)
+        seed_generators(config.seed)
+        collector = make_collector(config, env, learner.policy())
+        curriculum = make_curriculum(config)
+        replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
+        return assemble(
+            SACRun,
+            config,
+            overrides,
+            lock,
+            env,
+            learner,
+            collector,
+            curriculum,
+            replay=replay,
+            owed=UpdatesOwed(config.replay_ratio),
+        )
 
 
 if __name__ == "__main__":

@@ -23,6 +23,9 @@ class LockHeldByFirst:
     def release(self) -> None:
         """Do nothing."""
 
+    def abandon(self) -> None:
+        """Do nothing."""
+
 
 class UnwrittenMetrics:
     """Takes metrics, and keeps none."""

@@ -51,3 +51,11 @@ class RunLock:
     def release(self) -> None:
         """Let the next one in."""
         self._file.close()
+
+    def abandon(self) -> None:
+        """Let the next one in, and leave no folder behind if nothing was written to it."""
+        path = Path(self._file.name)
+        if list(self.directory.iterdir()) == [path]:
+            path.unlink()
+            self.directory.rmdir()
+        self.release()

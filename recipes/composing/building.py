@@ -3,8 +3,8 @@
 import math
 import random
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -243,18 +243,25 @@ def make_sequence_replay(
     )
 
 
-def claim(config: RunConfig) -> RunLock | LockHeldByFirst:
+@contextmanager
+def claimed(config: RunConfig) -> Iterator[RunLock | LockHeldByFirst]:
     """Take a run directory before anything large is made; of several processes the first one does.
+
+    The run keeps it after the block; if the block fails, the next one gets it, and a folder that was made for it goes.
 
     Raises:
         ValueError: it holds another run, or is in use by a live one.
     """
     assert config.run_dir is not None, "resolve_common() names it"
-    if not parallel.is_first():
-        return LockHeldByFirst(Path(config.run_dir))
-    lock = RunDirectory(Path(config.run_dir)).claim()
-    refuse_to_replace(config)
-    return lock
+    directory = Path(config.run_dir)
+    lock = RunDirectory(directory).claim() if parallel.is_first() else LockHeldByFirst(directory)
+    try:
+        if parallel.is_first():
+            refuse_to_replace(config)
+        yield lock
+    except BaseException:
+        lock.abandon()
+        raise
 
 
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:

@@ -342,3 +342,14 @@ def test_records_in_files_lie_in_the_run_directory_as_long_as_the_run_goes_on(tm
     assert len(run.replay) and {"vector.memmap", "action.memmap", "reward.memmap"} & set(files)
     run.close()
     assert not (tmp_path / "run" / "replay" / "process-0").exists()
+
+
+def test_a_run_that_is_refused_leaves_no_folder_and_its_lock_to_the_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir = tmp_path / "run"
+    for _ in range(2):
+        with pytest.raises(SystemExit):
+            build("track=nowhere.yaml", f"run_dir={run_dir}")
+        assert not run_dir.exists()
+    assert "nowhere.yaml" in capsys.readouterr().err

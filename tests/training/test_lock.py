@@ -31,3 +31,18 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
         process.kill()
         process.wait()
     RunLock(tmp_path).release()
+
+
+@pytest.mark.parametrize("written", [[], ["config.yaml"]])
+def test_what_is_abandoned_leaves_no_folder_unless_something_was_written_to_it(
+    written: list[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    lock = RunLock(run)
+    for name in written:
+        (run / name).touch()
+    lock.abandon()
+    assert [path.name for path in tmp_path.rglob("*") if path.name != ".lock"] == ["run", *written] * bool(written)
+    run.mkdir(exist_ok=True)
+    RunLock(run).release()  # the next one gets it
