@@ -350,6 +350,6 @@ def test_a_run_that_is_refused_leaves_no_folder_and_its_lock_to_the_next(
     run_dir = tmp_path / "run"
     for _ in range(2):
         with pytest.raises(SystemExit):
-            build("track=nowhere.yaml", f"run_dir={run_dir}")
+            build("init_from=nowhere", f"run_dir={run_dir}")
         assert not run_dir.exists()
-    assert "nowhere.yaml" in capsys.readouterr().err
+    assert "nowhere" in capsys.readouterr().err
