@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 from composing.arena import worlds_of
-from composing.command_line import AGENTS, agent_path, plain_errors, start_logging
+from composing.command_line import existing_agent_path, plain_errors, start_logging
 from composing.drawing import run_of, stage_name
 from composing.entry import recipe
 from composing.restoring import restore
@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.protocol import fly as fly_races
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
-from dreamer_racing.export.shipped_agent import agents_in, is_agent
+from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import write_page
 from dreamer_racing.figures.dashboard_live import serve
 from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
@@ -129,16 +129,11 @@ def locate(setting_name: str, place: str) -> Path | str:
     Raises:
         FileNotFoundError: there is nothing of that name, or no flight in it; the message says what would be right.
     """
-    path = Path(place)
+    path = existing_agent_path(setting_name, place)
     if path.is_file():
         return path
-    if is_agent(agent_path(place)):
+    if is_agent(path):
         return place
-    if not path.exists():
-        there = ", ".join(agents_in(AGENTS)) or "none"
-        raise FileNotFoundError(
-            f"{setting_name}={place}: there is no such run directory or file. Agents that ship, by name: {there}."
-        )
     flights = stored_flights(path)
     if not flights:
         raise FileNotFoundError(

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from composing.command_line import agent_path, new_run_dir, plain_errors, start_logging
+from composing.command_line import existing_agent_path, new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
@@ -107,7 +107,7 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
             raise ValueError("beside=pilot and actor=pilot: it would fly the same twice; leave one out.")
         track = load_track(config.track)
         return track, pilot_on(track, config)
-    path = agent_path(config.actor)
+    path = existing_agent_path("actor", config.actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
     track = load_track(config.track) if config.track else trained_track(contract)
     if note := check_contract(contract, track):

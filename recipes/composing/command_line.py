@@ -88,6 +88,24 @@ def agent_path(name: str) -> Path:
     return named if Path(name).name == name and (named / "agent.json").is_file() else Path(name)
 
 
+def existing_agent_path(setting_name: str, name: str) -> Path:
+    """As `agent_path`, of something that is there.
+
+    Raises:
+        FileNotFoundError: nothing is; the message names the setting, and the agents that ship.
+    """
+    path = agent_path(name)
+    if not path.exists():
+        raise FileNotFoundError(f"{setting_name}={name}: there is no such file or folder. {agents_that_ship()}")
+    return path
+
+
+def agents_that_ship() -> str:
+    """A sentence that names them."""
+    names = sorted(path.parent.name for path in AGENTS.glob("*/agent.json"))
+    return f"Agents that ship, to be given by name: {', '.join(names) or 'none'}."
+
+
 def override_key(override: str) -> str:
     """The setting that an override is of."""
     return override.partition("=")[0].lstrip("+~")

@@ -56,6 +56,9 @@ def draw(config: PlotConfig) -> None:
         draw_curves(read_curves(places[0]), output)
         print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
+    for setting_name, files in (("flights", config.flights), ("dreams", config.dreams)):
+        if missing := [str(file) for file in files if not Path(file).is_file()]:
+            raise ValueError(f"{setting_name}={missing[0]}: there is no such file.")
     explicit = {"trajectories": config.flights, "imagined": config.dreams}.get(config.figure)
     asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
     columns = {column for figure in asked for column in figure.columns(config)}
@@ -246,6 +249,8 @@ def stage_name(file: str | Path) -> str:
 def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
+        if config.figure == "comparison":
+            raise ValueError("figure=comparison: these runs are of one variant; runs= takes several paths.")
         return Drawn([], [])
     comparison = compare_variants(runs, problems, config.axis)
     (output / "comparison.md").write_text(comparison_table(comparison), encoding="utf-8")

@@ -32,6 +32,10 @@ WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
+HYDRAS_FLAGS = (
+    "--cfg", "--config-dir", "--config-name", "--config-path", "--experimental-rerun", "--info", "--package",
+)  # fmt: skip
+"""Flags of hydra's that may have a value after an equals sign."""
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
@@ -55,6 +59,7 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
             sys.argv[1:] = [readable(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
             with plain_errors():
+                refuse_dashes(sys.argv[1:])
                 refuse_unknown_settings(sys.argv[1:], name)
             try:
                 main()
@@ -133,6 +138,18 @@ def setting_names(config: DictConfig, prefix: str = "") -> list[str]:
         if not OmegaConf.is_missing(config, key) and isinstance(inner := config[key], DictConfig):
             names += setting_names(inner, f"{name}.")
     return names
+
+
+def refuse_dashes(arguments: Sequence[str]) -> None:
+    """Refuse a setting that is written as a flag, of which hydra has some of its own.
+
+    Raises:
+        ValueError: the message says how it is written.
+    """
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if equals and flag.startswith("--") and flag not in HYDRAS_FLAGS:
+            raise ValueError(f"{argument}: settings are written without dashes, {flag[2:].replace('-', '_')}={value}.")
 
 
 def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from composing.command_line import agent_path
+from composing.command_line import existing_agent_path
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig
@@ -209,8 +209,7 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
         return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
-    path = agent_path(config.actor)
-    flyer = ActorFlyer(path)
+    flyer = ActorFlyer(existing_agent_path("actor", config.actor))
     return flyer, flyer.contract
 
 

@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
 from composing.checks import steps_alone
-from composing.command_line import agent_path
+from composing.command_line import existing_agent_path
 from composing.saved import read_yaml
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.envs import DroneRacingEnv
@@ -69,7 +69,7 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
             configuration is damaged.
     """
     source = str(config.init_from)
-    folder = agent_path(source)
+    folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
         for name in ("env.control_rate", "env.camera_tilt"):

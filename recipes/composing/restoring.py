@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 
 from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
-from composing.command_line import AGENTS, agent_path
+from composing.command_line import agent_path, agents_that_ship
 from composing.devices import choose_device
 from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
 from composing.saved import trained_config
@@ -28,7 +28,6 @@ from dreamer_racing.export.shipped_agent import (
     AVERAGED,
     TRAINED,
     ShippedAgent,
-    agents_in,
     choose_weights,
     is_agent,
     kept_weights,
@@ -137,7 +136,7 @@ def find_trained(name: str) -> Path:
     """Find what `checkpoint=` and `agent=` name: an agent that ships, by its name, or a path.
 
     Args:
-        name: of an agent in `AGENTS`; or path of an agent's folder, a run directory, or a checkpoint.
+        name: of an agent that ships; or path of an agent's folder, a run directory, or a checkpoint.
 
     Returns:
         The folder of the agent, or the newest checkpoint there.
@@ -151,8 +150,7 @@ def find_trained(name: str) -> Path:
     try:
         return newest_sound(name, ("learner", "counters"))
     except FileNotFoundError as error:
-        there = ", ".join(agents_in(AGENTS)) or "none"
-        raise FileNotFoundError(f"{error} Agents that ship, to be given by name: {there}.") from error
+        raise FileNotFoundError(f"{error} {agents_that_ship()}") from error
 
 
 def config_folder(checkpoint: Path) -> Path:

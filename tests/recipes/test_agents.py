@@ -147,10 +147,9 @@ def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> N
 
 
 def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    restoring = recipe_module("composing.restoring")
-    assert restoring.AGENTS == ROOT / "agents"
-    for module in (restoring, recipe_module("composing.command_line")):
-        monkeypatch.setattr(module, "AGENTS", tmp_path)
+    restoring, command_line = recipe_module("composing.restoring"), recipe_module("composing.command_line")
+    assert command_line.AGENTS == ROOT / "agents"
+    monkeypatch.setattr(command_line, "AGENTS", tmp_path)
     with pytest.raises(FileNotFoundError, match="kidny: the path does not exist.* ship, to be given by name: none"):
         restoring.find_trained("kidny")
     for name in ("kidney", "circle"):

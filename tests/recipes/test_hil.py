@@ -70,7 +70,7 @@ def test_what_does_not_go_together_is_refused(changes, message):
         ({"actor": "pilot", "track": "moon"}, "moon"),
         ({"actor": "kidney", "track": "circle"}, "source.track is 'kidney', .* track=circle"),
         ({"actor": "kidney", "rate": 50.0}, "control.rate_hz is 25, and rate=50"),
-        ({"actor": "nobody"}, "There is no file nobody"),
+        ({"actor": "nobody"}, "actor=nobody: there is no such file or folder. Agents that ship, .*: circle"),
         ({"actor": "kidney", "link": "crsf"}, "mass= is missing: link=crsf turns thrust into a throttle by it"),
         ({"actor": "kidney", "device": "/dev/x"}, "device=/dev/x is for crsf, sbus, .* link=simulated goes over UDP"),
         ({"actor": "kidney", "betaflight_dump": "x"}, "betaflight_dump=x is for link=crsf, sbus, msp"),

@@ -76,7 +76,10 @@ def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ([*TINY, *NUMBERS, "init_from=nowhere"], ["nowhere", "does not exist"]),
+        (
+            [*TINY, *NUMBERS, "init_from=nowhere"],
+            ["init_from=nowhere: there is no such file or folder", "by name: circle"],
+        ),
         ([*TINY, "init_from=kidney"], ["size 'cpu_small'", "size 'debug'"]),
         ([*AS_SHIPPED, "init_from=kidney", "env.control_rate=50"], ["control_rate"]),
         ([*AS_SHIPPED, "init_from=kidney", "env.camera_tilt=10"], ["camera_tilt"]),

@@ -160,6 +160,21 @@ def test_bad_settings_are_refused(runs, recipe, settings, words):
         recipe.draw(recipe.PlotConfig(**given))
 
 
+@pytest.mark.parametrize("setting", ["flights", "dreams"])
+@pytest.mark.parametrize("figure", ["all", "learning_curves", "trajectories"])
+def test_a_named_file_that_is_not_there_is_refused_for_any_figure(setting, figure, runs, recipe):
+    config = recipe.PlotConfig(**{setting: ["nowhere.npz"]}, figure=figure, runs=str(runs / "runs"), output=str(runs))
+    with pytest.raises(ValueError, match=f"{setting}=nowhere.npz: there is no such file"):
+        recipe.draw(config)
+
+
+def test_one_variant_is_not_compared(runs, recipe):
+    config = recipe.PlotConfig(figure="comparison", runs=str(runs / "runs" / "dreamer_v3_circle_paper_seed0"))
+    config.output = str(runs / "figures")
+    with pytest.raises(ValueError, match="figure=comparison: these runs are of one variant; runs= takes several"):
+        recipe.draw(config)
+
+
 def test_an_ordinary_folder_of_runs_is_drawn_as_curves_named_by_what_differs(runs, recipe, figures):
     """As `runs/` is after a few days: names with a date, settings tried out, and a seed flown twice."""
     for name, overrides in (("101-120000", []), ("102-120000", ["env.preset=faithful"]), ("103-120000", [])):
