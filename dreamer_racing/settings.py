@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -68,6 +69,22 @@ def check_settings(config: Any, prefix: str = "") -> None:
         elif allowed is not None and value is not None and value not in allowed:
             finite = ", and finite" if value == math.inf else ""
             raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}{finite}.")
+
+
+def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:
+    """Refuse arguments that are no numbers; None passes.
+
+    Args:
+        whole: those that must be whole numbers, by name.
+        real: those that may be fractions, by name.
+
+    Raises:
+        ValueError: the message gives the argument and its value.
+    """
+    for values, kind, words in ((whole, Integral, "a whole number"), (real, Real, "a number")):
+        for name, value in values.items():
+            if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
+                raise ValueError(f"{name}={quoted(value)}: must be {words}.")
 
 
 def given(value: T | None, field: str, needs_it: str) -> T:

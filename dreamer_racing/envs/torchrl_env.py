@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
-from dreamer_racing.envs.simulator.backends import check_device
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds
 
@@ -30,7 +29,7 @@ class DroneRacingEnv(EnvBase):
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
-        worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
+        options: further arguments of `RaceWorlds`, see `RaceOptions`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.
@@ -50,14 +49,15 @@ class DroneRacingEnv(EnvBase):
         privileged: bool = True,
         preset: str | QuadrotorParameters = "easy",
         seed: int | None = None,
-        **worlds: Unpack[RaceOptions],
+        **options: Unpack[RaceOptions],
     ) -> None:
-        check_device(device)  # before TorchRL, which would fail with torch's own words
-        super().__init__(device=device, batch_size=[num_envs])
+        # before TorchRL, which would refuse arguments in torch's own words
+        worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **options)
+        super().__init__(device=device, batch_size=[worlds.num_envs])
         self.from_pixels = from_pixels
         self.privileged = privileged
-        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **worlds)
-        self.track = self.worlds.track
+        self.worlds = worlds
+        self.track = worlds.track
         self.body_rate_weight = self.worlds.race.weights.body_rate
         self._make_specs()
         self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close

@@ -28,6 +28,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.settings import check_numbers, quoted
 
 ACTION_SIZE = 4
 START_LINE = LineLimits(speed=0.7)
@@ -124,11 +125,24 @@ class RaceWorlds:
         miss_radius: float = 0.0,
         control_rate: float | None = None,
     ) -> None:
+        check_numbers(
+            {"num_envs": num_envs, "episode_steps": episode_steps, "num_threads": num_threads, "seed": seed},
+            {
+                "start_beyond_gate": start_beyond_gate,
+                "start_at_gate": start_at_gate,
+                "start_on_line": start_on_line,
+                "start_noise": start_noise,
+                "miss_radius": miss_radius,
+                "control_rate": control_rate,
+            },
+        )
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
+        if camera is not None and not isinstance(camera, Camera):
+            raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
         check_device(device)
         self.track = load_track(track)
-        self.num_envs = num_envs
+        self.num_envs = num_envs = int(num_envs)
         self.evaluation = evaluation
         self.camera = camera or Camera()
         self.parameters = load_preset(preset)
@@ -202,11 +216,18 @@ class RaceWorlds:
         self._starts.on_line = share
 
     def seed(self, seed: int | None) -> None:
-        """Seed start poses and physics randomisation; None draws a seed from the operating system."""
+        """Seed start poses and physics randomisation; None draws a seed from the operating system.
+
+        Raises:
+            ValueError: it is no whole number, or below 0.
+        """
+        check_numbers({"seed": seed}, {})
+        if seed is not None and seed < 0:
+            raise ValueError(f"seed={seed}: must be at least 0.")
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(int(seed))
 
     def reset(self, mask: Tensor | None = None) -> None:
         """Start new episodes in the masked worlds (N,) bool; in all if None."""

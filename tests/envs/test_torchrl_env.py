@@ -7,6 +7,7 @@ import resource
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -315,6 +316,30 @@ def test_bad_arguments_are_explained() -> None:
         blind(track="kidny")
     with pytest.raises(ValueError, match="Unknown renderer 'vulkan'"):
         DroneRacingEnv(num_envs=1, renderer="vulkan")
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ({"num_envs": 2.5}, "num_envs=2.5: must be a whole number"),
+        ({"num_envs": True}, "num_envs=True: must be a whole number"),
+        ({"episode_steps": "100"}, "episode_steps='100': must be a whole number"),
+        ({"num_threads": 0.5}, "num_threads=0.5: must be a whole number"),
+        ({"control_rate": "50"}, "control_rate='50': must be a number"),
+        ({"start_noise": "much"}, "start_noise='much': must be a number"),
+        ({"seed": -1}, "seed=-1: must be at least 0"),
+        ({"seed": "a"}, "seed='a': must be a whole number"),
+        ({"camera": "wide"}, "camera='wide': must be a Camera"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_named(argument, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        blind(**argument)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    env = blind(num_envs=np.int64(2), seed=np.uint32(3), control_rate=np.float32(50), miss_radius=np.int32(3))
+    assert env.batch_size == (2,)
 
 
 def test_a_closed_environment_has_freed_its_renderer():
