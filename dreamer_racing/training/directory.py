@@ -278,8 +278,8 @@ def ensure_writable(directory: str | Path) -> Path:
             os.fsync(file.fileno())
     except OSError as error:
         raise PermissionError(
-            f"Cannot write to the folder {directory} ({error.strerror or error}). The run keeps its checkpoints and "
-            "metrics there: choose another with run_dir=PATH, or give this user write permission and free space."
+            f"Cannot write to the folder {directory} ({error.strerror or error}): name another (run_dir= of a "
+            "run, output= of what is made of it), or give this user write permission and free space."
         ) from error
     return directory
 

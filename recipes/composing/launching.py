@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from composing.checks import check_overrides, check_read
 from composing.command_line import (
+    agent_path,
     as_override,
     follow_quietly,
     merge_overrides,
@@ -29,6 +30,7 @@ from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import WorkerError
+from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
     is_out_of_memory,
@@ -136,6 +138,8 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     Raises:
         ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
     """
+    if is_agent(agent_path(resume)):
+        raise ValueError(f"resume={resume} is an agent, which no run goes on from: begin one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
     run_dir = directory.path
     if directory.run != directory:

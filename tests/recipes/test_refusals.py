@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
-from tests.running_recipes import build, compose, recipe, recipe_module
+from tests.running_recipes import ROOT, build, compose, recipe, recipe_module
 
 
 @pytest.mark.parametrize(
@@ -225,3 +226,10 @@ def test_an_unknown_protocol_is_refused() -> None:
     config = OmegaConf.to_object(compose("evaluate", "checkpoint=nowhere", "protocol=full", "start_noise=1"))
     with pytest.raises(ValueError, match="start_noise=1.0 is for protocol=nominal"):
         recipe_module("evaluate").check(config)
+
+
+@pytest.mark.parametrize("name", ["circle", str(ROOT / "agents" / "circle")])
+def test_an_agent_is_begun_with_not_resumed(name: str) -> None:
+    words = f"resume={name} is an agent, which no run goes on from: begin one with init_from={name}."
+    with pytest.raises(ValueError, match=re.escape(words)):
+        recipe_module("composing.launching").resumed_config("dreamer_v3", name, [])
