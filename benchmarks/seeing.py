@@ -14,6 +14,7 @@ best/, and the run must have been given the state: `loss=privileged`, or `loss.a
 """
 
 import argparse
+import gc
 import sys
 import time
 from collections.abc import Iterator
@@ -61,6 +62,7 @@ def main() -> None:
         found = list(measure(latest_checkpoint(arguments.checkpoint), variant, arguments.updates, arguments.every))
         print_table(found, COLUMNS)
         records += found
+        gc.collect()  # replay and learner, gigabytes, are in cycles
     write_json(records, arguments.json)
 
 
