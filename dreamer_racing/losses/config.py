@@ -69,7 +69,7 @@ class LossConfig:
         free_nats: KL below which there is no gradient, nats.
         kl_mode: Whether the free nats apply to the sum over latents (``separate``) or to each (``per_latent``).
         image_scale: Weight of the images' reconstruction: losses ``reconstruction`` and ``informed``. The reference has
-            1; less leaves rewards and values more of the gradient.
+            1.
         image_share: Share of a window's records, at least one, whose images are decoded, drawn anew in every update;
             the reference decodes all. Less makes an update cheaper.
         privileged_scale: Weight of decoding the privileged state: losses ``informed`` and ``privileged``.
