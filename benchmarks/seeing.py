@@ -3,12 +3,14 @@
     OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --variant "" "model.learning_rate=2e-3" size.cnn_depth=32
     OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --updates 600 --variant loss.world_model=privileged \
         loss.world_model=reconstruction "loss.world_model=reconstruction loss.image_scale=0.003"
+    OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --as-trained
 
 A variant is a list of overrides of the run's settings, or `size.<field>` of the networks' size. The loss of the world
 model alone is trained, on windows as the run draws them, but without stored latents; no actor is there.
 `probe` is the error of a small network that learns beside it to tell the state from the latents and teaches them
 nothing, so that losses can be compared; `error` that of the loss's own decoder, if it has one; both mean squares of
-symlogs on windows that the run never trains on, the same ones for all variants. `share` is `probe` by their variance,
+symlogs on windows that the run never trains on, the same ones for all variants. With `--as-trained` the model is the
+run's own, which stands still, and the probe alone learns. `share` is `probe` by their variance,
 `trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
 best/, and the run must have been given the state: `loss=privileged`, or `loss.actor=asymmetric_ppo`.
 """
@@ -55,18 +57,21 @@ def main() -> None:
     parser.add_argument("--variant", nargs="+", default=[""])
     parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--every", type=int, default=150, help="updates between two measurements")
+    parser.add_argument("--as-trained", action="store_true", help="probe the run's own model instead of fresh ones")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    records = []
+    if arguments.as_trained and arguments.variant != [""]:
+        parser.error("--as-trained is of the run as it is: leave --variant out")
+    checkpoint, records = latest_checkpoint(arguments.checkpoint), []
     for variant in arguments.variant:
-        found = list(measure(latest_checkpoint(arguments.checkpoint), variant, arguments.updates, arguments.every))
+        found = list(measure(checkpoint, variant, arguments.updates, arguments.every, arguments.as_trained))
         print_table(found, COLUMNS)
         records += found
         gc.collect()  # replay and learner, gigabytes, are in cycles
     write_json(records, arguments.json)
 
 
-def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterator[dict[str, Any]]:
+def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained: bool) -> Iterator[dict[str, Any]]:
     """Yield a record for each measurement of a variant."""
     trained = trained_config(RunDirectory.of(checkpoint).path)
     assert isinstance(trained, DreamerConfig), "a run of recipes/dreamer_v3.py"
@@ -80,10 +85,13 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
     assert test is not None, "a replay with worlds held out"
     assert PRIVILEGED in test.keys(include_nested=True), "a run whose environment gave the state"
     test.pop(CONTEXT, None)
-    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
-    agent = Agent(size, learner.agent.interface, decodes, config.loss.min_std, config.loss.max_std)
-    losses = make_losses(agent, config.loss)
-    optimizer, loss = make_optimizer(agent, losses, model), losses["world_model"]
+    if as_trained:
+        loss, optimizer = learner.losses["world_model"].requires_grad_(False), None
+    else:
+        decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
+        agent = Agent(size, learner.agent.interface, decodes, config.loss.min_std, config.loss.max_std)
+        losses = make_losses(agent, config.loss)
+        loss, optimizer = losses["world_model"], make_optimizer(agent, losses, model)
     probe = Probe(size.features, test[PRIVILEGED].shape[-1])
     variance = symlog(test[PRIVILEGED]).var((0, 1)).mean()
     context, seconds = autocast(torch.device("cpu"), bool(model.mixed_precision)), 0.0
@@ -93,9 +101,10 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
         begun = time.process_time()
         with context:
             metrics = loss(batch)
-        torch.stack([value for name, value in metrics.items() if name.startswith("loss_")]).sum().backward()
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
+        if optimizer is not None:
+            torch.stack([value for name, value in metrics.items() if name.startswith("loss_")]).sum().backward()
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
         seconds += time.process_time() - begun
         probe.learn(metrics, batch)
         if number % every == 0:
@@ -103,8 +112,8 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int) -> Iterato
                 seen = loss(test)
                 probed = probe.error(seen, test)
             yield {
-                "benchmark": "seeing", "track": config.track, **counters, "variant": variant, "updates": number,
-                "seconds": seconds, "probe": probed.item(), "share": (probed / variance).item(),
+                "benchmark": "seeing", "track": config.track, **counters, "updates": number,
+                "variant": "as trained" if as_trained else variant, "seconds": seconds, "probe": probed.item(), "share": (probed / variance).item(),
                 "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
 
