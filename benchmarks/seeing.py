@@ -112,9 +112,10 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
                 seen = loss(test)
                 probed = probe.error(seen, test)
             yield {
-                "benchmark": "seeing", "track": config.track, **counters, "updates": number,
-                "variant": "as trained" if as_trained else variant, "seconds": seconds, "probe": probed.item(), "share": (probed / variance).item(),
-                "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
+                "benchmark": "seeing", "track": config.track, **counters, "updates": number, "seconds": seconds,
+                "variant": "as trained" if as_trained else variant, "probe": probed.item(),
+                "share": (probed / variance).item(), "kl": seen["kl"].item(), **errors(seen),
+                "trained": errors(metrics).get("error"),
             }  # fmt: skip
 
 
