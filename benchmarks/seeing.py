@@ -67,8 +67,8 @@ def main() -> None:
         found = list(measure(checkpoint, variant, arguments.updates, arguments.every, arguments.as_trained))
         print_table(found, COLUMNS)
         records += found
+        write_json(records, arguments.json)  # of all so far: a later variant may not fit
         gc.collect()  # replay and learner, gigabytes, are in cycles
-    write_json(records, arguments.json)
 
 
 def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained: bool) -> Iterator[dict[str, Any]]:
