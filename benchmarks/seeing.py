@@ -12,7 +12,7 @@ nothing, so that losses can be compared; `error` that of the loss's own decoder,
 symlogs on windows that the run never trains on, the same ones for all variants. With `--as-trained` the model is the
 run's own, which stands still, and the probe alone learns. `share` is `probe` by their variance,
 `trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
-best/, and the run must have been given the state: `loss=privileged`, or `loss.actor=asymmetric_ppo`.
+best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`.
 """
 
 import argparse
@@ -30,6 +30,7 @@ from measuring import print_table, write_json
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.objectives import LossModule
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
@@ -41,7 +42,7 @@ from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.losses import WorldModelLoss, find_loss, make_losses
 from dreamer_racing.modules import Agent, ModelSize, join_features, symlog
 from dreamer_racing.modules.decoder import VectorDecoder
-from dreamer_racing.modules.interface import PRIVILEGED
+from dreamer_racing.modules.interface import PRIVILEGED, Interface
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -78,26 +79,23 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
     trained.device, trained.replay.device = "cpu", "auto"
     learner, counters = restore(trained, checkpoint)
     config, size = varied(trained, variant)
-    model = config.model
-    replay = restore_replay(config, checkpoint, learner, model.batch_size, model.batch_length)
-    torch.manual_seed(0)  # the same windows for every variant
-    test = replay.held_out(HELD_OUT, LENGTH, RECENT)
-    assert test is not None, "a replay with worlds held out"
-    assert PRIVILEGED in test.keys(include_nested=True), "a run whose environment gave the state"
-    test.pop(CONTEXT, None)
+    replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
+    test = replay.held_out(HELD_OUT, LENGTH, RECENT)  # the same windows for every variant
+    if test is None or PRIVILEGED not in test.keys(include_nested=True):
+        raise SystemExit("The run must hold out worlds, and its loss or actor must read the state.")
     if as_trained:
         loss, optimizer = learner.losses["world_model"].requires_grad_(False), None
     else:
-        decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
-        agent = Agent(size, learner.agent.interface, decodes, config.loss.min_std, config.loss.max_std)
-        losses = make_losses(agent, config.loss)
-        loss, optimizer = losses["world_model"], make_optimizer(agent, losses, model)
+        loss, optimizer = fresh(config, size, learner.agent.interface)
+    torch.manual_seed(0)
     probe = Probe(size.features, test[PRIVILEGED].shape[-1])
     variance = symlog(test[PRIVILEGED]).var((0, 1)).mean()
-    context, seconds = autocast(torch.device("cpu"), bool(model.mixed_precision)), 0.0
+    context, seconds = autocast(torch.device("cpu"), bool(config.model.mixed_precision)), 0.0
     for number in range(1, updates + 1):
         batch = replay.sample()
-        batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
+        if not as_trained:
+            batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
+            test.pop(CONTEXT, None)
         begun = time.process_time()
         with context:
             metrics = loss(batch)
@@ -110,13 +108,22 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
         if number % every == 0:
             with torch.no_grad(), context:
                 seen = loss(test)
-                probed = probe.error(seen, test)
+            probed = probe.error(seen, test).item()
             yield {
-                "benchmark": "seeing", "track": config.track, **counters, "updates": number, "seconds": seconds,
-                "variant": "as trained" if as_trained else variant, "probe": probed.item(),
-                "share": (probed / variance).item(), "kl": seen["kl"].item(), **errors(seen),
-                "trained": errors(metrics).get("error"),
+                "benchmark": "seeing", "track": config.track, "env_steps": counters["env_steps"],
+                "trained_updates": counters["updates"], "variant": "as trained" if as_trained else variant,
+                "updates": number, "seconds": seconds, "probe": probed, "share": probed / variance.item(),
+                "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
+
+
+def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple[LossModule, torch.optim.Optimizer]:
+    """Make a world-model loss of initial weights, and what trains it."""
+    torch.manual_seed(0)
+    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
+    agent = Agent(size, interface, decodes, config.loss.min_std, config.loss.max_std)
+    losses = make_losses(agent, config.loss)
+    return losses["world_model"], make_optimizer(agent, losses, config.model)
 
 
 def errors(metrics: TensorDictBase) -> dict[str, float]:

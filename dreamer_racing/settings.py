@@ -72,7 +72,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
 
 
 def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:
-    """Refuse arguments that are no numbers; None passes.
+    """Refuse arguments that are no numbers.
 
     Args:
         whole: those that must be whole numbers, by name.
@@ -83,8 +83,13 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
     """
     for values, kind, words in ((whole, Integral, "a whole number"), (real, Real, "a number")):
         for name, value in values.items():
-            if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
+            if isinstance(value, bool) or not isinstance(value, kind):
                 raise ValueError(f"{name}={quoted(value)}: must be {words}.")
+
+
+def without_none(**arguments: object) -> dict[str, object]:
+    """Return the arguments that are given."""
+    return {name: value for name, value in arguments.items() if value is not None}
 
 
 def given(value: T | None, field: str, needs_it: str) -> T:

@@ -29,7 +29,7 @@ class DroneRacingEnv(EnvBase):
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`) or parameters.
         seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
-        options: further arguments of `RaceWorlds`, see `RaceOptions`.
+        worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on; the curriculum sets it.
@@ -49,15 +49,15 @@ class DroneRacingEnv(EnvBase):
         privileged: bool = True,
         preset: str | QuadrotorParameters = "easy",
         seed: int | None = None,
-        **options: Unpack[RaceOptions],
+        **worlds: Unpack[RaceOptions],
     ) -> None:
         # before TorchRL, which would refuse arguments in torch's own words
-        worlds = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **options)
-        super().__init__(device=device, batch_size=[worlds.num_envs])
+        race = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **worlds)
+        super().__init__(device=device, batch_size=[race.num_envs])
         self.from_pixels = from_pixels
         self.privileged = privileged
-        self.worlds = worlds
-        self.track = worlds.track
+        self.worlds = race
+        self.track = race.track
         self.body_rate_weight = self.worlds.race.weights.body_rate
         self._make_specs()
         self.is_closed = False  # TorchRL takes an environment that it does not wrap for one that has nothing to close

@@ -28,7 +28,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.settings import check_numbers, quoted
+from dreamer_racing.settings import check_numbers, quoted, without_none
 
 ACTION_SIZE = 4
 START_LINE = LineLimits(speed=0.7)
@@ -126,14 +126,14 @@ class RaceWorlds:
         control_rate: float | None = None,
     ) -> None:
         check_numbers(
-            {"num_envs": num_envs, "episode_steps": episode_steps, "num_threads": num_threads, "seed": seed},
+            {"num_envs": num_envs, **without_none(episode_steps=episode_steps, num_threads=num_threads)},
             {
                 "start_beyond_gate": start_beyond_gate,
                 "start_at_gate": start_at_gate,
                 "start_on_line": start_on_line,
                 "start_noise": start_noise,
                 "miss_radius": miss_radius,
-                "control_rate": control_rate,
+                **without_none(control_rate=control_rate),
             },
         )
         if num_envs < 1:
@@ -219,11 +219,11 @@ class RaceWorlds:
         """Seed start poses and physics randomisation; None draws a seed from the operating system.
 
         Raises:
-            ValueError: it is no whole number, or below 0.
+            ValueError: it is no whole number, or not in the range of a generator's.
         """
-        check_numbers({"seed": seed}, {})
-        if seed is not None and seed < 0:
-            raise ValueError(f"seed={seed}: must be at least 0.")
+        check_numbers(without_none(seed=seed), {})
+        if seed is not None and not 0 <= seed < 2**63:
+            raise ValueError(f"seed={quoted(seed)}: must be at least 0 and below 2**63.")
         if seed is None:
             self._generator.seed()
         else:

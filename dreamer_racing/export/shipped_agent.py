@@ -167,11 +167,6 @@ def is_agent(folder: str | Path) -> bool:
     return (Path(folder) / AGENT).is_file()
 
 
-def agents_in(folder: str | Path) -> list[str]:
-    """Return the names of the agents that lie in a folder, sorted."""
-    return sorted(path.parent.name for path in Path(folder).glob(f"*/{AGENT}"))
-
-
 def read_about(folder: str | Path) -> dict[str, Any]:
     """Read the agent.json of a folder.
 

@@ -31,8 +31,8 @@ class ReconstructionLoss(WorldModelLoss):
     Args:
         world_model: The module to train.
         image_scale: Weight of the images' squared error.
-        image_share: Share of a window's records, at least one, whose images are decoded: those of the same random
-            places in all windows, drawn anew in every call. With 1 nothing is drawn.
+        image_share: Share of a window's records, at least one, whose images are decoded where gradients are wanted:
+            those of the same random places in all windows, drawn anew in every call. With 1 nothing is drawn.
         kwargs: Of ``WorldModelLoss``.
     """
 
@@ -67,7 +67,7 @@ class ReconstructionLoss(WorldModelLoss):
         """Return the reconstruction losses."""
         losses: dict[str, Tensor] = {}
         if self.world_model.decoder is not None:
-            belief, state, pixels = self._drawn(posterior.belief, posterior.state, tensordict.get(PIXELS))
+            belief, state, pixels = self._share_of_records(posterior.belief, posterior.state, tensordict.get(PIXELS))
             error = self.world_model.decoder.squared_error(belief, state, pixels)
             # Mean over the batch of the sum over an image.
             image = self.image_scale * error * pixels.shape[-3:].numel()
@@ -76,9 +76,9 @@ class ReconstructionLoss(WorldModelLoss):
             losses["loss_vector"] = self.world_model.vector_decoder.squared_error(features, tensordict.get(VECTOR))
         return losses
 
-    def _drawn(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """Return each ``(B, T, ...)`` at ``image_share`` of its T records."""
-        if self.image_share == 1:
+    def _share_of_records(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """Return each ``(B, T, ...)`` at ``image_share`` of its T records; whole, where it is only measured."""
+        if self.image_share == 1 or not torch.is_grad_enabled():
             return values
         time = values[0].shape[1]
         places = torch.rand(time, device=values[0].device).argsort()[: max(1, round(self.image_share * time))]

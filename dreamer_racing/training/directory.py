@@ -137,7 +137,8 @@ class RunDirectory:
             PermissionError: nothing can be written there.
             ValueError: a live run holds it.
         """
-        return RunLock(ensure_writable(self.path))
+        made = not self.path.exists()
+        return RunLock(ensure_writable(self.path), made)
 
     def mark_finished(self, env_steps: int) -> None:
         """Note that all is done."""
@@ -278,8 +279,8 @@ def ensure_writable(directory: str | Path) -> Path:
             os.fsync(file.fileno())
     except OSError as error:
         raise PermissionError(
-            f"Cannot write to the folder {directory} ({error.strerror or error}): name another (run_dir= of a "
-            "run, output= of what is made of it), or give this user write permission and free space."
+            f"Cannot write to the folder {directory} ({error.strerror or error}): name another, or give "
+            "this user write permission and free space."
         ) from error
     return directory
 

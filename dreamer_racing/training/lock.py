@@ -1,5 +1,6 @@
 """One process at a time in a run directory."""
 
+import contextlib
 import fcntl
 import logging
 import os
@@ -18,6 +19,7 @@ class RunLock:
 
     Args:
         directory: of the run, which exists.
+        made: whether it was made for this lock.
 
     Attributes:
         directory: as given.
@@ -29,8 +31,9 @@ class RunLock:
         >>> lock = RunLock("runs/example")  # doctest: +SKIP
     """
 
-    def __init__(self, directory: str | Path) -> None:
+    def __init__(self, directory: str | Path, made: bool = False) -> None:
         self.directory = Path(directory)
+        self._made = made
         self._file = (self.directory / ".lock").open("a+", encoding="utf-8")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -53,9 +56,10 @@ class RunLock:
         self._file.close()
 
     def abandon(self) -> None:
-        """Let the next one in, and leave no folder behind if nothing was written to it."""
+        """Let the next one in; a folder that was made for this lock, and holds nothing else, goes."""
         path = Path(self._file.name)
-        if list(self.directory.iterdir()) == [path]:
-            path.unlink()
-            self.directory.rmdir()
+        with contextlib.suppress(OSError):  # it stays, then
+            if self._made and list(self.directory.iterdir()) == [path]:
+                path.unlink()
+                self.directory.rmdir()
         self.release()

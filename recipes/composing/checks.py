@@ -97,6 +97,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ValueError: the message names the setting, and what it is for.
     """
     actor, model = find_loss(ActorLoss, config.loss.actor), find_loss(WorldModelLoss, config.loss.world_model)
+    images = _is(model, ReconstructionLoss) and config.env.from_pixels
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
@@ -105,8 +106,8 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.ppo.updates", _is(actor, PPOActorLoss), "loss.actor=ppo"),
         ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo or asymmetric_ppo"),
         ("loss.ppo.critic_learning_rate", _is(actor, AsymmetricPPOActorLoss), "loss.actor=asymmetric_ppo"),
-        ("loss.image_scale", _is(model, ReconstructionLoss), "loss=reconstruction or informed"),
-        ("loss.image_share", _is(model, ReconstructionLoss), "loss=reconstruction or informed"),
+        ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
+        ("loss.image_share", images, "loss=reconstruction or informed, from images"),
         ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
         ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
         ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),

@@ -102,8 +102,12 @@ def existing_agent_path(setting_name: str, name: str) -> Path:
 
 def agents_that_ship() -> str:
     """A sentence that names them."""
-    names = sorted(path.parent.name for path in AGENTS.glob("*/agent.json"))
-    return f"Agents that ship, to be given by name: {', '.join(names) or 'none'}."
+    return f"Agents that ship, to be given by name: {', '.join(agents_in(AGENTS)) or 'none'}."
+
+
+def agents_in(folder: Path) -> list[str]:
+    """The names of the agents that lie in a folder, sorted."""
+    return sorted(path.parent.name for path in folder.glob("*/agent.json"))
 
 
 def override_key(override: str) -> str:

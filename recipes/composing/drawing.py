@@ -56,9 +56,6 @@ def draw(config: PlotConfig) -> None:
         draw_curves(read_curves(places[0]), output)
         print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
-    for setting_name, files in (("flights", config.flights), ("dreams", config.dreams)):
-        if missing := [str(file) for file in files if not Path(file).is_file()]:
-            raise ValueError(f"{setting_name}={missing[0]}: there is no such file.")
     explicit = {"trajectories": config.flights, "imagined": config.dreams}.get(config.figure)
     asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
     columns = {column for figure in asked for column in figure.columns(config)}
@@ -101,6 +98,9 @@ def check_plot(config: PlotConfig) -> None:
     ):
         if value not in allowed:
             raise ValueError(f"{name}={value}: there are {', '.join(allowed)}.")
+    for name, files in (("flights", config.flights), ("dreams", config.dreams)):
+        if missing := [str(file) for file in files if not Path(file).is_file()]:
+            raise ValueError(f"{name}={missing[0]}: there is no such file.")
     wanted_columns(config.quantities, config.axis)
 
 
@@ -249,7 +249,7 @@ def stage_name(file: str | Path) -> str:
 def draw_comparison(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `comparison.md` and `comparison.png`, if there are variants to compare."""
     if len(group_runs(runs)) < 2:
-        if config.figure == "comparison":
+        if runs and config.figure == "comparison":
             raise ValueError("figure=comparison: these runs are of one variant; runs= takes several paths.")
         return Drawn([], [])
     comparison = compare_variants(runs, problems, config.axis)

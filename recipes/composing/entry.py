@@ -33,9 +33,10 @@ WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
 HYDRAS_FLAGS = (
-    "--cfg", "--config-dir", "--config-name", "--config-path", "--experimental-rerun", "--info", "--package",
+    "--cfg", "--config-dir", "--config-name", "--config-path", "--experimental-rerun", "--help", "--hydra-help",
+    "--info", "--multirun", "--package", "--resolve", "--run", "--shell-completion", "--version",
 )  # fmt: skip
-"""Flags of hydra's that may have a value after an equals sign."""
+"""Flags that are hydra's own; it takes the beginnings of their names, too."""
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
@@ -147,9 +148,10 @@ def refuse_dashes(arguments: Sequence[str]) -> None:
         ValueError: the message says how it is written.
     """
     for argument in arguments:
-        flag, equals, value = argument.partition("=")
-        if equals and flag.startswith("--") and flag not in HYDRAS_FLAGS:
-            raise ValueError(f"{argument}: settings are written without dashes, {flag[2:].replace('-', '_')}={value}.")
+        flag, _, value = argument.partition("=")
+        if flag.startswith("--") and not any(known.startswith(flag) for known in HYDRAS_FLAGS):
+            written = f"{flag[2:].replace('-', '_')}={value or 'VALUE'}"
+            raise ValueError(f"{argument}: settings are written without dashes, {written}.")
 
 
 def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:

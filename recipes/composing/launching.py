@@ -138,7 +138,7 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     Raises:
         ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
     """
-    if is_agent(agent_path(resume)):
+    if is_agent(resume) or (not Path(resume).exists() and is_agent(agent_path(resume))):
         raise ValueError(f"resume={resume} is an agent, which no run goes on from: begin one with init_from={resume}.")
     directory = RunDirectory.of(latest_checkpoint(resume))
     run_dir = directory.path

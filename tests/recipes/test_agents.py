@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, agents_in, is_agent
+from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
 from dreamer_racing.training.checksums import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from tests.running_recipes import ROOT, recipe, recipe_module
@@ -157,6 +157,8 @@ def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monk
         (tmp_path / name / "agent.json").write_text("{}")
     with pytest.raises(FileNotFoundError, match="by name: circle, kidney"):
         restoring.find_trained("kidny")
+    (tmp_path / "unfinished").mkdir()
+    assert command_line.agents_in(tmp_path) == ["circle", "kidney"] and command_line.agents_in(tmp_path / "none") == []
     assert restoring.find_trained("kidney") == restoring.find_trained(str(tmp_path / "kidney")) == tmp_path / "kidney"
 
 
@@ -178,7 +180,7 @@ def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path
     assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
 
 
-@pytest.mark.parametrize("name", agents_in(ROOT / "agents"))
+@pytest.mark.parametrize("name", recipe_module("composing.command_line").agents_in(ROOT / "agents"))
 def test_each_agent_that_ships_is_restored(name: str) -> None:
     """Also those that were made when networks had fewer numbers."""
     folder = ROOT / "agents" / name
@@ -192,7 +194,7 @@ def test_each_agent_that_ships_is_restored(name: str) -> None:
 
 
 def test_the_agents_that_ship_are_whole_and_small() -> None:
-    folders = [ROOT / "agents" / name for name in agents_in(ROOT / "agents")]
+    folders = [ROOT / "agents" / name for name in recipe_module("composing.command_line").agents_in(ROOT / "agents")]
     for folder in folders:
         assert {path.name for path in folder.iterdir()} == set(FILES)
         assert OmegaConf.load(folder / "config.yaml").run_dir is None

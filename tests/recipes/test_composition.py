@@ -344,12 +344,18 @@ def test_records_in_files_lie_in_the_run_directory_as_long_as_the_run_goes_on(tm
     assert not (tmp_path / "run" / "replay" / "process-0").exists()
 
 
-def test_a_run_that_is_refused_leaves_no_folder_and_its_lock_to_the_next(
+def test_a_run_that_is_refused_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        build("init_from=nowhere", f"run_dir={tmp_path / 'run'}")
+    assert "init_from=nowhere" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
+def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run_dir = tmp_path / "run"
+    (tmp_path / "log.txt").touch()
     for _ in range(2):
         with pytest.raises(SystemExit):
-            build("init_from=nowhere", f"run_dir={run_dir}")
-        assert not run_dir.exists()
-    assert "nowhere" in capsys.readouterr().err
+            build("init_from=nowhere", f"run_dir={tmp_path}")
+        assert "init_from=nowhere" in capsys.readouterr().err
+    assert (tmp_path / "log.txt").exists()

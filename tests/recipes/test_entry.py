@@ -111,7 +111,9 @@ def test_a_setting_that_nothing_reads_is_not_added() -> None:
 
 def test_a_setting_is_no_flag() -> None:
     entry = recipe_module("composing.entry")
-    entry.refuse_dashes(["--multirun", "--config-name=crutches", "-m", "track=kidney", "'name=--a=b'"])
+    entry.refuse_dashes(["--multirun", "--config-n=crutches", "--config-name", "ablation", "-m", "'name=--a=b'"])
+    with pytest.raises(ValueError, match="--track: settings are written without dashes, track=VALUE"):
+        entry.refuse_dashes(["--track", "kidney"])
     with pytest.raises(ValueError, match="--total-env-steps=9: settings are written without dashes, total_env_steps=9"):
         entry.refuse_dashes(["--multirun", "--total-env-steps=9"])
 

@@ -163,9 +163,11 @@ def test_bad_settings_are_refused(runs, recipe, settings, words):
 @pytest.mark.parametrize("setting", ["flights", "dreams"])
 @pytest.mark.parametrize("figure", ["all", "learning_curves", "trajectories"])
 def test_a_named_file_that_is_not_there_is_refused_for_any_figure(setting, figure, runs, recipe):
-    config = recipe.PlotConfig(**{setting: ["nowhere.npz"]}, figure=figure, runs=str(runs / "runs"), output=str(runs))
+    output = runs / "refused"
+    config = recipe.PlotConfig(**{setting: ["nowhere.npz"]}, figure=figure, runs=str(runs / "runs"), output=str(output))
     with pytest.raises(ValueError, match=f"{setting}=nowhere.npz: there is no such file"):
         recipe.draw(config)
+    assert not output.exists()
 
 
 def test_one_variant_is_not_compared(runs, recipe):

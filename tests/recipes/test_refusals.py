@@ -165,6 +165,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss=reconstruction", "loss.privileged_scale=3"], "privileged_scale=3.* is for loss=privileged or informed"),
         (["loss=privileged", "loss.image_scale=3"], "image_scale=3.* is for loss=reconstruction or informed"),
         (["loss=decoder_free", "loss.image_share=0.5"], "image_share=0.5 is for loss=reconstruction or informed"),
+        (["env.from_pixels=false", "loss.image_share=0.5"], "is for loss=reconstruction or informed, from images"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
         (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
@@ -233,3 +234,12 @@ def test_an_agent_is_begun_with_not_resumed(name: str) -> None:
     words = f"resume={name} is an agent, which no run goes on from: begin one with init_from={name}."
     with pytest.raises(ValueError, match=re.escape(words)):
         recipe_module("composing.launching").resumed_config("dreamer_v3", name, [])
+
+
+def test_a_run_that_is_named_as_an_agent_is_resumed_where_it_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "circle").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="No complete checkpoint at .*circle: the path exists"):
+        recipe_module("composing.launching").resumed_config("dreamer_v3", "circle", [])

@@ -4,9 +4,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.lock import RunLock
 
 
@@ -20,7 +22,8 @@ def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> N
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     code = f"""if True:
-        from dreamer_racing.training.lock import RunLock
+        from dreamer_racing.training.directory import RunDirectory
+from dreamer_racing.training.lock import RunLock
         lock = RunLock({str(tmp_path)!r})
         print("held", flush=True)
         input()"""
@@ -33,16 +36,29 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     RunLock(tmp_path).release()
 
 
-@pytest.mark.parametrize("written", [[], ["config.yaml"]])
-def test_what_is_abandoned_leaves_no_folder_unless_something_was_written_to_it(
-    written: list[str], tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    lock = RunLock(run)
-    for name in written:
-        (run / name).touch()
+def test_an_abandoned_folder_goes_if_it_was_made_for_the_lock(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    directory.claim().abandon()
+    assert not directory.path.exists()
+
+
+@pytest.mark.parametrize("written", ["before", "after"])
+def test_an_abandoned_folder_stays_if_it_was_there_or_was_written_to(written: str, tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    if written == "before":
+        directory.path.mkdir()
+    lock = directory.claim()
+    if written == "after":
+        directory.config.touch()
     lock.abandon()
-    assert [path.name for path in tmp_path.rglob("*") if path.name != ".lock"] == ["run", *written] * bool(written)
-    run.mkdir(exist_ok=True)
-    RunLock(run).release()  # the next one gets it
+    assert directory.path.exists()
+    directory.claim().release()  # the next one gets it
+
+
+def test_what_cannot_be_taken_away_stays_and_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    lock = directory.claim()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", Mock(side_effect=OSError("busy")))
+        lock.abandon()
+    directory.claim().release()
