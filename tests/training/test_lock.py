@@ -22,8 +22,7 @@ def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> N
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     code = f"""if True:
-        from dreamer_racing.training.directory import RunDirectory
-from dreamer_racing.training.lock import RunLock
+        from dreamer_racing.training.lock import RunLock
         lock = RunLock({str(tmp_path)!r})
         print("held", flush=True)
         input()"""
