@@ -125,21 +125,7 @@ class RaceWorlds:
         miss_radius: float = 0.0,
         control_rate: float | None = None,
     ) -> None:
-        check_numbers(
-            {"num_envs": num_envs, **without_none(episode_steps=episode_steps, num_threads=num_threads)},
-            {
-                "start_beyond_gate": start_beyond_gate,
-                "start_at_gate": start_at_gate,
-                "start_on_line": start_on_line,
-                "start_noise": start_noise,
-                "miss_radius": miss_radius,
-                **without_none(control_rate=control_rate),
-            },
-        )
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
-        if camera is not None and not isinstance(camera, Camera):
-            raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
+        _check_arguments(num_envs, camera, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_device(device)
         self.track = load_track(track)
         self.num_envs = num_envs = int(num_envs)
@@ -147,6 +133,7 @@ class RaceWorlds:
         self.camera = camera or Camera()
         self.parameters = load_preset(preset)
         if control_rate is not None:
+            check_numbers({}, {"control_rate": control_rate})
             self.parameters = at_control_rate(self.parameters, control_rate)
         self._generator = torch.Generator(device)
         self.seed(seed)
@@ -173,6 +160,7 @@ class RaceWorlds:
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
         """Make the rules, of training or of evaluation."""
+        check_numbers({}, {"miss_radius": miss_radius})
         if episode_steps is None:
             episode_steps = round((EVALUATION_TIME if self.evaluation else EPISODE_TIME) / self.parameters.control_dt)
         return Race(
@@ -188,6 +176,8 @@ class RaceWorlds:
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
+        shares = {"start_beyond_gate": beyond_gate, "start_at_gate": at_gate, "start_on_line": on_line}
+        check_numbers({}, {**shares, "start_noise": noise})
         if not 0.0 <= on_line <= 1.0:
             raise ValueError(f"start_on_line={on_line}: a share of episodes lies between 0 and 1.")
         on_line = 0.0 if self.evaluation else on_line
@@ -371,3 +361,18 @@ class RaceWorlds:
         """Free rendering contexts and threads."""
         self._graph = self._images = None  # the graph draws into the simulator's buffers
         self.simulator.close()
+
+
+def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, object]) -> None:
+    """Refuse arguments of a wrong type, before something else fails at them in its own words.
+
+    Args:
+        num_envs: N.
+        camera: the nose camera.
+        whole: further ones that must be whole numbers, by name.
+    """
+    check_numbers({"num_envs": num_envs, **whole}, {})
+    if num_envs < 1:
+        raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
+    if camera is not None and not isinstance(camera, Camera):
+        raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")

@@ -261,8 +261,12 @@ def replace_text(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def ensure_writable(directory: str | Path) -> Path:
+def ensure_writable(directory: str | Path, setting_name: str = "run_dir") -> Path:
     """Creates a folder if needed and writes a file to it, to fail before a run and not at its first checkpoint.
+
+    Args:
+        directory: the folder.
+        setting_name: by which a person chooses another.
 
     Returns:
         The absolute path of the folder.
@@ -279,8 +283,8 @@ def ensure_writable(directory: str | Path) -> Path:
             os.fsync(file.fileno())
     except OSError as error:
         raise PermissionError(
-            f"Cannot write to the folder {directory} ({error.strerror or error}): name another, or give "
-            "this user write permission and free space."
+            f"Cannot write to the folder {directory} ({error.strerror or error}): choose another with "
+            f"{setting_name}=PATH, or give this user write permission and free space."
         ) from error
     return directory
 

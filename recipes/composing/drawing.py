@@ -49,7 +49,7 @@ def draw(config: PlotConfig) -> None:
         ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
     check_plot(config)
-    output = ensure_writable(config.output)
+    output = ensure_writable(config.output, "output")
     places = config.runs if isinstance(config.runs, list) else [config.runs]
     if [Path(str(place)).suffix for place in places] == [".csv"]:
         refuse_for_curves(config)
