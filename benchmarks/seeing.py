@@ -10,7 +10,7 @@ model alone is trained, on windows as the run draws them, but without stored lat
 `probe` is the error of a small network that learns beside it to tell the state from the latents and teaches them
 nothing, so that losses can be compared; `error` that of the loss's own decoder, if it has one; both mean squares of
 symlogs on windows that the run never trains on, the same ones for all variants. With `--as-trained` the model is the
-run's own, which stands still, and the probe alone learns. `share` is `probe` by their variance,
+run's own, which stands still and goes on from the latents stored, and the probe alone learns. `share` is `probe` by their variance,
 `trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
 best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`.
 """
@@ -86,6 +86,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
     if as_trained:
         loss, optimizer = learner.losses["world_model"].requires_grad_(False), None
     else:
+        test.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
         loss, optimizer = fresh(config, size, learner.agent.interface)
     torch.manual_seed(0)
     probe = Probe(size.features, test[PRIVILEGED].shape[-1])
@@ -94,8 +95,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
     for number in range(1, updates + 1):
         batch = replay.sample()
         if not as_trained:
-            batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
-            test.pop(CONTEXT, None)
+            batch.pop(CONTEXT, None)
         begun = time.process_time()
         with context:
             metrics = loss(batch)
@@ -129,7 +129,7 @@ def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple
 def errors(metrics: TensorDictBase) -> dict[str, float]:
     """Return what the loss's own decoders say, by column."""
     names = {"privileged_error": "error", "image_error": "image_error", "reward_error": "reward_error"}
-    return {column: metrics[name].item() for name, column in names.items() if name in metrics.keys()}  # noqa: SIM118
+    return {column: error.item() for name, column in names.items() if (error := metrics.get(name, None)) is not None}
 
 
 class Probe:

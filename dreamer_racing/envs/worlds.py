@@ -370,6 +370,9 @@ def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, o
         num_envs: N.
         camera: the nose camera.
         whole: further ones that must be whole numbers, by name.
+
+    Raises:
+        ValueError: the message names the argument, its value and what it must be.
     """
     check_numbers({"num_envs": num_envs, **whole}, {})
     if num_envs < 1:
