@@ -10,7 +10,8 @@ model alone is trained, on windows as the run draws them, but without stored lat
 `probe` is the error of a small network that learns beside it to tell the state from the latents and teaches them
 nothing, so that losses can be compared; `error` that of the loss's own decoder, if it has one; both mean squares of
 symlogs on windows that the run never trains on, the same ones for all variants. With `--as-trained` the model is the
-run's own, which stands still and goes on from the latents stored, and the probe alone learns. `share` is `probe` by their variance,
+run's own, which stands still and goes on from the latents stored, and the probe alone learns.
+`share` is `probe` by their variance,
 `trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
 best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`.
 """
