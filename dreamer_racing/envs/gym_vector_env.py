@@ -14,6 +14,7 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, with_rows
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import WorldOptions
+from dreamer_racing.settings import check_numbers, without_none
 
 
 class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
@@ -71,6 +72,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
             steps = worlds.get("episode_steps")
+            check_numbers(whole=without_none(max_episode_steps=max_episode_steps, episode_steps=steps), real={})
             worlds["episode_steps"] = max_episode_steps if steps is None else min(max_episode_steps, steps)
         self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         own = {"render_fps": self.race.frames_per_second, "autoreset_mode": self.autoreset_mode}

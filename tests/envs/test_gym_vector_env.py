@@ -205,6 +205,11 @@ def test_an_unknown_autoreset_mode_is_refused() -> None:
         make_vec(autoreset_mode="never")
 
 
+def test_a_length_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match="max_episode_steps='300': must be a whole number"):
+        make_vec(max_episode_steps="300", episode_steps=200)
+
+
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
 @pytest.mark.parametrize("observation", OBSERVATIONS)
 def test_torchrl_takes_the_vector_environment(observation: str, mode: str) -> None:
