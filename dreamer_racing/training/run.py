@@ -291,15 +291,16 @@ def collect_and_learn(run: Run, stop: GracefulExit, progress: Progress) -> None:
     minutes = Interval(config.checkpoint.minutes)
     run.learn(None, stop)  # what an interrupted run still owes
     while not stop.requested:
-        if run.at_end:  # so that what is evaluated last is what is saved
-            run.settle()
-            run.learn(None, stop)
-        run.keep_up(progress)
         by_steps = run.schedule.due("save", counters["env_steps"])
         by_minutes = parallel.agreed(minutes.due())  # both take note
-        if by_steps or by_minutes:
+        saves = by_steps or by_minutes
+        if saves or run.at_end:  # what is under way may end the run, and what is evaluated last is what is saved
             run.settle()
             run.learn(None, stop)
+            if stop.requested:  # a resumed run owes updates, and then evaluates
+                break
+        run.keep_up(progress)
+        if saves:
             with run.attempt("checkpoint"):
                 run.save()
         if run.at_end or stop.requested:
