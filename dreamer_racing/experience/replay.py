@@ -32,6 +32,7 @@ from dreamer_racing.experience.streams import (
     StreamTensorStorage,
     StreamWriter,
     check_layout,
+    send,
 )
 from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
 
@@ -78,6 +79,15 @@ class StreamReplay(TensorDictReplayBuffer):
         records = records_from_rollout(rollout, self.observation_keys, self.reward_keys, self.latents)
         return super().extend(records, update_priority=update_priority)
 
+    def _sample(self, batch_size: int) -> tuple[TensorDictBase, dict]:
+        """Draws a batch, its slots among it; TorchRL's own brings those by copies that wait for the device."""
+        with self._replay_lock, self._write_lock:
+            slots, info = self._sampler.sample(self._storage, batch_size)
+            records = self._storage.get(slots)
+        for name, value in {"index": slots, **info}.items():
+            records.set(name, send(value, self._storage.device))
+        return self._transformed(records), {}
+
     def refresh(self, slots: Tensor, belief: Tensor, state: Tensor) -> None:
         """Replaces the context of sampled records by what the world model makes of the records before them now.
 
@@ -102,7 +112,9 @@ class StreamReplay(TensorDictReplayBuffer):
         slots = self._sampler.held_out(num_windows, length, recent)
         if slots is None:
             return None
-        records = self._storage.get(slots)
+        return self._transformed(self._storage.get(slots))
+
+    def _transformed(self, records: TensorDictBase) -> TensorDictBase:
         return self._transform(records) if self._transform is not None and len(self._transform) else records
 
     def records(self, stream: int) -> TensorDictBase:

@@ -501,6 +501,19 @@ def test_samples_are_drawn_without_waiting():
     assert (seen.waits, seen.mixed) == ([], []) and seen.count > 0
 
 
+@pytest.mark.parametrize("kept_on", ["meta", "cpu"])
+def test_what_comes_with_a_sample_is_brought_without_waiting(kept_on):
+    replay = make_replay(60, 3, 6, 4, device="meta", storage_device=kept_on, recent_share=0.5)  # in a GPU's place
+    replay.extend(collect(CountingEnv(3), steps=5, batches=1)[0])
+    seen = launches(replay.sample)
+    assert {place.split(" at ")[1].split(":")[0] for place in seen.mixed} <= {
+        "experience/streams.py",  # `send`
+        "experience/replay.py",  # the delivery
+    }, seen.mixed
+    sample = replay.sample()
+    assert {sample[name].device.type for name in ("index", "recent")} == {"meta"}
+
+
 @pytest.mark.gpu
 def test_a_replay_on_cuda_is_written_sampled_and_refreshed_as_one_on_the_cpu():
     samples = []
