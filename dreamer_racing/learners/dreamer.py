@@ -199,7 +199,8 @@ class DreamerLearner:
 
         Raises:
             TypeError: If `LossConfig` has no number of such a name.
-            ValueError: If none of the losses has it as an attribute, or ``world_model_rate`` is given alone.
+            ValueError: If none of the losses has it as an attribute, a CUDA graph would not read it again, or
+                ``world_model_rate`` is given alone.
         """
         if rates is None and world_model_rate != 1.0:
             raise ValueError(f"adjust(world_model_rate={world_model_rate:g}) is a share of rates: give rates=, too.")
@@ -209,10 +210,10 @@ class DreamerLearner:
             for group, rate in zip(self._groups, self._rates, strict=True):
                 group["lr"] = rate * rates
             self._groups[0]["lr"] *= world_model_rate
-        if kl_target is not None:
-            numbers["kl_target"] = kl_target
+        if kl_target is not None:  # read between updates, where no graph is
+            set_number(self.losses.values(), "kl_target", kl_target)
         for name, value in numbers.items():
-            set_number(self.losses.values(), name, value)
+            set_number(self.losses.values(), name, value, captured=self._graph is not None)
         for name, bound in (("min_std", min_std), ("max_std", max_std)):
             if bound is not None:
                 for agent in (self.agent, self.flying_agent):

@@ -9,7 +9,7 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHAR
 
 HORIZON = 16
 """H, imagined actions from each start, where nobody says; in recipes ``model.imagination_horizon`` does.
-Reference: DreamerV3, Table 4."""
+Reference: Dream to Fly, where T = 16; danijar/dreamerv3 has 15 (``imag_length``)."""
 
 
 @dataclass

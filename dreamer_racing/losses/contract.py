@@ -32,11 +32,17 @@ def scheduled(value: float) -> nn.Buffer:
     return nn.Buffer(torch.tensor(float(value)), persistent=False)
 
 
-def set_number(losses: Collection[nn.Module], name: str, value: float) -> None:
+def set_number(losses: Collection[nn.Module], name: str, value: float, captured: bool = False) -> None:
     """Set a number of all losses that have it, from their next use on: a scalar in place, a plain number or None anew.
 
+    Args:
+        losses: Of a learner.
+        name: Of the number.
+        value: What it is from now on.
+        captured: Whether a CUDA graph replays the losses, which knows a plain number as it was.
+
     Raises:
-        ValueError: If none has a number of that name.
+        ValueError: If none has a number of that name, or one that a graph would not read anew.
     """
     numbers = (Tensor, float, int, type(None))
     if not (having := [loss for loss in losses if isinstance(getattr(loss, name, ""), numbers)]):
@@ -45,5 +51,10 @@ def set_number(losses: Collection[nn.Module], name: str, value: float) -> None:
     for loss in having:
         if isinstance(present := getattr(loss, name), Tensor):
             present.fill_(value)
+        elif captured:
+            raise ValueError(
+                f"adjust({name}=...): {type(loss).__name__} has it as a plain number, which a captured CUDA graph does "
+                f"not read again: make it self.{name} = scheduled(...), or set cuda_graph=False."
+            )
         else:
             setattr(loss, name, value)

@@ -207,14 +207,14 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
 
 
 def _rising(config: RunConfig) -> str:
-    """Return what to know before a run is made longer: what has fallen by its share of the run rises again."""
+    """Return what to know before a run is made longer: what has moved by its share of the run moves back."""
     if not isinstance(config, DreamerConfig):
         return ""
     ramps = {ramp.name: getattr(config.schedule, ramp.name) for ramp in fields(config.schedule)}
     by_run = [
         name
         for name, ramp in ramps.items()
-        if isinstance(ramp, Ramp) and ramp.to is not None and ramp.by is RampClock.run
+        if isinstance(ramp, Ramp) and ramp.to is not None and ramp.by is not RampClock.passes
     ]
     return f"  # sets back what moves with the share of the run: {', '.join(by_run)}" if by_run else ""
 

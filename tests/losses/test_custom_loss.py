@@ -100,8 +100,15 @@ def test_the_number_of_a_custom_actor_comes_from_the_configuration_and_moves(exa
     actor = learner.losses["actor"]
     assert (actor.horizon, float(actor.price)) == (5, 2.5)
     assert learner.update(example["batch"])["loss_actor"].isfinite()
-    set_number(learner.losses.values(), "price", 1.5)
+    set_number(learner.losses.values(), "price", 1.5, captured=True)
     assert float(actor.price) == 1.5
+
+
+def test_a_plain_number_that_a_graph_would_not_read_again_is_refused():
+    losses = make_dreamer("debug", seed=0).losses.values()
+    set_number(losses, "lambda_", 0.9)
+    with pytest.raises(ValueError, match=r"adjust\(lambda_=...\): \w+ has it as a plain number.*scheduled"):
+        set_number(losses, "lambda_", 0.8, captured=True)
 
 
 def test_page_names_every_loss_and_key():
