@@ -21,6 +21,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
@@ -42,7 +43,7 @@ from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.evaluate import Episode, Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
-from dreamer_racing.figures.hud import caption, race_words
+from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.training.directory import EVALUATION
 
@@ -260,9 +261,8 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:
     """Find the ends of the second lap, which is flown at racing speed; of the beginning of the flight without one."""
-    gate = trajectory.target_gate
-    ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
-    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
+    ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(trajectory.action)))
 
 
 if __name__ == "__main__":
