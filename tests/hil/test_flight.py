@@ -575,6 +575,12 @@ def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
         FlightChain(Hover(), CIRCLE, config, None)
 
 
+@pytest.mark.parametrize("latency", [-1, 1.5, np.nan, "0"])
+def test_a_latency_that_is_no_time_is_refused(latency):
+    with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
+        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency), None)
+
+
 def test_what_does_not_lift_off_does_not_spin_for_ever():
     plant = Watched(CIRCLE, mass=1.3, thrust=0.5)
     assert fly_hovering(plant).startswith(
