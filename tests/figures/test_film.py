@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import imageio.v3 as iio
 import imageio_ffmpeg
@@ -70,6 +71,30 @@ def test_video_reads_back(tmp_path, size, scale, expected):
     corner, middle = read[:, 3, 3].astype(int), read[:, -4, -4].astype(int)
     assert np.abs(middle - frames[:, -1, -1]).max() < 25
     assert np.abs(corner - frames[:, 0, 0]).max() < 25
+
+
+def test_a_film_that_is_broken_off_leaves_the_one_before_and_nothing_else(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    def half(image, path, **_):
+        Path(path).write_bytes(b"GIF89a")
+        full()
+
+    for name, write, owner, part in (
+        ("a.mp4", write_video, film, "_make_even"),
+        ("a.gif", write_gif, Image.Image, "save"),
+    ):
+        path = tmp_path / name
+        write(path, blocks(12))
+        before = path.read_bytes()
+        with monkeypatch.context() as broken:
+            broken.setattr(owner, part, full if owner is film else half)
+            with pytest.raises(OSError, match="No space left"):
+                write(path, blocks(10))
+        assert path.read_bytes() == before
+        assert [found.name for found in tmp_path.iterdir()] == [name]
+        path.unlink()
 
 
 def test_without_ffmpeg_one_warning_stands_for_all_videos(tmp_path, monkeypatch, caplog):
