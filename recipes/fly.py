@@ -13,8 +13,8 @@ and writes nothing. Windows need a display.
 """
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -154,14 +154,27 @@ def make_flight(config: FlyConfig) -> PlannedFlight:
 
 def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
+    with folder_to_fill(Path(config.run_dir)) as directory:
+        flight = make_flight(config)
+        result = flight.fly()
+        flight.env.close()
+        laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
+        print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
+        write(directory, flight.env.track, result)
+
+
+@contextmanager
+def folder_to_fill(directory: Path) -> Iterator[Path]:
+    """Make a folder before the flight, which would be in vain without; if nothing is written to it, it goes again."""
+    made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     with plain_errors():
-        Path(config.run_dir).mkdir(parents=True, exist_ok=True)
-    flight = make_flight(config)
-    result = flight.fly()
-    flight.env.close()
-    laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
-    print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-    write(Path(config.run_dir), flight.env.track, result)
+        directory.mkdir(parents=True, exist_ok=True)
+    try:
+        yield directory
+    finally:
+        for folder in made:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def watch(config: FlyConfig) -> None:
