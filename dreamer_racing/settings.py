@@ -20,16 +20,23 @@ class Range(NamedTuple):
     high: float = math.inf
     open_below: bool = False
 
-    def __contains__(self, value: object) -> bool:
-        if not isinstance(value, (int, float)):
+    def __contains__(self, value: Any) -> bool:
+        if not is_number(value):
             return False
         above = self.low < value if self.open_below else self.low <= value
-        return above and value < math.inf and value <= self.high
+        return bool(above and value < math.inf and value <= self.high)
 
     def __str__(self) -> str:
         """Say it in words."""
+        if self == FINITE:
+            return "finite"
         below = f"{'above' if self.open_below else 'at least'} {_in_digits(self.low)}"
         return below if self.high == math.inf else f"{below} and at most {_in_digits(self.high)}"
+
+
+def is_number(value: object) -> bool:
+    """Whether this is a number, NumPy's too; true and false are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _in_digits(number: float) -> str:
@@ -40,6 +47,9 @@ POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)
 SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
 COUNT = Range(1)
 SEED = Range(0, 2**32 - 1)
+FINITE = Range(-math.inf, open_below=True)
+_WHOLE = (int, "int", int | None, "int | None")
+"""What fields of whole numbers say of their type."""
 
 
 def setting(default: Any, allowed: Range) -> Any:
@@ -53,7 +63,9 @@ def allowed_values(config: Any, name: str) -> Range | None:
 
 
 def check_settings(config: Any, prefix: str = "") -> None:
-    """Refuse a number out of its range, of a dataclass and of those within it.
+    """Refuse a number out of its range, and what is none, or not whole where it should be.
+
+    Of a dataclass, and of those within it: fields that `setting` made.
 
     Args:
         config: an object of a dataclass.
@@ -66,9 +78,30 @@ def check_settings(config: Any, prefix: str = "") -> None:
         value, allowed = getattr(config, field.name), field.metadata.get(ALLOWED)
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
-        elif allowed is not None and value is not None and value not in allowed:
-            finite = ", and finite" if value == math.inf else ""
-            raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}{finite}.")
+        elif allowed is not None and value is not None:
+            check_setting(f"{prefix}{field.name}", value, allowed, whole=field.type in _WHOLE)
+
+
+def check_setting(name: str, value: object, allowed: Range, whole: bool = False) -> None:
+    """Refuse a number out of its range, and what is none.
+
+    Args:
+        name: of the setting, for the message.
+        value: of it.
+        allowed: what it may be.
+        whole: whether it must be a whole number.
+
+    Raises:
+        ValueError: the message gives the setting, its value, and what is allowed.
+    """
+    is_whole = isinstance(value, Integral)
+    if not is_number(value):
+        raise ValueError(f"{name}={quoted(value)}: must be a number, {allowed}.")
+    if value not in allowed:
+        finite = ", and finite" if value == math.inf and allowed != FINITE else ""
+        raise ValueError(f"{name}={value}: must be {allowed}{finite}.")
+    if whole and not is_whole:
+        raise ValueError(f"{name}={value}: must be a whole number, {allowed}.")
 
 
 def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> None:

@@ -13,14 +13,15 @@ and writes nothing. Windows need a display.
 """
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
@@ -42,7 +43,7 @@ from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.evaluate import Episode, Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
-from dreamer_racing.figures.hud import caption, race_words
+from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.training.directory import EVALUATION
 
@@ -153,14 +154,27 @@ def make_flight(config: FlyConfig) -> PlannedFlight:
 
 def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
+    with folder_to_fill(Path(config.run_dir)) as directory:
+        flight = make_flight(config)
+        result = flight.fly()
+        flight.env.close()
+        laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
+        print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
+        write(directory, flight.env.track, result)
+
+
+@contextmanager
+def folder_to_fill(directory: Path) -> Iterator[Path]:
+    """Make a folder before the flight, which would be in vain without; if nothing is written to it, it goes again."""
+    made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     with plain_errors():
-        Path(config.run_dir).mkdir(parents=True, exist_ok=True)
-    flight = make_flight(config)
-    result = flight.fly()
-    flight.env.close()
-    laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
-    print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
-    write(Path(config.run_dir), flight.env.track, result)
+        directory.mkdir(parents=True, exist_ok=True)
+    try:
+        yield directory
+    finally:
+        for folder in made:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def watch(config: FlyConfig) -> None:
@@ -260,9 +274,8 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:
     """Find the ends of the second lap, which is flown at racing speed; of the beginning of the flight without one."""
-    gate = trajectory.target_gate
-    ends = (((gate[1:] == 0) & (gate[:-1] != 0)).nonzero().flatten() + 1).tolist()
-    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(gate) - 1))
+    ends = (np.diff(laps_completed(trajectory)).nonzero()[0] + 1).tolist()
+    return (ends[0], ends[1]) if len(ends) > 1 else (0, min(GIF_STEPS, len(trajectory.action)))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
 from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
 from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
-from dreamer_racing.evaluation.sight import Sight, measure_sight, sight_table
+from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import check_settings
@@ -154,7 +154,9 @@ def to_markdown(
 ) -> str:
     """Return the tables as a page."""
     parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
-    parts += [sight_table({name: kind.sights for name, kind in looked.items()}), "![perception](perception.png)\n"]
+    sights = {name: kind.sights for name, kind in looked.items()}
+    parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
+    parts.append("![perception](perception.png)\n")
     parts.append("## Lesions of the camera\n")
     for noise, results in lesions.items():
         parts += [START_TEXT[noise], results_table(results, "images")]

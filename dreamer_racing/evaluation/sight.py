@@ -82,8 +82,9 @@ def measure_sight(
 
     Returns:
         ``next gate``: the one to pass next. ``nearest visible gate``: of the race gates in view the one nearest to the
-        camera; its angle is NaN while none is in view. ``decoy 1``, ``decoy 2`` and so on; ``any decoy``:
-        in view if one of them is; its angle is that to the one nearest to the camera's axis.
+        camera; its angle is NaN while none is in view. ``gate 1``, ``gate 2`` and so on: each race gate, whether it is
+        the next one or not. ``decoy 1``, ``decoy 2`` and so on; ``any decoy``: in view if one of them is; its angle is
+        that to the one nearest to the camera's axis.
     """
     position, attitude, target_gate = (
         torch.cat([getattr(trajectory, name) for trajectory in trajectories])
@@ -104,16 +105,26 @@ def measure_sight(
     sights = {
         NEXT_GATE: Sight(angle[row, target_gate], in_view[row, target_gate], flight),
         NEAREST_VISIBLE_GATE: Sight(angle[row, nearest].masked_fill(~any_gate, math.nan), any_gate, flight),
+        **_one_by_one("gate", angle, in_view, flight),
     }
     if decoys:
         places = torch.tensor([gate.position for gate in decoys], dtype=torch.float64)
         points = points_in_camera(position, attitude, places, camera)  # (M, L, 3)
         angle, in_view = angles(points), is_in_view(points, camera)
-        sights |= {
-            f"decoy {number + 1}": Sight(angle[:, number], in_view[:, number], flight) for number in range(len(decoys))
-        }
+        sights |= _one_by_one("decoy", angle, in_view, flight)
         sights["any decoy"] = Sight(angle.amin(-1), in_view.any(-1), flight)
     return sights
+
+
+def _one_by_one(kind: str, angle: Tensor, in_view: Tensor, flight: Tensor) -> dict[str, Sight]:
+    """Return the sights of things of a kind, each of a column of (M, L), by name and number."""
+    columns = enumerate(zip(angle.unbind(-1), in_view.unbind(-1), strict=True), start=1)
+    return {f"{kind} {number}": Sight(*column, flight) for number, column in columns}
+
+
+def is_race_gate(thing: str) -> bool:
+    """Whether a sight is of one race gate by its number; there may be many of them."""
+    return thing.startswith("gate ")
 
 
 def angles(points: Tensor) -> Tensor:
@@ -122,7 +133,7 @@ def angles(points: Tensor) -> Tensor:
 
 
 def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
-    """Write what the camera was turned to as a Markdown table.
+    """Write what the camera was turned to as a Markdown table, but for single race gates, which `gate_table` has.
 
     Args:
         flights: the sights of each kind of flight, by name.
@@ -131,8 +142,27 @@ def sight_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
     rows = [head, ("---",) * len(head)]
     for flight, sights in flights.items():
         for name, sight in sights.items():
+            if is_race_gate(name):
+                continue
             numbers = sight.to_dict()
             values = [numbers["angle_mean_degrees"], *numbers["angle_quantiles_degrees"].values()]
             cells = ("–" if value is None else f"{value:.0f}°" for value in values)
             rows.append((flight, name, f"{sight.share_in_view:.0%}", *cells))
+    return _as_markdown(rows)
+
+
+def gate_table(flights: Mapping[str, Mapping[str, Sight]]) -> str:
+    """Write the share of time in which each race gate was in view as a Markdown table, a row for each gate.
+
+    Args:
+        flights: the sights of each kind of flight, by name, on tracks of the same race gates.
+    """
+    gates = dict.fromkeys(name for sights in flights.values() for name in sights if is_race_gate(name))
+    head = ("in view", *flights)
+    rows = [head, ("---",) * len(head)]
+    rows += [(gate, *(f"{sights[gate].share_in_view:.0%}" for sights in flights.values())) for gate in gates]
+    return _as_markdown(rows)
+
+
+def _as_markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"

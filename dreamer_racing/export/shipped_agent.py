@@ -8,6 +8,7 @@ optimiser and replay are not in it.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,12 @@ CHOICES = ("auto", AVERAGED, TRAINED)
 """Which weights of a checkpoint are to fly: ``auto`` takes the averaged ones where they are kept."""
 
 _ABSENT = ("critic", "world_model.reward_head", "world_model.continue_head")
-_CAMERA_SETTINGS = {"width_px": "env.image_size", "height_px": "env.image_size", "tilt_up_deg": "env.camera_tilt"}
+_SETTINGS = {
+    "camera.width_px": "env.image_size",
+    "camera.height_px": "env.image_size",
+    "camera.tilt_up_deg": "env.camera_tilt",
+}
+"""Settings by what a contract calls them."""
 
 
 def choose_weights(wanted: str, kept: str | tuple[str, ...], source: str | Path) -> str:
@@ -198,18 +204,18 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
     Raises:
         ValueError: The message names the setting, the agent's value and the environment's.
     """
-    there: dict[str, tuple[Any, Any]] = {
-        "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt)
-    }
     camera = contract.get("camera")
-    there["env.from_pixels"] = (camera is not None, env.from_pixels)
+    pairs: dict[str, tuple[Any, Any]] = {
+        "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt),
+        "env.from_pixels": (camera is not None, env.from_pixels),
+    }
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)
-        pairs: dict[str, tuple[Any, Any]] = {name: (value, here.get(name)) for name, value in camera.items()}
-        there |= {_CAMERA_SETTINGS.get(name, f"camera.{name}"): pair for name, pair in pairs.items()}
-    for setting, (trained, given) in there.items():
+        pairs |= {f"camera.{name}": (value, here.get(name)) for name, value in camera.items()}
+    for name, (trained, given) in pairs.items():
         numbers = isinstance(trained, float) and isinstance(given, int | float)
-        if not (abs(trained - given) < 1e-6 * abs(trained) if numbers else trained == given):
+        if not (math.isclose(trained, given, rel_tol=1e-6, abs_tol=1e-9) if numbers else trained == given):
+            setting = _SETTINGS.get(name, name)
             raise ValueError(
                 f"{setting}={given}: the agent {folder} was trained with {setting}={trained}, and flies "
                 "with nothing else."

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -58,14 +60,30 @@ def write_video(
     import imageio.v2 as imageio  # starts slowly
 
     scale = math.ceil(VIDEO_HEIGHT / array.shape[1]) if scale is None else scale
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    writer: Any = imageio.get_writer(
-        path, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=quality, macro_block_size=1
-    )
-    with writer:
-        for frame in array:
-            writer.append_data(_make_even(enlarge(frame, scale)))
+    looks: Any = {"codec": "libx264", "pixelformat": "yuv420p", "quality": quality, "macro_block_size": 1}
+    with swapped_in(path) as partial:
+        writer: Any = imageio.get_writer(partial, format="FFMPEG", fps=fps, **looks)
+        with writer:
+            for frame in array:
+                writer.append_data(_make_even(enlarge(frame, scale)))
     return True
+
+
+@contextmanager
+def swapped_in(path: str | Path) -> Iterator[Path]:
+    """Give a path beside a file, of the same kind, and put what is written there in the file's place when it is whole.
+
+    Args:
+        path: the file; missing folders are made. It stays as it was if the block fails.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @cache
@@ -111,17 +129,17 @@ def write_gif(
         Image.fromarray(enlarge(frame, scale)).quantize(palette=palette, dither=Image.Dither.NONE) for frame in array
     ]
     delay = round(max(MIN_DELAY, 1 / fps), 2)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 * delay),
-        optimize=False,
-        disposal=1,
-        **({"loop": 0} if loop else {}),
-    )
+    with swapped_in(path) as partial:
+        images[0].save(
+            partial,
+            format="GIF",
+            save_all=True,
+            append_images=images[1:],
+            duration=round(1000 * delay),
+            optimize=False,
+            disposal=1,
+            **({"loop": 0} if loop else {}),
+        )
     return Path(path).stat().st_size
 
 

@@ -42,9 +42,12 @@ def race_words(track: Track, trajectory: Trajectory) -> list[str]:
 
 
 def laps_completed(trajectory: Trajectory) -> np.ndarray:
-    """Count the laps behind a drone at every row of a flight from its start on, (K + 1,)."""
+    """Count the laps behind a drone at every row of a flight from its start on, (K + 1,).
+
+    A lap ends where the next gate is an earlier one: the first, or one behind it where a step passed two.
+    """
     gate = trajectory.target_gate.numpy()
-    return np.concatenate(([0], np.cumsum((gate[1:] == 0) & (gate[:-1] != 0))))
+    return np.concatenate(([0], np.cumsum(gate[1:] < gate[:-1])))
 
 
 def _speed(speed: float) -> str:

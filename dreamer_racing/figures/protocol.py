@@ -16,7 +16,7 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.evaluation.evaluate import CRASHES, FINISHED, Episode, Evaluation, Trajectory
 from dreamer_racing.evaluation.protocol import MODES, Result
-from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight
+from dreamer_racing.evaluation.sight import BIN_DEGREES, NEAREST_VISIBLE_GATE, Sight, is_race_gate
 from dreamer_racing.figures.drawing import (
     FAINT,
     INK,
@@ -172,7 +172,11 @@ def plot_sight(
         axes.sharey(below[0])
     from_zero(below[0], least=0.01)
     below[0].set_ylabel("share of observations, per 5°")
-    _draw_shares(figure.add_subplot(grid[3, :]), {name: sights for name, (_, _, sights) in flights.items()})
+    shares = {
+        name: {thing: sight for thing, sight in sights.items() if not is_race_gate(thing)}
+        for name, (_, _, sights) in flights.items()
+    }
+    _draw_shares(figure.add_subplot(grid[3, :]), shares)
     _save(figure, path, title)
 
 
@@ -198,7 +202,8 @@ def _draw_maps(
 
 def _draw_distributions(axes: Axes, name: str, sights: Mapping[str, Sight], camera: Camera) -> None:
     edges = np.arange(0, 180 + BIN_DEGREES, BIN_DEGREES)
-    drawn = {thing: sight for thing, sight in sights.items() if not thing.startswith("decoy ")}  # any decoy is enough
+    single = {thing for thing in sights if thing.startswith("decoy ") or is_race_gate(thing)}  # any is enough
+    drawn = {thing: sight for thing, sight in sights.items() if thing not in single}
     for color, (thing, sight) in zip(SIGHT_COLORS, drawn.items(), strict=False):
         axes.stairs(sight.histogram().numpy(), edges, color=color, label=thing, linewidth=1.6, fill=False)
     axes.axvline(camera.field_of_view / 2, color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)))

@@ -23,6 +23,7 @@ from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import Safety, SafetyLimits, Tick, Verdict
 from dreamer_racing.hil.stamping import PoseClock, Stamping, extrapolate
 from dreamer_racing.hil.vehicle import GRAVITY, Pose, Setpoint
+from dreamer_racing.settings import Range, check_setting
 
 LIFT = 1.35
 """Weights of thrust that the lift off the stand grows to within `SafetyLimits.lift_time` [choice]. It begins at one: a
@@ -41,6 +42,10 @@ RISE_HEIGHT = 0.01
 START_RATE = 2.0
 """rad/s above which a vehicle has left the start, be it slow still [choice]: racers turn before they move, and an actor
 whose memory begins when it is tilted already has never seen such a start. Noise of estimated rates stays below."""
+
+
+LATENCY = Range(0, 1)
+"""s, of poses."""
 
 
 class ChainConfig(NamedTuple):
@@ -129,7 +134,8 @@ class FlightChain:
         camera: Draws what the flyer sees; None if it needs no image.
 
     Raises:
-        ValueError: The lift lifts nothing, or is more than is sensible or safety lets through.
+        ValueError: The latency is no time, or the lift lifts nothing, or is more than is sensible or safety lets
+            through.
 
     Attributes:
         progress: Which gates were passed.
@@ -139,6 +145,7 @@ class FlightChain:
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
+        check_setting("latency", config.latency, LATENCY)
         self.progress = GateProgress(track, config.limits)
         self.clock = PoseClock(config.stamping, config.latency, config.limits.clock_drift_max)
         self.safety = Safety(config.limits)

@@ -17,8 +17,8 @@ import numpy as np
 from dreamer_racing.hil.aside import Aside
 from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.chain import FlightChain, Inputs, Outputs, describe_inputs, describe_outputs
-from dreamer_racing.hil.operator import OperatorSource
-from dreamer_racing.hil.pose import PoseSource
+from dreamer_racing.hil.operator import Operator, OperatorSource
+from dreamer_racing.hil.pose import PoseSource, Received
 from dreamer_racing.hil.recording import FlightRecorder
 from dreamer_racing.hil.safety import Reason
 from dreamer_racing.hil.vehicle import Command, Link, at_rest
@@ -151,7 +151,7 @@ class FlightLoop:
         self._lines = Aside(LINES_MOST)
         self._stop: str | None = None
         self._dropped = False  # whether the command of the tick before was
-        self._broken = False  # whether the link has failed
+        self._broken: set[str] = set()  # what has failed: link, source of poses, operator's switch
         self._said: tuple[object, ...] = ()
 
     def stop(self, reason: str) -> None:
@@ -224,9 +224,9 @@ class FlightLoop:
 
     def _tick(self, start: float, deadline: float, overrun: int, armed: bool) -> Outputs:
         """Do one tick: what came in → chain → link → file."""
-        operator = self._operator.poll(armed)
+        operator = self._ask_operator(armed)
         heard = self._listen()
-        inputs = Inputs(start, self._poses.poll(), operator, overrun, heard or [], self._dropped)
+        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
@@ -241,12 +241,28 @@ class FlightLoop:
         self.statistics.prepare.append(self._clock.now() - shown)
         return outputs
 
+    def _ask_operator(self, armed: bool) -> Operator:
+        """Return what the operator wants; of a switch that fails, that nothing may fly: safety cuts then."""
+        try:
+            return self._operator.poll(armed)
+        except OSError as error:
+            self._note_broken("the operator's switch", error)
+            return Operator(enable=False, kill=False)
+
+    def _take_poses(self) -> list[Received]:
+        """Return the poses that have come; none of a source that fails: safety holds, then cuts."""
+        try:
+            return self._poses.poll()
+        except OSError as error:
+            self._note_broken("the source of poses", error)
+            return []
+
     def _listen(self) -> list[Reading] | None:
         """Return what the link has heard; None of one that fails: what it takes then counts as dropped, too."""
         try:
             return self._link.listen()
         except OSError as error:
-            self._note_broken(error)
+            self._note_broken("the link", error)
             return None
 
     def _send(self, command: Command) -> bytes:
@@ -254,14 +270,14 @@ class FlightLoop:
         try:
             return self._watchdog.send(command)
         except OSError as error:
-            self._note_broken(error)
+            self._note_broken("the link", error)
             return b""
 
-    def _note_broken(self, error: OSError) -> None:
-        """Say once what the link has met."""
-        if not self._broken:
-            self._log(logging.ERROR, "the link fails: %s", error)
-        self._broken = True
+    def _note_broken(self, part: str, error: OSError) -> None:
+        """Say once what a part has met."""
+        if part not in self._broken:
+            self._log(logging.ERROR, "%s fails: %s", part, error)
+        self._broken.add(part)
 
     def _show(self, inputs: Inputs, outputs: Outputs, took: dict[str, float], sent: bytes) -> None:
         """Write it down and show it; a full disk, or a page that fails, must not end a flight."""

@@ -21,6 +21,9 @@ _CHECK = struct.Struct("<I")
 PACKET_SIZE = _BODY.size + _CHECK.size
 """Bytes of a packet: 124."""
 
+LARGEST = 1e6
+"""m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]."""
+
 
 class PosePacket(NamedTuple):
     """What a pose packet says.
@@ -58,7 +61,8 @@ class PoseSource(Protocol):
     """Where poses come from.
 
     Attributes:
-        rejected: Messages so far that were no pose: malformed, damaged, not finite, or of an attitude that is none.
+        rejected: Messages so far that were no pose: malformed, damaged, with numbers that are not `plausible`, or of an
+            attitude that is none.
     """
 
     rejected: int
@@ -100,12 +104,18 @@ def make_packet(
     linear_velocity: np.ndarray,
     body_rates: np.ndarray,
 ) -> PosePacket | None:
-    """Return a packet with its attitude at unit length; None if a number is not finite or the attitude is none."""
-    vectors = (position, attitude, linear_velocity, body_rates)
-    length = float(np.linalg.norm(attitude)) if all(np.isfinite(vector).all() for vector in vectors) else 0.0
-    if not np.isfinite(stamp) or not 0.9 < length < 1.1:
+    """Return a packet with its attitude at unit length; None if a number is not plausible or the attitude is none."""
+    if not (np.isfinite(stamp) and plausible(position, attitude, linear_velocity, body_rates)):
+        return None
+    length = float(np.linalg.norm(attitude))
+    if not 0.9 < length < 1.1:
         return None
     return PosePacket(sequence, stamp, position, attitude / length, linear_velocity, body_rates)
+
+
+def plausible(*vectors: np.ndarray) -> bool:
+    """Whether all numbers are finite, and of a size that can be calculated with."""
+    return all(bool((np.abs(vector) <= LARGEST).all()) for vector in vectors)
 
 
 class UdpPose:

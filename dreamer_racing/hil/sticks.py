@@ -16,8 +16,8 @@ Reference: Betaflight, src/main/fc/rc.c (rates, throttle) and src/main/flight/mi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -135,7 +135,7 @@ class ThrustMap:
             ValueError: The message gives the field, its value, and what is allowed.
         """
         check_settings(self, "ThrustMap.")
-        low, high = 0.5 * self.reference_voltage, 1.5 * self.reference_voltage
+        low, high = self._voltage_ends
         if not low <= self.voltage <= high:
             raise ValueError(
                 f"ThrustMap.voltage={self.voltage} V: must be between {low:g} and {high:g} V, half and one and a half "
@@ -147,6 +147,23 @@ class ThrustMap:
                 f"{GRAVITY * self.mass:.3g} N, but is {self.collective_thrust_max * self.mass:.3g} N at "
                 f"{self.voltage:g} V. Is it that of all motors together?"
             )
+
+    @property
+    def _voltage_ends(self) -> tuple[float, float]:
+        """Least and largest voltage of a battery that the reference may be of, V."""
+        return 0.5 * self.reference_voltage, 1.5 * self.reference_voltage
+
+    def at(self, voltage: float) -> Self:
+        """Return the map at another voltage, V, or at the nearest for which it can be (`check`): this never raises.
+
+        Below the voltage at which motors just lift the drone it stays there; what is not finite changes nothing.
+        """
+        if not math.isfinite(voltage):
+            return self
+        low, high = self._voltage_ends
+        lifting = self.reference_voltage * math.sqrt(GRAVITY * self.mass / self.full_thrust) * (1.0 + 1e-6)
+        low = max(low, min(lifting, self.voltage))  # the voltage of now is one that it can be at
+        return replace(self, voltage=_clamp(voltage, low, high))
 
     @property
     def collective_thrust_max(self) -> float:

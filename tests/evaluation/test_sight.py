@@ -14,7 +14,7 @@ from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_came
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds
-from dreamer_racing.evaluation.sight import Sight, angles, measure_sight, sight_table
+from dreamer_racing.evaluation.sight import Sight, angles, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 
@@ -66,11 +66,30 @@ def test_next_and_nearest_visible_gate():
     """Gates 30° to the left at 10 m, straight ahead at 20 m, and behind at 1 m, which is next."""
     left = (10 * math.cos(math.radians(30)), 10 * math.sin(math.radians(30)), 1.0)
     sights = measure_sight([flight((0.0, 0.0, 1.0), target=2)], track_of(left, (20.0, 0, 1.0), (-1.0, 0, 1.0)), LEVEL)
-    assert list(sights) == ["next gate", "nearest visible gate"]
+    assert list(sights) == ["next gate", "nearest visible gate", "gate 1", "gate 2", "gate 3"]
     assert sights["next gate"].angle.tolist() == pytest.approx([180.0])
     assert not sights["next gate"].in_view.any()
     assert sights["nearest visible gate"].angle.tolist() == pytest.approx([30.0])
     assert sights["nearest visible gate"].in_view.all()
+
+
+def test_each_gate_is_seen_for_itself():
+    """One row towards both gates, 0° and 30° off the axis, two turned by 60° to the left, and one to where none is."""
+    left = (10 * math.cos(math.radians(30)), 10 * math.sin(math.radians(30)), 1.0)
+    here = (0.0, 0.0, 1.0)
+    flights = [flight(here), flight(here, yaw_degrees=60.0, rows=2), flight(here, yaw_degrees=180.0)]
+    sights = measure_sight(flights, track_of((20.0, 0, 1.0), left), LEVEL)
+    assert sights["gate 1"].angle.tolist() == pytest.approx([0, 60, 60, 180])
+    assert sights["gate 2"].angle.tolist() == pytest.approx([30, 30, 30, 150])
+    assert [sights[f"gate {number}"].share_in_view for number in (1, 2)] == [0.25, 0.75]
+    assert sights["gate 2"].shares_by_flight == [1.0, 1.0, 0.0]
+    rows = gate_table({"without": sights, "with": sights}).splitlines()
+    assert rows[0] == "| in view | without | with |" and rows[2:] == [
+        "| gate 1 | 25% | 25% |",
+        "| gate 2 | 75% | 75% |",
+    ]
+    table = sight_table({"without": sights}).splitlines()
+    assert [row.split(" | ")[1] for row in table[2:]] == ["next gate", "nearest visible gate"]
 
 
 def test_shares_over_flights_of_unequal_length_and_no_gate_in_view():

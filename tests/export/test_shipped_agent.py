@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,9 +17,16 @@ from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export.actor_step import ActorStep, export_actor
 from dreamer_racing.export.contract import hash_weights, make_contract
-from dreamer_racing.export.onnx_actor import OnnxActor
+from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, read_contract
 from dreamer_racing.export.parity import MIN_STEPS
-from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, choose_weights, is_agent, load_agent
+from dreamer_racing.export.shipped_agent import (
+    FILES,
+    ShippedAgent,
+    check_env,
+    choose_weights,
+    is_agent,
+    load_agent,
+)
 from dreamer_racing.export.weights_file import read_weights, write_weights
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.modules.agent import Agent
@@ -170,6 +178,30 @@ def test_another_environment_is_refused(other: dict, message: str, shipped: Path
     with pytest.raises(ValueError, match=message):
         ShippedAgent.load(shipped, env)
     env.close()
+
+
+def described(contract: dict, **camera: object) -> SimpleNamespace:
+    """What `check_env` looks at of an environment that is as a contract describes it, but for its camera."""
+    parameters = SimpleNamespace(control_dt=1.0 / contract["control"]["rate_hz"])
+    worlds = SimpleNamespace(parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera))
+    return SimpleNamespace(from_pixels=True, worlds=worlds)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 30.0, -10.0])
+def test_an_agent_of_any_tilt_flies_with_its_own_only(tilt: float, shipped: Path) -> None:
+    contract = read_contract(shipped / CONTRACT)
+    contract["camera"]["tilt_up_deg"] = tilt
+    check_env(shipped, contract, described(contract, tilt=tilt + 1e-12))
+    with pytest.raises(ValueError, match="env.camera_tilt="):
+        check_env(shipped, contract, described(contract, tilt=tilt + 0.01))
+
+
+@pytest.mark.parametrize("side", ["width", "height"])
+def test_each_side_of_an_image_counts(side: str, shipped: Path) -> None:
+    contract = read_contract(shipped / CONTRACT)
+    contract["camera"][f"{side}_px"] = 48
+    with pytest.raises(ValueError, match="env.image_size=32: .*env.image_size=48"):
+        check_env(shipped, contract, described(contract))
 
 
 def cut_off(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import imageio.v3 as iio
 import imageio_ffmpeg
@@ -70,6 +71,33 @@ def test_video_reads_back(tmp_path, size, scale, expected):
     corner, middle = read[:, 3, 3].astype(int), read[:, -4, -4].astype(int)
     assert np.abs(middle - frames[:, -1, -1]).max() < 25
     assert np.abs(corner - frames[:, 0, 0]).max() < 25
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "owner", "part"),
+    [("a.mp4", write_video, film, "_make_even"), ("a.gif", write_gif, Image.Image, "save")],
+)
+def test_a_film_that_is_broken_off_leaves_the_one_before_and_nothing_else(
+    tmp_path, monkeypatch, name, write, owner, part
+):
+    frames = []
+
+    def fails(first, *rest, **_):
+        """In place of what makes a frame even, at the ninth one; or of what saves an image, half of which is there."""
+        frames.append(first)
+        if owner is film and len(frames) < 9:
+            return first
+        for path in rest:
+            Path(path).write_bytes(b"GIF89a")
+        raise OSError(28, "No space left on device")
+
+    write(tmp_path / name, blocks(12))
+    before = (tmp_path / name).read_bytes()
+    monkeypatch.setattr(owner, part, fails)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path / name, blocks(10))
+    assert (tmp_path / name).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_without_ffmpeg_one_warning_stands_for_all_videos(tmp_path, monkeypatch, caplog):

@@ -10,7 +10,15 @@ import torch
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.film import CONTEXT_COLOR, OPEN_LOOP_COLOR
-from dreamer_racing.figures.hud import SEEN, STRIP_COLOR, caption, dream_words, race_words, slow_motion
+from dreamer_racing.figures.hud import (
+    SEEN,
+    STRIP_COLOR,
+    caption,
+    dream_words,
+    laps_completed,
+    race_words,
+    slow_motion,
+)
 from tests.figures.test_flights import random_flight
 
 
@@ -25,6 +33,12 @@ def test_time_speed_gate_and_lap_of_a_race():
     assert words[4] == " 0.08 s   lost  gate 4/4  lap 1/2"
     assert words[5] == " 0.10 s   5.0 m/s  gate 1/4  lap 2/2"
     assert words[9].endswith("gate 1/4  lap 2/2")  # the race is over: there is no third lap
+
+
+def test_a_lap_that_ends_in_a_step_of_two_gates_counts():
+    flight = random_flight(steps=9)
+    flight.target_gate[:] = torch.tensor([0, 2, 3, 1, 2, 3, 0, 0, 2, 0])
+    assert laps_completed(flight).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
 
 
 def test_a_dream_says_what_it_has_seen():

@@ -86,6 +86,21 @@ def test_a_frame_of_the_flight_controller_changes_the_throttle_by_the_thrust_law
     assert link.listen() == [] and link.rejected == 0
 
 
+@pytest.mark.parametrize("voltage", [0.0, 3.9, 7.4, 8.9, 9.2, 22.6, 1e9, -15.0, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("mass", [0.6, 0.2, 1.6])
+def test_no_reading_in_flight_raises(voltage, mass):
+    """The reference is 15 V: from 7.5 V, or what just lifts the drone, to 22.5 V."""
+    thrust = ThrustMap(mass=mass, full_thrust=16.0, reference_voltage=15.0, voltage=16.0)
+    link = ChannelLink(Wire(), encode_crsf, RateMap(roll=10.0, pitch=10.0, yaw=4.0), thrust)
+    link.reckon_with(voltage)
+    link.thrust.check()
+    lifting = 15.0 * math.sqrt(9.81 * mass / 16.0)
+    expected = min(max(voltage, 7.5, lifting), 22.5) if math.isfinite(voltage) else 16.0
+    assert link.thrust.voltage == pytest.approx(expected, rel=1e-4)
+    link.reckon_with(16.0)
+    assert link.thrust == thrust
+
+
 def throttle(link: ChannelLink) -> float:
     channels = decode_crsf(link.send(Command(True, hover())))
     assert channels is not None

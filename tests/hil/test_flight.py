@@ -364,6 +364,34 @@ def test_a_link_that_breaks_in_flight_cuts_and_the_flight_ends_as_any_other(capl
     assert sum("the link fails" in line for line in caplog.messages) == 1
 
 
+@pytest.mark.parametrize(
+    ("part", "said", "states", "words"),
+    [
+        ("poses", "the source of poses fails", ["flying", "hold", "cut"], "cut: the newest pose is "),
+        ("operator", "the operator's switch fails", ["flying", "cut"], "cut: the operator does not give the enable"),
+    ],
+)
+def test_what_speaks_to_the_loop_and_breaks_in_flight_ends_it_as_any_other(part, said, states, words, tmp_path, caplog):
+    """As where a receiver is unplugged: safety decides, all is recorded, and the reason is returned."""
+    plant = Watched(CIRCLE)
+    source = getattr(plant, part)
+    poll = source.poll
+
+    def unplugged(*armed):
+        if plant.elapsed > 2.0:
+            raise OSError(19, "No such device")
+        return poll(*armed)
+
+    source.poll = unplugged
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        ended = plant.fly(chain_of(Hover(), plant), Hover.rate, 30.0, recorder)
+    assert ended.startswith(words)
+    shown = [tick["out"]["state"] for tick in Flight(tmp_path).ticks]
+    assert list(dict.fromkeys(shown[shown.index("flying") :])) == states
+    assert 2.0 < max(moment for moment, command in plant.sent if command.armed) + 0.02 < 2.2
+    assert sum(said in line for line in caplog.messages) == 1
+
+
 def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
     class Clogged(Watched):
         def send(self, command):
@@ -545,6 +573,12 @@ def test_a_lift_that_lifts_nothing_or_is_clipped_is_refused(lift, limits):
     config = ChainConfig(SafetyLimits.of_track(CIRCLE, **limits), lift=lift)
     with pytest.raises(ValueError, match=rf"lift={lift:g}: must be 1.1 to 1.5 weights.*limits.thrust_max="):
         FlightChain(Hover(), CIRCLE, config, None)
+
+
+@pytest.mark.parametrize("latency", [-1, 1.5, np.nan, "0"])
+def test_a_latency_that_is_no_time_is_refused(latency):
+    with pytest.raises(ValueError, match=f"latency={latency!r}: must be (a number, )?at least 0 and at most 1"):
+        FlightChain(Hover(), CIRCLE, ChainConfig(SafetyLimits.of_track(CIRCLE), latency=latency), None)
 
 
 def test_what_does_not_lift_off_does_not_spin_for_ever():

@@ -62,6 +62,9 @@ def test_a_packet_survives_the_way(sequence, stamp, numbers):
         {"attitude": (0.0, 0.0, 0.0, 0.0)},
         {"attitude": (2.0, 0.0, 0.0, 0.0)},
         {"stamp": math.nan},
+        {"position": (0.0, -1.001e6, 0.0)},
+        {"linear_velocity": (1e200, 0.0, 0.0)},
+        {"body_rates": (0.0, 1e200, 1e200)},
     ],
 )
 def test_impossible_numbers_are_no_pose(spoilt):

@@ -726,6 +726,19 @@ def test_the_same_ticks_give_the_same_verdicts(ticks):
         assert (one.state, one.reasons, one.words) == (other.state, other.reasons, other.words)
 
 
+def test_limits_are_numbers_of_any_kind_and_counts_are_whole():
+    track = load_track("circle")
+    of_numpy = {"speed_max": np.float32(10.0), "overruns_max": np.int64(2), "thrust_max": np.float64(20.0)}
+    Safety(SafetyLimits.of_track(track, **of_numpy))
+    for change, message in (
+        ({"speed_max": "10"}, "limits.speed_max='10': must be a number, above 0 and at most 10000"),
+        ({"speed_max": np.float32(2e4)}, "limits.speed_max=20000.0: must be above 0 and at most 10000"),
+        ({"overruns_max": 2.5}, "limits.overruns_max=2.5: must be a whole number, at least 0 and at most 1000"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Safety(SafetyLimits.of_track(track, **change))
+
+
 def test_limits_of_a_track_know_its_box_and_refuse_names_that_are_none():
     track = load_track("circle")
     limits = SafetyLimits.of_track(track, speed_max=9.0, rate_max=[5.0, 5.0, 2.0])

@@ -74,6 +74,26 @@ def test_without_a_display_it_says_in_a_sentence_how_to_get_a_video(monkeypatch:
             fly.check(fly.FlyConfig(viewer=True, **flown))
 
 
+@pytest.mark.parametrize(
+    "refused", [{"track": "monza"}, {"agent": "circle", "control_rate": 49.0}], ids=["track", "control rate"]
+)
+def test_a_flight_that_is_refused_leaves_no_folder(refused, tmp_path, monkeypatch) -> None:
+    fly = recipe_module("fly")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for run_dir in ("runs/fly", "mine/fly", "mine"):
+        with pytest.raises(SystemExit):
+            fly.fly(fly.FlyConfig(run_dir=run_dir, **refused))
+        assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
+
+
+def test_a_folder_to_which_something_was_written_stays(tmp_path) -> None:
+    fly = recipe_module("fly")
+    with fly.folder_to_fill(tmp_path / "runs" / "fly") as directory:
+        (directory / "evaluation.json").write_text("{}")
+    assert (tmp_path / "runs" / "fly" / "evaluation.json").exists()
+
+
 @pytest.mark.slow
 def test_the_refusal_as_a_user_meets_it(tmp_path) -> None:
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):

@@ -231,7 +231,7 @@ def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
     report = json.loads((tmp_path / "seen" / "perception.json").read_text())
     assert set(report["flights"]) == {"without decoys", "with decoys"}
     for flights in report["flights"].values():
-        assert {"next gate", "nearest visible gate", "decoy 1", "decoy 2"} <= set(flights["sights"])
+        assert {"next gate", "nearest visible gate", "gate 1", "decoy 1", "decoy 2"} <= set(flights["sights"])
     lesions = [(record["start_noise"], record["images"], record["policy"]) for record in report["lesions"]]
     modes = ("deterministic", "stochastic")
     assert lesions == [(noise, name, mode) for noise in (0.0, 1.0) for name in LESIONS for mode in modes]

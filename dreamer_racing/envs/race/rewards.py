@@ -9,6 +9,8 @@ import dataclasses
 
 import torch
 
+from dreamer_racing.settings import FINITE, check_settings, setting
+
 
 @dataclasses.dataclass(frozen=True)
 class RewardWeights:
@@ -19,12 +21,18 @@ class RewardWeights:
         body_rate: b₂, penalty for each rad/s of body rate; a curriculum raises it to 0.01.
         gate: reward of a control step in which the target gate was passed, instead of progress.
         collision: reward of a control step that ends in a crash, instead of everything else.
+
+    Raises:
+        ValueError: a weight is no finite number.
     """
 
-    progress: float = 1.0
-    body_rate: float = 0.0
-    gate: float = 10.0
-    collision: float = -4.0
+    progress: float = setting(1.0, FINITE)
+    body_rate: float = setting(0.0, FINITE)
+    gate: float = setting(10.0, FINITE)
+    collision: float = setting(-4.0, FINITE)
+
+    def __post_init__(self) -> None:
+        check_settings(self, "RewardWeights.")
 
 
 def race_reward(

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track
+from dreamer_racing.envs.tracks.track import Gate, GateShape, Track, TrackError, Vector, make_track, refusal
 from dreamer_racing.envs.tracks.validation import validate_track
 from dreamer_racing.settings import quoted, shortened, suggestion
 
@@ -302,4 +302,4 @@ class _TrackReader:
 
     def _error(self, where: str, value: Any, allowed: str) -> TrackError:
         """Return the refusal of one field."""
-        return TrackError(f"{self._source}: {where} is {quoted(value)}, but must be {allowed}.")
+        return refusal(self._source, where, value, allowed)

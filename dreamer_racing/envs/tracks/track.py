@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
+from dreamer_racing.settings import is_number, quoted
+
 if TYPE_CHECKING:
     import torch
 
@@ -33,9 +35,38 @@ class TrackError(ValueError):
     """A track that cannot be flown, with one paragraph that says what is wrong, where, and what would be right."""
 
 
+def refusal(source: str, field: str, value: object, allowed: str) -> TrackError:
+    """Return the refusal of one field."""
+    return TrackError(f"{source}: {field} is {quoted(value)}, but must be {allowed}.")
+
+
+def _normalise(part: Any, numbers: Sequence[str], vectors: Sequence[str]) -> None:
+    """Make Python's floats, and tuples of them, of a frozen object's fields; what is none stays, to be refused."""
+    for name in numbers:
+        object.__setattr__(part, name, _as_float(getattr(part, name)))
+    for name in vectors:
+        value = _as_tuple(getattr(part, name))
+        object.__setattr__(part, name, tuple(map(_as_float, value)) if isinstance(value, tuple) else value)
+
+
+def _as_float(value: Any) -> Any:
+    value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's and torch's
+    try:
+        return float(value) if is_number(value) else value
+    except OverflowError:
+        return value
+
+
+def _as_tuple(value: Any) -> Any:
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+
+
 @dataclasses.dataclass(frozen=True)
 class Gate:
     """One square gate, standing upright.
+
+    Numbers may be of any kind, vectors any sequences or arrays of them: they become floats, and tuples of floats.
 
     Args:
         position: centre of the opening in the world, m.
@@ -50,9 +81,7 @@ class Gate:
     color: Vector | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", tuple(self.position))  # a list could not be hashed
-        if self.color is not None:
-            object.__setattr__(self, "color", tuple(self.color))
+        _normalise(self, ("yaw_degrees",), ("position", "color"))
 
     @property
     def forward(self) -> Vector:
@@ -82,6 +111,9 @@ class GateShape:
     outer: float = 2.05
     depth: float = 0.1
     margin: float = 0.1
+
+    def __post_init__(self) -> None:
+        _normalise(self, [field.name for field in dataclasses.fields(self)], ())
 
     @property
     def pass_half_width(self) -> float:
@@ -114,6 +146,13 @@ class Track:
     bounds_low: Vector
     bounds_high: Vector
     laps: int = 3
+
+    def __post_init__(self) -> None:
+        _normalise(self, ("start_yaw_degrees",), ("start_position", "bounds_low", "bounds_high"))
+        for name in ("gates", "decoys"):
+            object.__setattr__(self, name, _as_tuple(getattr(self, name)))
+        if hasattr(self.laps, "tolist"):
+            object.__setattr__(self, "laps", self.laps.tolist())
 
     @property
     def num_gates(self) -> int:
@@ -179,12 +218,19 @@ def make_track(
         bounds_high: m; None for 3 m outside the race gates' frames, 6 m high.
         laps: number of laps of an evaluation episode.
 
+    Raises:
+        TrackError: a gate, a measure or the start is no number where defaults follow from it.
+
     Example:
         >>> make_track("line", [Gate((0, 0, 1.35), 0), Gate((5, 0, 1.35), 0)]).start_position
         (-2.5, 0.0, 1.35)
     """
-    shape = shape or GateShape()
-    if start_position is None:
+    source, shape = f"Track({name!r})", shape or GateShape()
+    require_gates(source, "gates", gates)
+    require_shape(source, shape)
+    if start_position is not None:
+        require_vector(source, "start.position", start_position := _as_tuple(start_position))
+    else:
         start_position = _point_before(gates[0], START_DISTANCE)
     if start_yaw_degrees is None:
         start_yaw_degrees = _bearing(start_position, gates[0].position)
@@ -200,6 +246,42 @@ def make_track(
         bounds_high=default_high if bounds_high is None else bounds_high,
         laps=laps,
     )
+
+
+def require_gates(source: str, field: str, gates: Sequence[Gate]) -> None:
+    """Refuse what is no gate, and gates of which it is not known where they are, or how they are turned."""
+    if not isinstance(gates, Sequence):
+        raise refusal(source, field, gates, "a sequence of gates")
+    for index, gate in enumerate(gates):
+        if not isinstance(gate, Gate):
+            raise refusal(source, f"{field}[{index}]", gate, "a Gate")
+        require_vector(source, f"{field}[{index}].position", gate.position)
+        require_number(source, f"{field}[{index}].yaw_degrees", gate.yaw_degrees)
+
+
+def require_shape(source: str, shape: GateShape) -> None:
+    """Refuse measures that are no finite numbers."""
+    if not isinstance(shape, GateShape):
+        raise refusal(source, "shape", shape, "a GateShape")
+    for field in dataclasses.fields(shape):
+        require_number(source, f"shape.{field.name}", getattr(shape, field.name))
+
+
+def require_vector(source: str, field: str, value: object) -> None:
+    """Refuse what is not three finite numbers."""
+    if not (isinstance(value, tuple) and len(value) == 3 and all(map(_is_finite, value))):
+        raise refusal(source, field, value, "three finite numbers (x, y, z) in m")
+
+
+def require_number(source: str, field: str, value: object) -> None:
+    """Refuse what is no finite number."""
+    if not _is_finite(value):
+        raise refusal(source, field, value, "a finite number")
+
+
+def _is_finite(value: object) -> bool:
+    value = _as_float(value)
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _point_before(gate: Gate, distance: float) -> Vector:

@@ -14,8 +14,19 @@ from __future__ import annotations
 import math
 from itertools import pairwise, permutations
 
-from dreamer_racing.envs.tracks.track import GROUND_HEIGHT, Gate, GateShape, Track, TrackError, Vector
-from dreamer_racing.settings import quoted
+from dreamer_racing.envs.tracks.track import (
+    GROUND_HEIGHT,
+    Gate,
+    GateShape,
+    Track,
+    TrackError,
+    Vector,
+    refusal,
+    require_gates,
+    require_number,
+    require_shape,
+    require_vector,
+)
 
 ROUNDING = 1e-9
 """How far (m) rounding may carry a point over a limit that it stands on."""
@@ -57,7 +68,7 @@ def validate_track(track: Track, source: str) -> None:
         if gate.kind == "race":
             _check_reach(track, name, gate, source)
         elif not _inside(gate.position, *flyable_box(track, clearance=0.0)):
-            raise _error(source, f"{name}.position", gate.position, f"inside the bounding box {_box(track)}")
+            raise refusal(source, f"{name}.position", gate.position, f"inside the bounding box {_box(track)}")
     _check_overlaps(track, source)
     _check_start(track, source)
     _check_legs(track, source)
@@ -80,7 +91,11 @@ def _named_gates(track: Track) -> list[tuple[str, Gate]]:
 
 
 def _check_numbers(track: Track, source: str) -> None:
-    """Refuse vectors that are not three finite numbers, and numbers that are not finite."""
+    """Refuse what is no number where one belongs: places, directions, measures, colours and laps."""
+    for name in ("gates", "decoys"):
+        require_gates(source, name, getattr(track, name))
+    require_shape(source, track.shape)
+    require_number(source, "start.yaw_degrees", track.start_yaw_degrees)
     vectors = {
         "start.position": track.start_position,
         "bounds.low": track.bounds_low,
@@ -88,48 +103,48 @@ def _check_numbers(track: Track, source: str) -> None:
         **{f"{name}.position": gate.position for name, gate in _named_gates(track)},
     }
     for field, vector in vectors.items():
-        if len(vector) != 3 or not all(math.isfinite(number) for number in vector):
-            raise _error(source, field, vector, "three finite numbers (x, y, z) in m")
+        require_vector(source, field, vector)
         if max(map(abs, vector)) > FARTHEST:
-            raise _error(source, field, vector, f"within {FARTHEST:.0f} m of the origin on every axis")
-    numbers = {
-        "start.yaw_degrees": track.start_yaw_degrees,
-        **{f"{name}.yaw_degrees": gate.yaw_degrees for name, gate in _named_gates(track)},
-        **{f"shape.{name}": getattr(track.shape, name) for name in ("opening", "outer", "depth", "margin")},
-    }
-    for field, number in numbers.items():
-        if not math.isfinite(number):
-            raise _error(source, field, number, "a finite number")
-    if not 1 <= track.laps <= MAX_LAPS:
-        raise _error(source, "laps", track.laps, f"a whole number of at least 1 and at most {MAX_LAPS:,}")
+            raise refusal(source, field, vector, f"within {FARTHEST:.0f} m of the origin on every axis")
+    for name, gate in _named_gates(track):
+        if gate.color is not None and not _is_color(gate.color):
+            raise refusal(source, f"{name}.color", gate.color, "three numbers [red, green, blue] from 0 to 1, or None")
+    whole = isinstance(track.laps, int) and not isinstance(track.laps, bool)
+    if not (whole and 1 <= track.laps <= MAX_LAPS):
+        raise refusal(source, "laps", track.laps, f"a whole number of at least 1 and at most {MAX_LAPS:,}")
+
+
+def _is_color(value: object) -> bool:
+    """Tell whether this is red, green and blue."""
+    return isinstance(value, tuple) and len(value) == 3 and all(isinstance(x, float) and 0 <= x <= 1 for x in value)
 
 
 def _check_kinds(track: Track, source: str) -> None:
     """Refuse too few race gates, and gates listed under the wrong name."""
     if len(track.gates) < 2:
-        raise _error(source, "gates", track.gates, "at least 2 race gates, so that there is a lap")
+        raise refusal(source, "gates", track.gates, "at least 2 race gates, so that there is a lap")
     if (count := len(track.gates) + len(track.decoys)) > MAX_GATES:
         raise TrackError(f"{source}: gates and decoys are {count:,} together, but must be {MAX_GATES} at most.")
     for name, gate in _named_gates(track):
         kind = "race" if name.startswith("gates") else "decoy"
         if gate.kind != kind:
-            raise _error(source, f"{name}.kind", gate.kind, f"{kind!r}: race gates stand in gates, decoys in decoys")
+            raise refusal(source, f"{name}.kind", gate.kind, f"{kind!r}: race gates stand in gates, decoys in decoys")
 
 
 def _check_shape(shape: GateShape, source: str) -> None:
     """Refuse gates without an opening, a frame or a thickness."""
     if shape.opening < SMALLEST:
-        raise _error(source, "shape.opening", shape.opening, f"greater than 0 m, {SMALLEST} m at least")
+        raise refusal(source, "shape.opening", shape.opening, f"greater than 0 m, {SMALLEST} m at least")
     if shape.outer <= shape.opening + 2 * SMALLEST - ROUNDING:
         allowed = f"greater than shape.opening, which is {shape.opening} m, by {2 * SMALLEST} m at least"
-        raise _error(source, "shape.outer", shape.outer, allowed)
+        raise refusal(source, "shape.outer", shape.outer, allowed)
     if shape.outer > FARTHEST:
-        raise _error(source, "shape.outer", shape.outer, f"at most {FARTHEST:.0f} m")
+        raise refusal(source, "shape.outer", shape.outer, f"at most {FARTHEST:.0f} m")
     if shape.depth < SMALLEST:
-        raise _error(source, "shape.depth", shape.depth, f"greater than 0 m, {SMALLEST} m at least")
+        raise refusal(source, "shape.depth", shape.depth, f"greater than 0 m, {SMALLEST} m at least")
     if not 0 <= shape.margin < shape.opening / 2:
         allowed = f"from 0 to less than half of shape.opening, which is {shape.opening / 2} m"
-        raise _error(source, "shape.margin", shape.margin, allowed)
+        raise refusal(source, "shape.margin", shape.margin, allowed)
 
 
 def _check_bounds(track: Track, source: str) -> None:
@@ -137,7 +152,7 @@ def _check_bounds(track: Track, source: str) -> None:
     for axis, letter in enumerate("xyz"):
         if track.bounds_low[axis] >= track.bounds_high[axis]:
             allowed = f"greater than bounds.low, which is {track.bounds_low[axis]} m on the {letter} axis"
-            raise _error(source, f"bounds.high[{axis}]", track.bounds_high[axis], allowed)
+            raise refusal(source, f"bounds.high[{axis}]", track.bounds_high[axis], allowed)
 
 
 def _check_reach(track: Track, name: str, gate: Gate, source: str) -> None:
@@ -152,14 +167,14 @@ def _check_reach(track: Track, name: str, gate: Gate, source: str) -> None:
                     f"such that the whole opening (less the margin: {half} m to each side) is inside the bounding box "
                     f"{_box(track)} and above {GROUND_HEIGHT} m: its corner {_rounded(corner)} is not"
                 )
-                raise _error(source, f"{name}.position", gate.position, allowed)
+                raise refusal(source, f"{name}.position", gate.position, allowed)
     approach = _offset(gate, -GATE_CLEARANCE, 0.0, 0.0)
     if not _inside(approach, *flyable_box(track, START_CLEARANCE)):
         allowed = (
             f"such that the point {GATE_CLEARANCE} m before it, {_rounded(approach)}, is at least {START_CLEARANCE} m "
             f"inside the bounding box {_box(track)}, so that a drone can get to it"
         )
-        raise _error(source, f"{name}.position", gate.position, allowed)
+        raise refusal(source, f"{name}.position", gate.position, allowed)
 
 
 def _check_overlaps(track: Track, source: str) -> None:
@@ -171,7 +186,7 @@ def _check_overlaps(track: Track, source: str) -> None:
                 f"farther from {other_name} at {other.position}: the frame of {other_name} ({shape.outer} m square, "
                 f"{shape.depth} m deep) reaches into the opening of {name} ({shape.opening} m square)"
             )
-            raise _error(source, f"{name}.position", gate.position, allowed)
+            raise refusal(source, f"{name}.position", gate.position, allowed)
 
 
 def _check_start(track: Track, source: str) -> None:
@@ -179,18 +194,18 @@ def _check_start(track: Track, source: str) -> None:
     start = track.start_position
     if not _inside(start, *flyable_box(track, START_CLEARANCE)):
         allowed = f"at least {START_CLEARANCE} m inside the bounding box {_box(track)} and above {GROUND_HEIGHT} m"
-        raise _error(source, "start.position", start, allowed)
+        raise refusal(source, "start.position", start, allowed)
     forward, _, _ = _coordinates(track.gates[0], start)
     if forward > -GATE_CLEARANCE + ROUNDING:
         state = f"{-forward:.2f} m before" if forward <= 0 else f"{forward:.2f} m behind"
         allowed = f"at least {GATE_CLEARANCE} m before the plane of gates[0]: it is {state}"
-        raise _error(source, "start.position", start, allowed)
+        raise refusal(source, "start.position", start, allowed)
     reach = track.shape.outer / 2 + GATE_CLEARANCE
     for index, gate in enumerate(track.gates):
         forward, left, up = _coordinates(gate, start)
         if abs(forward) < GATE_CLEARANCE - ROUNDING and max(abs(left), abs(up)) < reach:
             allowed = f"at least {GATE_CLEARANCE} m from the plane or the frame of gates[{index}] at {gate.position}"
-            raise _error(source, "start.position", start, allowed)
+            raise refusal(source, "start.position", start, allowed)
 
 
 def _check_legs(track: Track, source: str) -> None:
@@ -202,7 +217,7 @@ def _check_legs(track: Track, source: str) -> None:
     for (name, position), (next_name, next_position) in pairwise(places):
         if (leg := math.dist(position, next_position)) > FARTHEST_LEG:
             allowed = f"at most {FARTHEST_LEG:.0f} m from {name}, as far as a flight can be: it is {leg:.0f} m"
-            raise _error(source, next_name, next_position, allowed)
+            raise refusal(source, next_name, next_position, allowed)
 
 
 def boxes_intersect(gate: Gate, side: float, other: Gate, other_side: float, depth: float) -> bool:
@@ -261,8 +276,3 @@ def _rounded(vector: Vector) -> Vector:
     """Round to millimetres, for a message."""
     x, y, z = (round(number, 3) for number in vector)
     return (x, y, z)
-
-
-def _error(source: str, field: str, value: object, allowed: str) -> TrackError:
-    """Return the refusal of one field."""
-    return TrackError(f"{source}: {field} is {quoted(value)}, but must be {allowed}.")

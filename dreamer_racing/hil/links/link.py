@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -88,9 +87,13 @@ class TransportLink(ABC):
         return [Reading(time, voltage) for time, data in arrived for voltage in self._telemetry.read(data)]
 
     def reckon_with(self, voltage: float) -> None:
-        """Let the thrust map reckon with a voltage, V, for which it can be (`ThrustMap.check`)."""
+        """Let the thrust map reckon with a voltage, V, from now on, or with the nearest that it can (`ThrustMap.at`).
+
+        A reading in flight never raises: beyond what `ThrustMap.check` allows it is the last that is allowed which
+        counts, and what is not finite counts for nothing.
+        """
         if self.thrust is not None and self.thrust.voltage != voltage:
-            self.thrust = replace(self.thrust, voltage=voltage)
+            self.thrust = self.thrust.at(voltage)
 
     @property
     def longest(self) -> int:

@@ -30,8 +30,8 @@ import numpy as np
 from dreamer_racing.hil.attitude import turn
 from dreamer_racing.hil.inlet import Inlet
 from dreamer_racing.hil.mavlink_messages import import_messages
-from dreamer_racing.hil.pose import PosePacket, make_packet
-from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose, plausible
+from dreamer_racing.hil.pose import PosePacket, make_packet, plausible
+from dreamer_racing.hil.pose_sources.messages import SMOOTHING, Measurement, MessagePose
 
 LOCAL_NED, BODY_FRD, LOCAL_FRD = 1, 12, 20
 """Of MAV_FRAME."""

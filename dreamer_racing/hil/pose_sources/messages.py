@@ -14,9 +14,6 @@ from dreamer_racing.hil.pose import PosePacket, Received, make_packet
 from dreamer_racing.hil.stamping import SILENCE
 from dreamer_racing.hil.velocity import VelocityEstimator
 
-LARGEST = 1e6
-"""m, m/s, rad/s or rad beyond which a number is no measurement of a drone [choice]."""
-
 SMOOTHING = 0.01
 """s, time constant of velocities that are made from poses [choice]: two poses of a motion capture at 200 Hz."""
 
@@ -88,8 +85,6 @@ class MessagePose(ABC):
         """Return what is known now; None if that is no pose."""
         stamp, position, attitude, velocity, rates, in_body = measured
         velocity, rates = (np.zeros(3) if vector is None else vector for vector in (velocity, rates))
-        if not plausible(position, attitude, velocity, rates):
-            return None
         packet = make_packet(self._sequence, stamp, position, attitude, velocity, rates)
         if packet is None or not self._is_new(arrival, stamp):
             return None
@@ -109,8 +104,3 @@ class MessagePose(ABC):
             return False
         self._newest = arrival, stamp
         return True
-
-
-def plausible(*vectors: np.ndarray) -> bool:
-    """Whether all numbers are finite, and of a size that can be calculated with."""
-    return all(bool((np.abs(vector) <= LARGEST).all()) for vector in vectors)

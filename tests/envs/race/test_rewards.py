@@ -25,6 +25,13 @@ def reward(previous, position, passes=0, crashed=False, weights=None, rates=RATE
     return base.item(), rate.item()
 
 
+@pytest.mark.parametrize("name", ["progress", "body_rate", "gate", "collision"])
+@pytest.mark.parametrize("weight", [math.nan, math.inf, -math.inf, "10", True])
+def test_weights_are_finite_numbers(name, weight):
+    with pytest.raises(ValueError, match=f"RewardWeights.{name}={weight!r}: must be (a number, )?finite"):
+        RewardWeights(**{name: weight})
+
+
 def test_defaults_are_the_papers():
     assert RewardWeights() == RewardWeights(progress=1.0, body_rate=0.0, gate=10.0, collision=-4.0)
 

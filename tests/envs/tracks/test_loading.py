@@ -5,6 +5,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -18,8 +19,11 @@ from dreamer_racing.envs.tracks import (
     GateShape,
     Track,
     TrackError,
+    describe_track,
+    hash_track,
     load_track,
     make_track,
+    read_track,
     validate_track,
 )
 from dreamer_racing.envs.tracks.validation import boxes_intersect
@@ -353,6 +357,97 @@ def test_tracks_built_in_python_are_checked_too():
     ):
         with pytest.raises(TrackError, match=r"Track\('circle'\): " + field):
             load_track(dataclasses.replace(good, **change))
+
+
+CIRCLE = load_track("circle")
+FIRST, *OTHERS = CIRCLE.gates
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position": (4.0, None, 1.35)}, r"gates[0].position is (4.0, None, 1.35), but must be three finite numbers"),
+        ({"position": (4.0, "0", 1.35)}, "gates[0].position is (4.0, '0', 1.35), but must be three finite numbers"),
+        ({"position": (4.0, True, 1.35)}, "gates[0].position is (4.0, True, 1.35), but must be three finite numbers"),
+        ({"position": 4.0}, "gates[0].position is 4.0, but must be three finite numbers"),
+        ({"position": "abc"}, "gates[0].position is 'abc', but must be three finite numbers"),
+        ({"position": (4.0, 10**400, 1.35)}, "gates[0].position is (4.0, 1000"),
+        ({"yaw_degrees": "0"}, "gates[0].yaw_degrees is '0', but must be a finite number"),
+        ({"yaw_degrees": None}, "gates[0].yaw_degrees is None, but must be a finite number"),
+        ({"color": (1.0, 1.5, 0.0)}, "gates[0].color is (1.0, 1.5, 0.0), but must be three numbers [red, green, blue]"),
+        ({"color": (1.0, -0.1, 0.0)}, "gates[0].color is (1.0, -0.1, 0.0), but must be three numbers"),
+        ({"color": (1.0, 0.0)}, "gates[0].color is (1.0, 0.0), but must be three numbers"),
+        ({"color": (1.0, 0.0, math.nan)}, "gates[0].color is (1.0, 0.0, nan), but must be three numbers"),
+        ({"color": "red"}, "gates[0].color is 'red', but must be three numbers"),
+    ],
+)
+def test_gates_built_in_python_are_refused_by_name_and_field(change, message):
+    gates = (dataclasses.replace(FIRST, **change), *OTHERS)
+    for build in (lambda: dataclasses.replace(CIRCLE, gates=gates), lambda: make_track("circle", gates)):
+        with pytest.raises(TrackError, match="^" + re.escape(f"Track('circle'): {message}")):
+            load_track(build())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gates": (*CIRCLE.gates, (0.0, 0.0, 1.0))}, "gates[4] is (0.0, 0.0, 1.0), but must be a Gate"),
+        ({"gates": None}, "gates is None, but must be a sequence of gates"),
+        ({"decoys": 3}, "decoys is 3, but must be a sequence of gates"),
+        ({"shape": None}, "shape is None, but must be a GateShape"),
+        ({"shape": GateShape(depth="0.1")}, "shape.depth is '0.1', but must be a finite number"),
+        ({"start_position": (0.0, None, 1.0)}, "start.position is (0.0, None, 1.0), but must be three finite numbers"),
+        ({"start_yaw_degrees": "0"}, "start.yaw_degrees is '0', but must be a finite number"),
+        ({"bounds_high": None}, "bounds.high is None, but must be three finite numbers"),
+        ({"laps": 1.5}, "laps is 1.5, but must be a whole number"),
+        ({"laps": True}, "laps is True, but must be a whole number"),
+        ({"laps": "3"}, "laps is '3', but must be a whole number"),
+    ],
+)
+def test_fields_of_tracks_built_in_python_are_refused_by_name(change, message):
+    with pytest.raises(TrackError, match="^" + re.escape(f"Track('circle'): {message}")):
+        load_track(dataclasses.replace(CIRCLE, **change))
+
+
+def test_defaults_do_not_follow_from_a_start_that_is_none():
+    with pytest.raises(TrackError, match=re.escape("Track('mine'): start.position is (0.0, None, 1.0)")):
+        make_track("mine", CIRCLE.gates, start_position=[0.0, None, 1.0])
+
+
+@pytest.mark.parametrize("array", [list, np.array, lambda numbers: np.array(numbers, np.float32), torch.tensor])
+def test_numbers_of_any_kind_make_the_track_that_floats_make(array):
+    """Of 1/4 and 3/8, which float32 holds exactly: what comes is hashed, described and compared as if of a file."""
+
+    def build(vector, number, laps):
+        gates = [Gate(vector([0.25, 0.0, 2.375]), number(90.0), color=vector([1.0, 0.5, 0.25])),
+                 Gate(vector([0.25, 6.0, 2.375]), number(90.0))]  # fmt: skip
+        shape = GateShape(opening=number(1.25), margin=number(0.125))
+        corners = {"bounds_low": vector([-9.0, -9.0, 0.0]), "bounds_high": vector([9.0, 15.0, 6.0])}
+        start = vector([0.25, -2.5, 1.25])
+        return make_track("mine", gates, shape=shape, start_position=start, laps=laps, **corners)
+
+    plain = load_track(build(tuple, float, 2))
+    made = load_track(build(array, np.float32, np.int64(2)))
+    assert made == plain and hash(made) == hash(plain)
+    assert hash_track(made) == hash_track(plain)
+    assert read_track(describe_track(made), "a copy") == plain
+    listed = dataclasses.replace(plain, gates=list(plain.gates), bounds_low=[-9, -9, 0])
+    assert load_track(listed) == plain and hash(listed) == hash(plain)
+
+
+@pytest.mark.parametrize(
+    ("name", "beginning"),
+    [
+        ("circle", "9374b4c41ac86e07"),
+        ("kidney", "c9bea353eed64395"),
+        ("figure8", "cd9fba7cd82eb68d"),
+        ("split_s", "0cbed177605e9003"),
+        ("figure8_decoys", "38b3801af1f5704e"),
+    ],
+)
+def test_hashes_of_builtin_tracks_stay(name, beginning):
+    """Contracts of agents that ship hold them."""
+    assert hash_track(load_track(name)).startswith(beginning)
 
 
 # ---------------------------------------------------------------- overlaps
