@@ -45,7 +45,7 @@ class MissingPackagesError(ImportError):
 
 
 class ActorStep(nn.Module):
-    """One acting step of explicit state, with the posterior's mode for z and the actor's mean for the action.
+    """One acting step of explicit state: z is the posterior's mode, the action the mean of the actor's clipped samples.
 
     Args:
         agent: Its encoder, RSSM and actor are copied.
@@ -112,7 +112,7 @@ class ActorStep(nn.Module):
     def act(self, observation: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Return action ``(1, A)`` and next state ``(1, S)`` by what is seen and the next belief ``(1, D)``."""
         z = self.rssm.take_in(h, self._embed(observation), deterministic=True)
-        return self.actor(join_features(h, z)).mode(), z
+        return self.actor(join_features(h, z)).clipped_mean(), z
 
     def example_inputs(self) -> dict[str, Tensor]:
         """Return inputs by name, in the order of ``forward``."""
@@ -166,7 +166,7 @@ class SampledActorStep(ActorStep):
         gumbel = -(-noise.log()).log()
         index = (probabilities.log() + gumbel).argmax(-1, keepdim=True)
         z = torch.zeros_like(probabilities).scatter(-1, index, 1.0).flatten(1)
-        return self.actor(join_features(h, z)).mode(), z
+        return self.actor(join_features(h, z)).clipped_mean(), z
 
 
 class StepPart(nn.Module):

@@ -80,7 +80,7 @@ _MEANINGS = {
     "is_init": "whether this is the first step of an episode",
     "noise": "uniform numbers in [0, 1), fresh at every step, one for each class of each latent: "
     "z is argmax(log p - log(-log(noise)))",
-    "action": "mean of the policy, tanh of the network's output, in [-1, 1]: nothing is sampled",
+    "action": "mean of the policy's samples, each clipped to [-1, 1]: nothing is sampled",
     "h_next": "deterministic state, to be given back as h",
     "z_next": "stochastic state, to be given back as z",
 }

@@ -171,7 +171,7 @@ class BaselinePolicy(TensorDictModuleBase):
 
     Args:
         actor: Shared, not copied.
-        deterministic: Take the mode instead of a sample; may be set at any time.
+        deterministic: Take what the distribution calls its deterministic sample; may be set at any time.
     """
 
     def __init__(self, actor: ProbabilisticTensorDictSequential, deterministic: bool = False) -> None:

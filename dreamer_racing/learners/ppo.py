@@ -25,6 +25,7 @@ from dreamer_racing.learners.networks import (
     ObservationNetwork,
 )
 from dreamer_racing.modules import Interface
+from dreamer_racing.modules.clipped_normal import clipped_mean
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, setting
 
 
@@ -204,6 +205,15 @@ class PPOLearner(BaselineLearner):
         return {"actor": self.actor, "critic": self.critic}
 
 
+class ClippedNormal(IndependentNormal):
+    """Normals whose samples the environment clips to [−1, 1], and whose deterministic sample is the mean of those."""
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """Mean of what the environment gets, ``(..., A)``."""
+        return clipped_mean(self.base_dist.loc, self.base_dist.scale)
+
+
 def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> ProbabilisticActor:
     """Make a normal whose mean depends on what is seen, and whose deviation does not."""
     network = ObservationNetwork(interface, interface.action_dim, size, output_scale=0.01)
@@ -211,6 +221,6 @@ def _make_actor(interface: Interface, size: NetworkSize, initial_std: float) -> 
     return ProbabilisticActor(
         NetworkModule(GaussianNetwork(network, deviation), ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
+        distribution_class=ClippedNormal,
         return_log_prob=True,
     )

@@ -29,8 +29,12 @@ def clipped_mean(mean: Tensor, std: Tensor) -> Tensor:
         tensor([0.0000, 0.8005, 1.0000])
     """
     low, high = (-1.0 - mean) / std, (1.0 - mean) / std
-    below, above = torch.special.ndtr(low), torch.special.ndtr(-high)
+    below, above = _share_below(low), _share_below(-high)
     return mean * (1.0 - below - above) + std * (_density(low) - _density(high)) + above - below
+
+
+def _share_below(deviation: Tensor) -> Tensor:
+    return 0.5 + 0.5 * torch.erf(deviation / math.sqrt(2.0))  # ONNX has no ndtr
 
 
 def _density(deviation: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ class DreamerPolicy(TensorDictModuleBase):
     Args:
         world_model: Its encoder and RSSM are used (and shared, not copied).
         actor: The policy head.
-        deterministic: Take the posterior's and the actor's mode instead of samples; may be set at any time.
+        deterministic: Take the mode of the posterior and the mean of clipped actions, no samples; may be set at any time.
 
     | key | read / written | shape |
     |---|---|---|
@@ -85,7 +85,7 @@ class DreamerPolicy(TensorDictModuleBase):
             deterministic=self.deterministic,
         )
         policy = self.actor(join_features(belief, state))
-        action = policy.mode() if self.deterministic else policy.sample()
+        action = policy.clipped_mean() if self.deterministic else policy.sample()
         return policy, action.clamp(-1.0, 1.0), belief, state
 
     def make_primer(self) -> TensorDictPrimer:

@@ -30,7 +30,15 @@ def test_mean_and_std_stay_within_their_bounds():
     assert policy.mean.abs().max() <= 1
     assert policy.std.min() >= 0.1
     assert policy.std.max() <= 1.0 + 1e-6
-    assert torch.equal(policy.mode(), policy.mean)
+    assert (policy.clipped_mean().abs() <= policy.mean.abs()).all()  # noise keeps it off the bounds
+
+
+def test_the_deterministic_action_is_the_mean_of_what_an_environment_gets():
+    torch.manual_seed(0)
+    policy = ActionDistribution(torch.tensor([-1.0, 0.3, 0.97]), torch.tensor([0.15, 0.15, 0.05]))
+    flown = policy.sample(torch.randn(100_000, 3)).clamp(-1.0, 1.0).mean(0)
+    torch.testing.assert_close(policy.clipped_mean(), flown, atol=2e-3, rtol=0.0)
+    assert policy.clipped_mean()[0].item() == pytest.approx(-1.0 + 0.15 / math.sqrt(2 * math.pi), abs=1e-6)
 
 
 def test_new_actor_explores_around_zero():
