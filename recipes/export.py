@@ -92,6 +92,8 @@ def export(config: ExportConfig) -> None:
         trained.track_description = describe_file(trained.track)
     check_agent(config, checkpoint)
     output = check_output(config.output or Path(config.agent or results_of(checkpoint) / "export") / ACTOR)
+    if not config.agent and is_agent(output.parent):
+        raise ValueError(f"output={config.output}: {output.parent} holds an agent, which stays as it is: name another.")
     print(f"checkpoint: {checkpoint}")
     step, contract, flight = prepare(config, trained, checkpoint)
     about = describe(config, trained, checkpoint, step, contract) if config.agent else None

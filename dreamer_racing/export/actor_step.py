@@ -240,7 +240,7 @@ def check_output(output: str | Path) -> Path:
         reason = error.__cause__ or error
         raise PermissionError(f"output={output}: cannot write to its folder ({reason}).") from error
     contract = output.parent / CONTRACT
-    if contract.exists() and _described(contract) != output.name:
+    if contract.exists() and _described(contract).get("onnx") != output.name:
         raise ValueError(
             f"output={output}: {contract} describes another actor. Every actor has a folder of its own: choose another "
             "folder, or remove that export."
@@ -248,12 +248,13 @@ def check_output(output: str | Path) -> Path:
     return output
 
 
-def _described(contract: Path) -> str | None:
-    """Return the name of the ``.onnx`` file that a contract describes; None if it cannot be read off it."""
+def _described(contract: Path) -> dict[str, str]:
+    """Return the names of the files that a contract describes, by kind; none if it is not there or cannot be read."""
     try:
-        return json.loads(contract.read_text(encoding="utf-8"))["files"]["onnx"]["name"]
-    except (ValueError, KeyError, TypeError):
-        return None
+        files = json.loads(contract.read_text(encoding="utf-8"))["files"]
+        return {kind: file["name"] for kind, file in files.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def export_actor(
@@ -271,7 +272,8 @@ def export_actor(
         step: The step.
         contract: From `contract.make_contract`.
         flight: To compare them over, at least ``MIN_STEPS`` steps.
-        output: Path of the ``.onnx`` file; others are named after its stem. Those of an earlier export are replaced.
+        output: Path of the ``.onnx`` file; others are named after its stem. Those of an earlier export, which its
+            contract names, are replaced.
         seed: Of the noise that samples latents in the comparison.
         shared_weights: Keep the weights in a file beside those of ONNX, which torch can read too, instead of inside of
             each; the ``.pt2``, which would hold them once more, is compared and left out.
@@ -287,6 +289,7 @@ def export_actor(
     """
     check_steps(len(flight.observations))
     output = check_output(output)
+    earlier = set(_described(output.parent / CONTRACT).values())  # none but these are taken away
     partial = output.parent / f".{output.stem}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -315,9 +318,7 @@ def export_actor(
         _write_json(partial / CONTRACT, full)
         for path in (*written.values(), partial / CONTRACT):
             os.replace(path, output.parent / path.name)
-        kept = {path.name for path in written.values()}
-        ours = {program.name, WEIGHTS, *(f"{output.stem}_{name}.onnx" for name in PARTS)}
-        for name in ours - kept:  # of an earlier export
+        for name in earlier - {path.name for path in written.values()}:
             (output.parent / name).unlink(missing_ok=True)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -196,6 +196,12 @@ def test_what_flies_otherwise_than_the_policy_did_is_refused(agent: Agent, tmp_p
 
 def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent: Agent, tmp_path: Path) -> None:
     step, flight, kinds = make_step(agent, "mode"), make_flight(agent), [False, True, False]
+    other = tmp_path / "notes" / "weights.safetensors"  # where no export has been
+    other.parent.mkdir()
+    other.write_text("mine", encoding="utf-8")
+    export_actor(step, contract_of(step), flight, other.with_name("actor.onnx"))
+    assert other.read_text(encoding="utf-8") == "mine"
+    shutil.rmtree(other.parent)
     for shared_weights in kinds:
         export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx", shared_weights=shared_weights)
         own = "weights.safetensors" if shared_weights else "actor.pt2"

@@ -98,6 +98,10 @@ def test_an_agent_is_flown_evaluated_and_exported_as_its_run_is(agent: Path, run
     assert done.returncode == 0, done.stderr
     contract = json.loads((tmp_path / "runs" / "agent_mine" / "export" / "contract.json").read_text())
     assert contract["weights_sha256"] == written["provenance"]["weights_sha256"]
+    before = {path.name: path.read_bytes() for path in agent.iterdir()}
+    done = recipe("export", f"checkpoint={agent}", f"output={agent}/actor.onnx", cwd=tmp_path)
+    assert done.returncode == 2 and "holds an agent, which stays as it is: name another" in done.stderr, done.stderr
+    assert {path.name: path.read_bytes() for path in agent.iterdir()} == before
 
 
 @pytest.mark.slow
