@@ -229,7 +229,7 @@ class RaceWorlds:
         self._images, self.begun = None, True
 
     def step(self, action: Tensor) -> RaceStep:
-        """Fly one control step.
+        """Fly one control step. The simulator is not differentiable: no gradient goes back to the action.
 
         Args:
             action: (N, 4), on the worlds' device; values beyond [-1, 1] are clipped. A drone with a non-finite action
@@ -244,6 +244,7 @@ class RaceWorlds:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
             raise wrong_action_type(action.dtype)
+        action = action.detach()  # or the commands that are under way would keep every graph before them
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
