@@ -3,6 +3,7 @@
 The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, TypedDict
@@ -127,6 +128,7 @@ class RaceWorlds:
     ) -> None:
         _check_arguments(num_envs, camera, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_device(device)
+        self._process = os.getpid()
         self.track = load_track(track)
         self.num_envs = num_envs = int(num_envs)
         self.evaluation = evaluation
@@ -219,8 +221,22 @@ class RaceWorlds:
         else:
             self._generator.manual_seed(int(seed))
 
+    def _check_process(self) -> None:
+        """Refuse to work in a child: a fork copies no threads, and whoever waits for theirs waits for ever."""
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                f"These worlds were made in process {self._process}, and process {os.getpid()} was forked from it, "
+                "without the threads that fly and draw them: make them in the process that uses them, or start it by "
+                "multiprocessing's 'spawn'."
+            )
+
     def reset(self, mask: Tensor | None = None) -> None:
-        """Start new episodes in the masked worlds (N,) bool; in all if None."""
+        """Start new episodes in the masked worlds (N,) bool; in all if None.
+
+        Raises:
+            RuntimeError: this process was forked from the one that made the worlds.
+        """
+        self._check_process()
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         start = self._starts.sample(self.num_envs, self.evaluation)
@@ -236,10 +252,11 @@ class RaceWorlds:
                 has crashed: its episode ends and the others fly on.
 
         Raises:
-            RuntimeError: no episode has begun.
+            RuntimeError: no episode has begun, or this process was forked from the one that made the worlds.
             TypeError: not of a floating-point type.
             ValueError: wrong shape or device.
         """
+        self._check_process()
         if not self.begun:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
@@ -284,7 +301,12 @@ class RaceWorlds:
         return graph
 
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
+        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,).
+
+        Raises:
+            RuntimeError: there are none, or this process was forked from the one that made the worlds.
+        """
+        self._check_process()
         if self._images is None:
             images = self.simulator.render(rows)
         elif rows is None:
@@ -299,6 +321,7 @@ class RaceWorlds:
 
         They show the halls of worlds 0, 1, …; the drones that fly stay where they are.
         """
+        self._check_process()
         before, state = self.simulator.state_dict(), self.simulator.state
         parts = []
         for place, turned in zip(position.split(self.num_envs), attitude.split(self.num_envs), strict=True):
@@ -359,9 +382,10 @@ class RaceWorlds:
         )
 
     def close(self) -> None:
-        """Free rendering contexts and threads."""
+        """Free rendering contexts and threads; a forked process has none, and leaves them to the one that made them."""
         self._graph = self._images = None  # the graph draws into the simulator's buffers
-        self.simulator.close()
+        if os.getpid() == self._process:
+            self.simulator.close()
 
 
 def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, object]) -> None:

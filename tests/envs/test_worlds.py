@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
+import os
+import signal
+import traceback
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -33,3 +38,37 @@ def test_no_gradient_goes_back_to_the_action(preset: str) -> None:
         simulator.quadrotor.rotor_speed,
     ]
     assert not any(tensor.requires_grad for tensor in kept)
+
+
+def in_a_fork(work: Callable[[], None]) -> bool:
+    """Whether a forked process did its work, without an error and in less than 20 s."""
+    if child := os.fork():
+        return os.waitpid(child, 0)[1] == 0
+    signal.alarm(20)
+    try:
+        work()
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+@pytest.mark.parametrize("from_pixels", [False, True])
+def test_a_forked_process_is_told_instead_of_waiting_for_ever(from_pixels: bool) -> None:
+    made = [RaceWorlds("circle", 2, from_pixels=from_pixels, renderer="warp", num_threads=2, seed=0)]
+    made[0].reset()
+
+    def told() -> None:
+        for work in (made[0].reset, made[0].render, lambda: made[0].step(torch.zeros(2, 4))):
+            with pytest.raises(RuntimeError, match="was forked from it.*by multiprocessing's 'spawn'"):
+                work()
+
+    def freed() -> None:
+        made.clear()
+        gc.collect()
+
+    for work in (told, lambda: made[0].close(), freed):
+        assert in_a_fork(work)
+    made[0].step(torch.zeros(2, 4))
+    made[0].close()
