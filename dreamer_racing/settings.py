@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,13 +21,16 @@ class Range(NamedTuple):
     open_below: bool = False
 
     def __contains__(self, value: object) -> bool:
-        if not isinstance(value, (int, float)):
+        if not isinstance(value, Real):
             return False
-        above = self.low < value if self.open_below else self.low <= value
-        return above and value < math.inf and value <= self.high
+        number: Any = value
+        above = self.low < number if self.open_below else self.low <= number
+        return bool(above and number < math.inf and number <= self.high)
 
     def __str__(self) -> str:
         """Say it in words."""
+        if self.low == -math.inf:
+            return "finite"
         below = f"{'above' if self.open_below else 'at least'} {_in_digits(self.low)}"
         return below if self.high == math.inf else f"{below} and at most {_in_digits(self.high)}"
 
@@ -36,6 +39,7 @@ def _in_digits(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:g}"
 
 
+FINITE = Range(-math.inf, open_below=True)
 POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)
 SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
 COUNT = Range(1)
@@ -67,7 +71,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{prefix}{field.name}.")
         elif allowed is not None and value is not None and value not in allowed:
-            finite = ", and finite" if value == math.inf else ""
+            finite = ", and finite" if value == math.inf and allowed != FINITE else ""
             raise ValueError(f"{prefix}{field.name}={value}: must be {allowed}{finite}.")
 
 
@@ -85,6 +89,22 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
         for name, value in values.items():
             if isinstance(value, bool) or not isinstance(value, kind):
                 raise ValueError(f"{name}={quoted(value)}: must be {words}.")
+
+
+def check_three(name: str, values: object, allowed: Range) -> None:
+    """Refuse what is not three numbers in a range, one for each axis.
+
+    Args:
+        name: of the setting.
+        values: of it.
+        allowed: of each.
+
+    Raises:
+        ValueError: the message gives the setting, its value, and what is allowed.
+    """
+    three = isinstance(values, Iterable) and not isinstance(values, str) and list(values)
+    if not three or len(three) != 3 or not all(value in allowed for value in three):
+        raise ValueError(f"{name}={quoted(values)}: must be three numbers, each {allowed}.")
 
 
 def without_none(**arguments: object) -> dict[str, object]:
