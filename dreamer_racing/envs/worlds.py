@@ -26,7 +26,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.backends import check_device, make_simulator
 from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.simulator.scene import Camera, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.settings import check_numbers, quoted, without_none
@@ -126,13 +126,13 @@ class RaceWorlds:
         miss_radius: float = 0.0,
         control_rate: float | None = None,
     ) -> None:
-        _check_arguments(num_envs, camera, without_none(episode_steps=episode_steps, num_threads=num_threads))
+        _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_device(device)
+        self.camera = load_camera(camera)
         self._process = os.getpid()
         self.track = load_track(track)
         self.num_envs = num_envs = int(num_envs)
         self.evaluation = evaluation
-        self.camera = camera or Camera()
         self.parameters = load_preset(preset)
         if control_rate is not None:
             check_numbers({}, {"control_rate": control_rate})
@@ -388,12 +388,11 @@ class RaceWorlds:
             self.simulator.close()
 
 
-def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, object]) -> None:
+def _check_arguments(num_envs: int, whole: Mapping[str, object]) -> None:
     """Refuse arguments of a wrong type, before something else fails at them in its own words.
 
     Args:
         num_envs: N.
-        camera: the nose camera.
         whole: further ones that must be whole numbers, by name.
 
     Raises:
@@ -402,5 +401,3 @@ def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, o
     check_numbers({"num_envs": num_envs, **whole}, {})
     if num_envs < 1:
         raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
-    if camera is not None and not isinstance(camera, Camera):
-        raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")

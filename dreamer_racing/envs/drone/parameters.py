@@ -130,7 +130,7 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     """
     if isinstance(preset, QuadrotorParameters):
         return preset
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"preset={preset}: there is no such physics; there are {there}{suggestion(preset, PRESETS)}.")
     return PRESETS[preset]

@@ -15,7 +15,16 @@ import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.tracks import Gate, Track
-from dreamer_racing.settings import COUNT, FINITE, POSITIVE, check_numbers, check_settings, check_three, setting
+from dreamer_racing.settings import (
+    COUNT,
+    FINITE,
+    POSITIVE,
+    check_numbers,
+    check_settings,
+    check_three,
+    quoted,
+    setting,
+)
 
 HALL_GROUP = 0  # geom group of hall and gates
 DRONE_GROUP = 2  # geom group of the drone, hidden from its own camera
@@ -65,6 +74,17 @@ class Camera:
             raise ValueError(f"camera.field_of_view={self.field_of_view}: must be below 180 degrees.")
         if self.near >= self.far:
             raise ValueError(f"camera.near={self.near}: must be below camera.far={self.far}.")
+
+
+def load_camera(camera: Camera | None) -> Camera:
+    """Return the camera, the default one if None.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not (camera is None or isinstance(camera, Camera)):
+        raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
+    return camera or Camera()
 
 
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:
