@@ -23,6 +23,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import torch
 from measuring import print_table, write_json
 from mujoco.batch import Batch
@@ -66,10 +67,13 @@ class Drones:
     """
 
     def __init__(self, drone: QuadrotorParameters, variant: str, integrator: str, step: float, num: int) -> None:
-        self.parameters = replace(drone, physics_dt=step, integrator=integrator)
+        # the package takes no implicit ones, and treats them as Euler
+        self.parameters = replace(drone, physics_dt=step, integrator="RK4" if integrator == "RK4" else "Euler")
         midpoint = variant == "midpoint"
         self.quadrotor = (Quadrotor if midpoint else PlainQuadrotor)(self.parameters, num)
-        batch = Batch(build_drone(self.parameters).compile(), num, min(2, num))
+        model = build_drone(self.parameters).compile()
+        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+        batch = Batch(model, num, min(2, num))
         self.qpos, self.qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         corrected = None if midpoint else False
         self._flight = RigidStep(self.quadrotor, self.qpos, self.qvel, force, batch.step, corrected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeVar
 
@@ -43,11 +43,11 @@ def _in_digits(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:g}"
 
 
+FINITE = Range(-math.inf, open_below=True)
 POSITIVE, NOT_NEGATIVE = Range(0, open_below=True), Range(0)
 SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, open_below=True)
 COUNT = Range(1)
 SEED = Range(0, 2**32 - 1)
-FINITE = Range(-math.inf, open_below=True)
 _WHOLE = (int, "int", int | None, "int | None")
 """What fields of whole numbers say of their type."""
 
@@ -118,6 +118,22 @@ def check_numbers(whole: Mapping[str, object], real: Mapping[str, object]) -> No
         for name, value in values.items():
             if isinstance(value, bool) or not isinstance(value, kind):
                 raise ValueError(f"{name}={quoted(value)}: must be {words}.")
+
+
+def check_three(name: str, values: object, allowed: Range) -> None:
+    """Refuse what is not three numbers in a range, one for each axis.
+
+    Args:
+        name: of the setting.
+        values: of it.
+        allowed: of each.
+
+    Raises:
+        ValueError: the message gives the setting, its value, and what is allowed.
+    """
+    three = isinstance(values, Iterable) and not isinstance(values, str) and list(values)
+    if not three or len(three) != 3 or not all(value in allowed for value in three):
+        raise ValueError(f"{name}={quoted(values)}: must be three numbers, each {allowed}.")
 
 
 def without_none(**arguments: object) -> dict[str, object]:

@@ -43,6 +43,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from dreamer_racing.settings import check_numbers, without_none
+
 TASKS = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
 """Domain and task of the suite by the name `domain_task`."""
 CAMERAS = {"quadruped": 2}  # by domain; 0 for all others
@@ -92,7 +94,8 @@ class ControlSuiteEnv(EnvBase):
         seed: int | None = None,
         episode_steps: int | None = None,
     ) -> None:
-        _check_arguments(task, num_envs, action_repeat)
+        steps = without_none(episode_steps=episode_steps)
+        _check_arguments(task, action_repeat, {"num_envs": num_envs, "image_size": image_size, **steps})
         super().__init__(device=device, batch_size=[num_envs])
         self.task = task
         self.from_pixels = from_pixels
@@ -360,12 +363,15 @@ class SuiteWorld:
         self.env.task.random.set_state({**state, "state": {**twister, "key": key}})
 
 
-def _check_arguments(task: str, num_envs: int, action_repeat: int) -> None:
+def _check_arguments(task: str, action_repeat: int, counts: Mapping[str, Any]) -> None:
+    """Refuse an unknown task, and counts, by name, of nothing or that are no whole numbers."""
     if task not in TASKS:
         close = difflib.get_close_matches(task, TASKS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""
         raise ValueError(f"Unknown task {task!r}: {hint}The tasks are {', '.join(TASKS)}.")
-    if num_envs < 1:
-        raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
+    check_numbers(counts, {})
+    for name, what in (("num_envs", "world"), ("image_size", "pixel"), ("episode_steps", "action")):
+        if counts.get(name, 1) < 1:
+            raise ValueError(f"{name}={counts[name]}: at least one {what} is needed.")
     if not isinstance(action_repeat, int) or action_repeat < 1:
         raise ValueError(f"action_repeat={action_repeat!r}: a whole number of simulator steps, 1 or more.")

@@ -40,9 +40,10 @@ from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, R
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene
+from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene, load_camera
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
+from dreamer_racing.settings import check_numbers, without_none
 
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
 
@@ -87,12 +88,13 @@ def load(
         >>> env.step(env.action_spec().generate_value()).discount
         1.0
     """
+    check_numbers({}, without_none(control_rate=control_rate, time_limit=time_limit))
+    camera = load_camera(camera)
     track, parameters = load_track(track), load_preset(preset)
     if control_rate is not None:
         parameters = at_control_rate(parameters, control_rate)
     default_time = EVALUATION_TIME if evaluation else EPISODE_TIME
     episode_steps = _steps_of(default_time if time_limit is None else time_limit, parameters.control_dt)
-    camera = camera or Camera()
     generator = torch.Generator()
     physics = make_physics(track, parameters, camera, generator)
     task = DroneRace(

@@ -108,7 +108,7 @@ class GymWorlds:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
         device = worlds.get("device", "cpu")
-        if torch.device(device).type != "cpu":
+        if str(device).partition(":")[0] == "cuda":  # others are for the worlds to refuse
             raise ValueError(
                 f"device={device!r}: Gymnasium's arrays live on cpu; DroneRacingEnv keeps tensors on a GPU."
             )
@@ -120,6 +120,7 @@ class GymWorlds:
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
         self._onboard: Renderer | None = None
+        self._closed = False
 
     @property
     def frames_per_second(self) -> int:
@@ -214,7 +215,12 @@ class GymWorlds:
         """The on-board views, uint8 (N, 256, 256, 3), as each drone sees, but for noise; by a renderer of their own.
 
         It is made on first use.
+
+        Raises:
+            ClosedEnvironmentError: the environment is closed.
         """
+        if self._closed:
+            raise gymnasium.error.ClosedEnvironmentError("render() after close(): there is nothing left to draw with.")
         worlds, looks = self.worlds, self.worlds.simulator.looks
         if self._onboard is None:
             camera = replace(worlds.camera, width=FRAME_SIZE, height=FRAME_SIZE)
@@ -227,6 +233,7 @@ class GymWorlds:
 
     def close(self) -> None:
         """Free rendering contexts and threads."""
+        self._closed = True
         self.worlds.close()
         if self._onboard is not None:
             self._onboard.close()

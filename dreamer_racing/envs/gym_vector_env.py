@@ -25,7 +25,8 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     episode with reward 0. SAME_STEP: the step itself returns the first observation of the next episode, and `info` the
     last one of the old (`final_obs`, an array of objects, and `final_info`). DISABLED: whoever steps begins them, by
     `reset(options={"reset_mask": ended})`, as TorchRL's `GymWrapper` does. Every entry of `info` but these two is there
-    for every environment (`info["_" + name]` is all true), of a reset for those that were reset.
+    for every environment (`info["_" + name]` is all true), of a reset for those that were reset; these two, and all
+    that is in `final_info`, are there for those whose episode ended.
 
     Args:
         num_envs: N.
@@ -128,10 +129,12 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         terminated = outcome.terminated.numpy() & ~begun
         truncated = outcome.truncated.numpy() & ~begun
         ended = terminated | truncated
-        info = self._masked(self.race.info(outcome, begun))
+        told = self.race.info(outcome, begun)
+        info = self._masked(told)
         observation = self.race.observe()
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            info |= {**self._final(observation, ended), "final_info": dict(info), "_final_info": ended}
+            info |= self._final(observation, ended)
+            info |= {"final_info": self._masked(told, ended), "_final_info": ended}
             self.race.begin(ended)
             info |= self._masked(self.race.info(outcome, ended))
             observation = with_rows(observation, ended, self.race.observe(ended))

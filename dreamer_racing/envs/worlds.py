@@ -3,6 +3,7 @@
 The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, TypedDict
@@ -25,7 +26,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.backends import check_device, make_simulator
 from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.simulator.scene import Camera, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.settings import check_numbers, quoted, without_none
@@ -125,12 +126,13 @@ class RaceWorlds:
         miss_radius: float = 0.0,
         control_rate: float | None = None,
     ) -> None:
-        _check_arguments(num_envs, camera, without_none(episode_steps=episode_steps, num_threads=num_threads))
+        _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_device(device)
+        self.camera = load_camera(camera)
+        self._process = os.getpid()
         self.track = load_track(track)
         self.num_envs = num_envs = int(num_envs)
         self.evaluation = evaluation
-        self.camera = camera or Camera()
         self.parameters = load_preset(preset)
         if control_rate is not None:
             check_numbers({}, {"control_rate": control_rate})
@@ -219,8 +221,22 @@ class RaceWorlds:
         else:
             self._generator.manual_seed(int(seed))
 
+    def _check_process(self) -> None:
+        """Refuse to work in a child: a fork copies no threads, and whoever waits for theirs waits for ever."""
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                f"These worlds were made in process {self._process}, and process {os.getpid()} was forked from it, "
+                "without the threads that fly and draw them: make them in the process that uses them, or start it by "
+                "multiprocessing's 'spawn'."
+            )
+
     def reset(self, mask: Tensor | None = None) -> None:
-        """Start new episodes in the masked worlds (N,) bool; in all if None."""
+        """Start new episodes in the masked worlds (N,) bool; in all if None.
+
+        Raises:
+            RuntimeError: this process was forked from the one that made the worlds.
+        """
+        self._check_process()
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         start = self._starts.sample(self.num_envs, self.evaluation)
@@ -229,21 +245,23 @@ class RaceWorlds:
         self._images, self.begun = None, True
 
     def step(self, action: Tensor) -> RaceStep:
-        """Fly one control step.
+        """Fly one control step. The simulator is not differentiable: no gradient goes back to the action.
 
         Args:
             action: (N, 4), on the worlds' device; values beyond [-1, 1] are clipped. A drone with a non-finite action
                 has crashed: its episode ends and the others fly on.
 
         Raises:
-            RuntimeError: no episode has begun.
+            RuntimeError: no episode has begun, or this process was forked from the one that made the worlds.
             TypeError: not of a floating-point type.
             ValueError: wrong shape or device.
         """
+        self._check_process()
         if not self.begun:
             raise RuntimeError("Step before the first reset: call reset() to begin episodes.")
         if not action.is_floating_point():
             raise wrong_action_type(action.dtype)
+        action = action.detach()  # or the commands that are under way would keep every graph before them
         if action.shape != (self.num_envs, ACTION_SIZE):
             raise ValueError(
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
@@ -283,7 +301,12 @@ class RaceWorlds:
         return graph
 
     def render(self, rows: Tensor | None = None) -> Tensor:
-        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,)."""
+        """Images uint8 (M, height, width, 3) of all worlds, or of M rows: a mask (N,) bool, or numbers (M,).
+
+        Raises:
+            RuntimeError: there are none, or this process was forked from the one that made the worlds.
+        """
+        self._check_process()
         if self._images is None:
             images = self.simulator.render(rows)
         elif rows is None:
@@ -298,6 +321,7 @@ class RaceWorlds:
 
         They show the halls of worlds 0, 1, …; the drones that fly stay where they are.
         """
+        self._check_process()
         before, state = self.simulator.state_dict(), self.simulator.state
         parts = []
         for place, turned in zip(position.split(self.num_envs), attitude.split(self.num_envs), strict=True):
@@ -358,17 +382,17 @@ class RaceWorlds:
         )
 
     def close(self) -> None:
-        """Free rendering contexts and threads."""
+        """Free rendering contexts and threads; a forked process has none, and leaves them to the one that made them."""
         self._graph = self._images = None  # the graph draws into the simulator's buffers
-        self.simulator.close()
+        if os.getpid() == self._process:
+            self.simulator.close()
 
 
-def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, object]) -> None:
+def _check_arguments(num_envs: int, whole: Mapping[str, object]) -> None:
     """Refuse arguments of a wrong type, before something else fails at them in its own words.
 
     Args:
         num_envs: N.
-        camera: the nose camera.
         whole: further ones that must be whole numbers, by name.
 
     Raises:
@@ -377,5 +401,3 @@ def _check_arguments(num_envs: int, camera: Camera | None, whole: Mapping[str, o
     check_numbers({"num_envs": num_envs, **whole}, {})
     if num_envs < 1:
         raise ValueError(f"num_envs={num_envs}: at least one world is needed.")
-    if camera is not None and not isinstance(camera, Camera):
-        raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")

@@ -28,7 +28,7 @@ class DreamerPolicy(TensorDictModuleBase):
     Args:
         world_model: Its encoder and RSSM are used (and shared, not copied).
         actor: The policy head.
-        deterministic: Take the mode of the posterior and the mean of clipped actions, no samples; may be set at any time.
+        deterministic: Take the mode of the latents and the mean of clipped actions, no samples; may be set at any time.
 
     | key | read / written | shape |
     |---|---|---|

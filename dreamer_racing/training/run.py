@@ -297,12 +297,11 @@ def collect_and_learn(run: Run, stop: GracefulExit, progress: Progress) -> None:
         if saves or run.at_end:  # what is under way may end the run, and what is evaluated last is what is saved
             run.settle()
             run.learn(None, stop)
-            if stop.requested:  # a resumed run owes updates, and then evaluates
-                break
-        run.keep_up(progress)
-        if saves:
-            with run.attempt("checkpoint"):
-                run.save()
+        if not stop.requested:  # else a resumed run owes updates first
+            run.keep_up(progress)
+            if saves:
+                with run.attempt("checkpoint"):
+                    run.save()
         if run.at_end or stop.requested:
             break
         with run.clock.timed("collect"):

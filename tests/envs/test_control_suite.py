@@ -379,6 +379,22 @@ def test_bad_arguments_are_explained(opengl: None) -> None:
             ControlSuiteEnv("cartpole_swingup", 1, camera=camera)
 
 
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        *(({"episode_steps": steps}, f"episode_steps={steps}: at least one action") for steps in (0, -3)),
+        ({"episode_steps": 2.5}, "episode_steps=2.5: must be a whole number"),
+        ({"num_envs": "2"}, "num_envs='2': must be a whole number"),
+        ({"num_envs": None}, "num_envs=None: must be a whole number"),
+        ({"image_size": 0}, "image_size=0: at least one pixel"),
+        ({"image_size": 64.0}, "image_size=64.0: must be a whole number"),
+    ],
+)
+def test_counts_of_nothing_are_refused(argument: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        blind(**argument)
+
+
 def test_bad_actions_are_explained() -> None:
     env = blind("walker_walk", 2)
     data = env.reset()

@@ -220,6 +220,20 @@ def test_time_limit_of_less_than_a_step_is_refused() -> None:
         load("circle", time_limit=0.001)
 
 
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ({"control_rate": "50"}, "control_rate='50': must be a number"),
+        ({"time_limit": "3"}, "time_limit='3': must be a number"),
+        ({"camera": "x"}, "camera='x': must be a Camera"),
+        ({"preset": ["easy"]}, r"preset=\['easy'\]: there is no such physics"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_named(argument: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        load("circle", **argument)
+
+
 def test_seeds_reproduce_and_differ() -> None:
     def starts(seed: int) -> np.ndarray:
         env = load("split_s", "faithful", random=seed)

@@ -206,6 +206,28 @@ def test_wrong_arguments_are_explained() -> None:
         DroneRaceVectorEnv(2, render_mode="human")
 
 
+@pytest.mark.parametrize(
+    ("device", "words"),
+    [
+        ("gpu", "device='gpu': worlds live on cpu or cuda"),
+        ("cuda:0", "Gymnasium's arrays live on cpu"),
+        (None, "device='None': worlds live on cpu or cuda"),
+    ],
+)
+def test_devices_without_worlds_are_refused(device: str | None, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        DroneRaceGymEnv("circle", observation="state", device=device)
+
+
+@pytest.mark.parametrize("kind", [DroneRaceGymEnv, DroneRaceVectorEnv])
+def test_a_closed_environment_draws_no_more(kind: type[gymnasium.Env]) -> None:
+    env = kind(track="circle", observation="state", render_mode="rgb_array", renderer="warp")
+    env.reset()
+    env.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match=r"render\(\) after close\(\)"):
+        env.render()
+
+
 @pytest.mark.parametrize("vector", [False, True])
 def test_seeds_reproduce(vector: bool) -> None:
     def fly(seed: int | None) -> np.ndarray:

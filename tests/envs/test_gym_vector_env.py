@@ -154,6 +154,19 @@ def test_in_mode_same_step_the_last_observation_is_in_info(observation: str) -> 
     envs.close()
 
 
+def test_in_mode_same_step_the_last_info_is_of_those_that_ended() -> None:
+    """As Gymnasium's own vector environment has it, in dictionaries within, too."""
+    envs = make_vec(observation="vector", autoreset_mode="SameStep", privileged=True)
+    envs.reset(seed=0)
+    info = make_and_poison(envs)[-1]
+    final = info["final_info"]
+    for told, there in ((final, [False, True, False]), (info, [True, True, True])):
+        for entries in (told, told["privileged"]):
+            masks = [mask for name, mask in entries.items() if name.startswith("_") and "final" not in name]
+            assert len(masks) > 4 and all(list(mask) == there for mask in masks)
+    envs.close()
+
+
 @pytest.mark.parametrize("observation", ["pixels", "both"])
 def test_in_mode_same_step_only_the_images_of_new_episodes_are_drawn_again(
     observation: str, monkeypatch: pytest.MonkeyPatch

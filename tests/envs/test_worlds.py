@@ -1,8 +1,16 @@
-"""The options that every environment hands on to its worlds."""
+"""The worlds themselves, and their options that every environment hands on."""
 
 from __future__ import annotations
 
+import gc
 import inspect
+import os
+import signal
+import traceback
+from collections.abc import Callable
+
+import pytest
+import torch
 
 from dreamer_racing.envs.worlds import RaceWorlds, WorldOptions
 
@@ -12,3 +20,55 @@ OF_ADAPTERS = {"self", "track", "num_envs", "preset", "from_pixels"}
 def test_every_option_of_the_worlds_is_handed_on():
     parameters = inspect.signature(RaceWorlds.__init__).parameters
     assert set(parameters) - OF_ADAPTERS == set(WorldOptions.__annotations__)
+
+
+@pytest.mark.parametrize("preset", ["easy", "faithful"])
+def test_no_gradient_goes_back_to_the_action(preset: str) -> None:
+    worlds = RaceWorlds("circle", 2, preset, from_pixels=False, seed=0)
+    worlds.reset()
+    leaf = torch.zeros(2, 4, requires_grad=True)
+    for _ in range(3):
+        outcome = worlds.step(torch.tanh(leaf))
+    simulator = worlds.simulator
+    kept = [
+        *vars(outcome).values(),
+        *vars(simulator.state).values(),
+        *worlds.race.state_dict().values(),
+        simulator.quadrotor.setpoints,
+        simulator.quadrotor.rotor_speed,
+    ]
+    assert not any(tensor.requires_grad for tensor in kept)
+
+
+def in_a_fork(work: Callable[[], None]) -> bool:
+    """Whether a forked process did its work, without an error and in less than 20 s."""
+    if child := os.fork():
+        return os.waitpid(child, 0)[1] == 0
+    signal.alarm(20)
+    try:
+        work()
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+@pytest.mark.parametrize("from_pixels", [False, True])
+def test_a_forked_process_is_told_instead_of_waiting_for_ever(from_pixels: bool) -> None:
+    made = [RaceWorlds("circle", 2, from_pixels=from_pixels, renderer="warp", num_threads=2, seed=0)]
+    made[0].reset()
+
+    def told() -> None:
+        for work in (made[0].reset, made[0].render, lambda: made[0].step(torch.zeros(2, 4))):
+            with pytest.raises(RuntimeError, match="was forked from it.*by multiprocessing's 'spawn'"):
+                work()
+
+    def freed() -> None:
+        made.clear()
+        gc.collect()
+
+    for work in (told, lambda: made[0].close(), freed):
+        assert in_a_fork(work)
+    made[0].step(torch.zeros(2, 4))
+    made[0].close()

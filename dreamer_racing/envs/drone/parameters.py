@@ -5,11 +5,22 @@ project's, because nobody published it.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
-from dreamer_racing.settings import suggestion
+from dreamer_racing.settings import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    check_numbers,
+    check_settings,
+    check_three,
+    quoted,
+    setting,
+    suggestion,
+)
 
 GRAVITY = 9.81  # m/s²
+INTEGRATORS = ("Euler", "RK4")
+"""MuJoCo's names of those to choose from: `RigidStep` brings Euler's pose to second order, and RK4 needs nothing."""
 
 
 @dataclass(frozen=True)
@@ -21,35 +32,59 @@ class Randomisation:
     drag: float = 0.10
     thrust: float = 0.10  # all four rotors together: battery voltage
     torque: float = 0.01
-    delay_max: float = 0.040  # s; the command delay is uniform in [0, delay_max]
+    delay_max: float = setting(0.040, NOT_NEGATIVE)  # s; the command delay is uniform in [0, delay_max]
+
+    def __post_init__(self) -> None:
+        widths = {f"Randomisation: {name}": width for name, width in vars(self).items()}
+        check_numbers({}, widths)
+        check_settings(self, "Randomisation: ")
+        for name, width in widths.items():
+            if not name.endswith("delay_max") and not 0.0 <= width < 1.0:
+                raise ValueError(f"{name}={width}: a relative half-width, must be at least 0 and below 1.")
 
 
 @dataclass(frozen=True)
 class QuadrotorParameters:
     """Physical and control parameters of the drone, in SI units.
 
+    Raises:
+        ValueError: the message gives the number, and what is allowed.
+
     Example:
         >>> QuadrotorParameters().hover_action
         -0.26407
     """
 
-    mass: float = 0.6  # kg [paper]
+    mass: float = setting(0.6, POSITIVE)  # kg [paper]
     inertia: tuple[float, float, float] = (0.002410, 0.001800, 0.003759)  # kg m², principal axes = body axes [paper]
-    arm_length: float = 0.14  # m, centre to rotor [paper]; X layout [choice]
-    torque_constant: float = 0.022  # m: N m of yaw torque per N of rotor thrust [paper]
-    rotor_thrust_max: float = 4.0  # N, thrust-to-weight ratio 2.72 [paper]
-    motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]
+    arm_length: float = setting(0.14, POSITIVE)  # m, centre to rotor [paper]; X layout [choice]
+    torque_constant: float = setting(0.022, POSITIVE)  # m: N m of yaw torque per N of rotor thrust [paper]
+    rotor_thrust_max: float = setting(4.0, POSITIVE)  # N, thrust-to-weight ratio 2.72 [paper]
+    motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]; inf: speeds stay
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/(m/s), linear rotor drag in the body frame
     body_rate_max: tuple[float, float, float] = (10.0, 10.0, 4.0)  # rad/s at action ±1 [rpg]
-    collective_thrust_scale: float = 13.33  # m/s²: c = scale · (1 + a) [rpg]
-    rate_gain: float = 15.0  # 1/s, proportional body-rate loop [choice]
-    command_delay: float = 0.0  # s
-    physics_dt: float = 0.002  # s [rpg]
-    control_dt: float = 0.02  # s, 50 Hz [rpg]
-    integrator: str = "Euler"  # MuJoCo's name of it
+    collective_thrust_scale: float = setting(13.33, POSITIVE)  # m/s²: c = scale · (1 + a) [rpg]
+    rate_gain: float = setting(15.0, POSITIVE)  # 1/s, proportional body-rate loop [choice]
+    command_delay: float = setting(0.0, NOT_NEGATIVE)  # s
+    physics_dt: float = setting(0.002, POSITIVE)  # s [rpg]
+    control_dt: float = setting(0.02, POSITIVE)  # s, 50 Hz [rpg]
+    integrator: str = "Euler"  # out of `INTEGRATORS`
     randomisation: Randomisation | None = None
 
     def __post_init__(self) -> None:
+        prefix, three = "QuadrotorParameters: ", {"inertia": POSITIVE, "drag": NOT_NEGATIVE, "body_rate_max": POSITIVE}
+        plain = [field.name for field in fields(self) if field.type is float]
+        check_numbers({}, {prefix + name: getattr(self, name) for name in plain})
+        check_settings(self, prefix)
+        for name, allowed in three.items():
+            check_three(prefix + name, getattr(self, name), allowed)
+        if not self.motor_time_constant > 0.0:
+            raise ValueError(f"{prefix}motor_time_constant={self.motor_time_constant}: must be above 0.")
+        if self.integrator not in INTEGRATORS:
+            there = " or ".join(INTEGRATORS)
+            raise ValueError(f"{prefix}integrator={quoted(self.integrator)}: must be {there}, as MuJoCo calls them.")
+        if not (self.randomisation is None or isinstance(self.randomisation, Randomisation)):
+            raise ValueError(f"{prefix}randomisation={quoted(self.randomisation)}: must be a Randomisation or None.")
         steps = self.control_dt / self.physics_dt
         if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
             raise ValueError(
@@ -95,7 +130,7 @@ def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
     """
     if isinstance(preset, QuadrotorParameters):
         return preset
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"preset={preset}: there is no such physics; there are {there}{suggestion(preset, PRESETS)}.")
     return PRESETS[preset]

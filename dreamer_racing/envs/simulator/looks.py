@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.simulator.scene import Camera, gate_materials
+from dreamer_racing.settings import NOT_NEGATIVE, check_numbers
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,11 @@ class LooksRandomisation:
     noise: float = 0.02  # standard deviation of every pixel's noise, of full scale; drawn anew for every image
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) >= 0.0:
-                raise ValueError(f"LooksRandomisation: {field.name}={getattr(self, field.name)} must not be negative.")
+        widths = vars(self)
+        check_numbers({}, {f"LooksRandomisation: {name}": width for name, width in widths.items()})
+        for name, width in widths.items():
+            if width not in NOT_NEGATIVE:
+                raise ValueError(f"LooksRandomisation: {name}={width} must not be negative, and finite.")
         if self.brightness >= 1.0 or self.color >= 1.0:
             raise ValueError("LooksRandomisation: brightness and color are relative half-widths, below 1.")
 
@@ -63,6 +66,9 @@ class LooksSampler:
 
     Attributes:
         looks: those of the present episodes, (N, ...); nominal until `reset`.
+
+    Raises:
+        ValueError: lenses vary further than there are any.
     """
 
     def __init__(
@@ -75,6 +81,12 @@ class LooksSampler:
         dtype: torch.dtype = torch.float64,
         generator: torch.Generator | None = None,
     ) -> None:
+        widest = min(camera.field_of_view, 180.0 - camera.field_of_view)
+        if not randomisation.field_of_view < widest:
+            raise ValueError(
+                f"LooksRandomisation: field_of_view={randomisation.field_of_view}: around the camera's "
+                f"{camera.field_of_view:g} degrees it must be below {widest:g}, to stay between 0 and 180."
+            )
         self._randomisation = randomisation
         self._generator = generator
         self._nominal = torch.from_numpy(scene.mat_rgba[:, :3].copy()).to(device, dtype)  # (K, 3)

@@ -1,5 +1,9 @@
 """N worlds on CPU: MuJoCo's C engine for the rigid bodies, batched natively, and a renderer for their cameras."""
 
+import ctypes
+import os
+import weakref
+
 import mujoco
 import torch
 from mujoco.batch import Batch
@@ -12,6 +16,21 @@ from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.machine import available_cpus
+
+_batches: weakref.WeakSet[Batch] = weakref.WeakSet()
+
+
+def _keep_batches() -> None:
+    """Keep those of before a fork from being freed: they would wait for threads, which a forked process does not have.
+
+    A list of them would be freed when that process exits.
+    """
+    for batch in _batches:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(batch))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_keep_batches)
 
 
 class MujocoSimulator(Simulator):
@@ -52,6 +71,7 @@ class MujocoSimulator(Simulator):
         # a broken state must be seen and ended by the race, not hidden by an automatic reset
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         batch = Batch(model, num_envs, num_threads)
+        _batches.add(batch)
         qpos, qvel, force = (torch.from_numpy(batch.bind(name)) for name in ("qpos", "qvel", "qfrc_applied"))
         super().__init__(parameters, qpos, qvel, force, batch.step, generator)
         self.renderer: Renderer | None = None

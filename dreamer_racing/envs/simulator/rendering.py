@@ -271,7 +271,8 @@ def make_renderer(
             reasons.append(str(error))
             continue
         why = f"; {' '.join(reasons)}" if reasons else ""
-        logger.info("renderer: %s, %d thread(s)%s", candidate, num_workers, why)
+        level = logging.WARNING if reasons else logging.INFO  # it is slower than what is missing
+        logger.log(level, "renderer: %s, %d thread(s)%s", candidate, num_workers, why)
         return renderer
     raise RendererUnavailableError(" ".join(reasons))
 

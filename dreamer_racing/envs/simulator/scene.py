@@ -15,6 +15,16 @@ import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.tracks import Gate, Track
+from dreamer_racing.settings import (
+    COUNT,
+    FINITE,
+    POSITIVE,
+    check_numbers,
+    check_settings,
+    check_three,
+    quoted,
+    setting,
+)
 
 HALL_GROUP = 0  # geom group of hall and gates
 DRONE_GROUP = 2  # geom group of the drone, hidden from its own camera
@@ -37,23 +47,44 @@ class Camera:
     Args:
         width: pixels.
         height: pixels.
-        field_of_view: vertical, degrees.
+        field_of_view: vertical, degrees, below 180.
         tilt: upwards, degrees; a racing drone pitches forward when it accelerates.
         position: mount in the body frame, m.
+        near: what is nearer is not drawn, m.
+        far: what is farther is not drawn, m.
+
+    Raises:
+        ValueError: the message gives the number, and what is allowed.
     """
 
-    width: int = 64
-    height: int = 64
-    field_of_view: float = 90.0
-    tilt: float = 25.0
+    width: int = setting(64, COUNT)
+    height: int = setting(64, COUNT)
+    field_of_view: float = setting(90.0, POSITIVE)
+    tilt: float = setting(25.0, FINITE)
     position: tuple[float, float, float] = (0.10, 0.0, 0.02)
-    near: float = 0.01  # m
-    far: float = 100.0  # m
+    near: float = setting(0.01, POSITIVE)
+    far: float = setting(100.0, POSITIVE)
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            if (value := getattr(self, name)) < 1:
-                raise ValueError(f"camera.{name}={value}: an image has at least 1 pixel.")
+        whole, real = ("width", "height"), ("field_of_view", "tilt", "near", "far")
+        check_numbers(*({f"camera.{name}": getattr(self, name) for name in names} for names in (whole, real)))
+        check_settings(self, "camera.")
+        check_three("camera.position", self.position, FINITE)
+        if self.field_of_view >= 180.0:
+            raise ValueError(f"camera.field_of_view={self.field_of_view}: must be below 180 degrees.")
+        if self.near >= self.far:
+            raise ValueError(f"camera.near={self.near}: must be below camera.far={self.far}.")
+
+
+def load_camera(camera: Camera | None) -> Camera:
+    """Return the camera, the default one if None.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not (camera is None or isinstance(camera, Camera)):
+        raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
+    return camera or Camera()
 
 
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:

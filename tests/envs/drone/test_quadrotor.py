@@ -1,5 +1,6 @@
 """The checks an expert makes of the drone's physics, through the simulator that flies it."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters, load_preset
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters, Randomisation, load_preset
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
@@ -250,3 +251,44 @@ def test_unknown_preset_is_refused_with_the_known_ones() -> None:
 def test_control_step_must_be_a_multiple_of_the_physics_step() -> None:
     with pytest.raises(ValueError, match="physics_dt=0.003"):
         QuadrotorParameters(physics_dt=0.003)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        *((name, value, f"{name}={value}: must be above 0") for value in (0.0, -1.0, math.nan, math.inf) for name in (
+            "mass", "arm_length", "torque_constant", "rotor_thrust_max", "collective_thrust_scale", "rate_gain",
+            "physics_dt", "control_dt",
+        )),
+        *(("motor_time_constant", value, f"={value}: must be above 0") for value in (0.0, -1.0, math.nan)),
+        ("mass", "light", "mass='light': must be a number"),
+        ("mass", None, "mass=None: must be a number"),
+        ("command_delay", -0.01, "command_delay=-0.01: must be at least 0"),
+        ("inertia", (0.002, 0.0, 0.003), r"inertia=\(0.002, 0.0, 0.003\): must be three numbers, each above 0"),
+        ("drag", (0.1, 0.1), "drag=.*: must be three numbers, each at least 0"),
+        ("drag", 0.1, "drag=0.1: must be three numbers, each at least 0"),
+        ("body_rate_max", (10.0, -10.0, 4.0), "body_rate_max=.*: must be three numbers, each above 0"),
+        ("integrator", "foo", "integrator='foo': must be Euler or RK4"),
+        ("integrator", "implicitfast", "integrator='implicitfast': must be Euler or RK4"),
+        ("randomisation", True, "randomisation=True: must be a Randomisation or None"),
+    ],
+)  # fmt: skip
+def test_drones_that_cannot_be_are_refused(name: str, value: object, words: str) -> None:
+    with pytest.raises(ValueError, match=f"QuadrotorParameters: .*{words}"):
+        QuadrotorParameters(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        *((name, value, f"{name}={value}: .*at least 0 and below 1") for value in (1.0, -0.1, math.nan) for name in (
+            "mass", "inertia", "drag", "thrust", "torque",
+        )),
+        ("delay_max", -0.01, "delay_max=-0.01: must be at least 0"),
+        ("delay_max", math.inf, "delay_max=inf: must be at least 0, and finite"),
+        ("thrust", "much", "thrust='much': must be a number"),
+    ],
+)  # fmt: skip
+def test_widths_by_which_no_drone_can_differ_are_refused(name: str, value: object, words: str) -> None:
+    with pytest.raises(ValueError, match=f"Randomisation: {words}"):
+        Randomisation(**{name: value})

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.worlds import RaceWorlds
 from tests.renderers import IN_PROCESS, renderer_or_skip
 
@@ -126,3 +129,13 @@ def test_bad_looks_are_refused() -> None:
         LooksRandomisation(noise=-1.0)
     with pytest.raises(ValueError, match="below 1"):
         LooksRandomisation(brightness=1.0)
+    with pytest.raises(ValueError, match="gate_color=inf must not be negative, and finite"):
+        LooksRandomisation(gate_color=math.inf)
+    with pytest.raises(ValueError, match="camera_tilt='3': must be a number"):
+        LooksRandomisation(camera_tilt="3")
+
+
+@pytest.mark.parametrize(("lens", "width", "most"), [(90.0, 95.0, 90), (90.0, 90.0, 90), (120.0, 60.0, 60)])
+def test_lenses_vary_no_further_than_there_are_any(lens: float, width: float, most: int) -> None:
+    with pytest.raises(ValueError, match=f"field_of_view={width}: around the camera's {lens:g} .* below {most}"):
+        worlds(LooksRandomisation(field_of_view=width), "warp", camera=Camera(field_of_view=lens))

@@ -143,6 +143,34 @@ def test_default_camera_is_tilted_by_25_degrees() -> None:
     assert (Camera().tilt, Camera().width, Camera().height) == (25.0, 64, 64)
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"width": 0}, "camera.width=0: must be at least 1"),
+        ({"width": 64.0}, "camera.width=64.0: must be a whole number"),
+        ({"height": "64"}, "camera.height='64': must be a whole number"),
+        ({"field_of_view": 0.0}, "camera.field_of_view=0.0: must be above 0"),
+        ({"field_of_view": math.nan}, "camera.field_of_view=nan: must be above 0"),
+        ({"field_of_view": 180.0}, "camera.field_of_view=180.0: must be below 180"),
+        ({"tilt": math.nan}, "camera.tilt=nan: must be finite"),
+        ({"tilt": math.inf}, r"camera.tilt=inf: must be finite\."),
+        ({"position": (0.1, 0.0)}, r"camera.position=\(0.1, 0.0\): must be three numbers, each finite"),
+        ({"position": (0.1, 0.0, math.nan)}, "camera.position=.*nan.*: must be three numbers, each finite"),
+        ({"position": 0.1}, "camera.position=0.1: must be three numbers"),
+        ({"near": 0.0}, "camera.near=0.0: must be above 0"),
+        ({"far": math.inf}, "camera.far=inf: must be above 0, and finite"),
+        ({"near": 2.0, "far": 1.0}, "camera.near=2.0: must be below camera.far=1.0"),
+    ],
+)
+def test_cameras_that_see_nothing_are_refused(settings, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        Camera(**settings)
+
+
+def test_numbers_of_numpy_make_a_camera() -> None:
+    assert Camera(np.int64(32), np.int32(32), np.float32(80), position=np.zeros(3)).width == 32
+
+
 def test_drone_is_drawn_in_a_group_of_its_own_and_touches_nothing() -> None:
     model, _ = compiled()
     drone = model.body("drone").id

@@ -327,6 +327,13 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
     made.close()
     assert "renderer: warp" in caplog.text
     assert "egl needs libEGL.so.1, which is not installed (Debian: apt-get install libegl1" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
+def test_a_renderer_that_was_asked_for_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger=rendering.__name__):
+        simulator(2, "warp").close()
+    assert [(record.levelname, record.message[:14]) for record in caplog.records] == [("INFO", "renderer: warp")]
 
 
 def test_renderer_that_was_asked_for_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
