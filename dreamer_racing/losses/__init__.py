@@ -28,6 +28,7 @@ from dreamer_racing.losses.representation import (
 )
 from dreamer_racing.losses.world_model import KL_MODES, WorldModelLoss, kl_losses
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.settings import suggestion
 
 Loss = TypeVar("Loss", bound=LossModule)
 
@@ -71,7 +72,10 @@ def find_loss(kind: type[Loss], name: str) -> type[Loss]:
             raise ValueError(f"Loss {name!r}, given as module:Class, cannot be imported: {error}.") from error
     elif (found := registries[kind].get(name)) is None:
         known = ", ".join(registries[kind])
-        raise ValueError(f"Unknown loss {name!r}. Known here: {known}; a loss of your own is given as module:Class.")
+        meant = suggestion(name, registries[kind])
+        raise ValueError(
+            f"Unknown loss {name!r}{meant}. Known here: {known}; a loss of your own is given as module:Class."
+        )
     if not (isinstance(found, type) and issubclass(found, kind)):
         raise ValueError(f"Loss {name!r} is no {kind.__name__}: subclass that, or its nearest child.")
     return found

@@ -30,6 +30,13 @@ from dreamer_racing.settings import shortened, suggestion
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
+PLAIN = {
+    r"could not be converted to Integer": "is no whole number",
+    r"could not be converted to Float": "is no number",
+    r"is not a valid bool \(type \w+\)": "is neither true nor false",
+    r"Invalid type assigned: .*Ramp.*": "a schedule has an end and times of its own, NAME.to=, .begin=, .end=",
+}
+"""What the libraries say, and what is said instead."""
 FLAGS = {"--json": "json=true"}
 """Settings that are customary as flags, for recipes that have them."""
 HYDRAS_FLAGS = (
@@ -108,8 +115,9 @@ def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[
         return f"{group}={choice}: there are {', '.join(choices)}{suggestion(choice, choices)}."
     if match := re.search(r"Error merging override (.+)", text):
         wanted = str(cause).partition("\n")[0] if isinstance(cause, OmegaConfBaseException) else "it does not fit"
-        wanted = wanted.replace("could not be converted to Integer", "is no whole number")
-        return f"{match[1]}: {wanted.replace('could not be converted to Float', 'is no number')}."
+        for words, plain in PLAIN.items():
+            wanted = re.sub(words, plain, wanted)
+        return f"{match[1]}: {wanted}."
     if "parsing override" in text or "no viable alternative" in text:
         match = re.search(r"Error parsing override '(.+?)'", text)
         given = f"{match[1]}: an override is" if match else f"{' '.join(overrides)}: overrides are"
@@ -122,6 +130,8 @@ def no_such_setting(name: str, recipe_name: str) -> str:
     ready = GlobalHydra.instance().is_initialized()  # in the midst of an experiment
     with nullcontext() if ready else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
         known = setting_names(hydra.compose(recipe_name))
+    if name in known:  # a group that nothing is taken from where nobody says so
+        return f"{name}: is added, with a plus: +{name}=..."
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(name, known, n=1) or [
         last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)

@@ -176,6 +176,7 @@ def is_finished(config: DictConfig) -> bool:
     """
     directory = RunDirectory(Path(config.run_dir))
     if directory.finished_env_steps() < config.total_env_steps:
+        refuse_past(config)
         return False
     checkpoint = newest_sound(config.resume)
     config.resume = str(checkpoint)  # so that it is not looked for, and damage not told, again
@@ -186,6 +187,13 @@ def is_finished(config: DictConfig) -> bool:
     return True
 
 
+def refuse_past(config: DictConfig) -> None:
+    """Refuse a length that a run, which has not come to its end, is beyond already."""
+    made = env_steps_of(latest_checkpoint(config.resume))
+    if config.total_env_steps < made:
+        raise ValueError(f"total_env_steps={config.total_env_steps}: the run has made {made:,} env_steps already.")
+
+
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
     """Say where best policy, latest film and latest plot of a finished run are, and which commands go on from there."""
     left = {"run": directory.path}
@@ -193,7 +201,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         left["best policy"] = directory.best.path
     if (evaluation := directory.latest_evaluation()) is not None:
         left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
-    place, longer = _from_here(directory.path), 2 * config.total_env_steps
+    place, longer = _from_here(directory.path), 2 * max(config.total_env_steps, directory.finished_env_steps())
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
     noisy = " start_noise=1" if is_race(config) else ""  # else all of the deterministic policy's flights are alike
     commands = {

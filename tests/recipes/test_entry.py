@@ -75,7 +75,9 @@ def test_any_text_can_be_said_to_hydra(text: str) -> None:
         ("model=cpu_smal", "(did you mean cpu_small?)."),
         ("tuned=fast", "tuned=fast: there are auto, gpu, none, race, suite."),
         ("total_env_steps=many", "total_env_steps=many: Value 'many' of type 'str' is no whole number."),
-        ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is not a valid bool (type str)."),
+        ("env.from_pixels=maybe", "env.from_pixels=maybe: Value 'maybe' is neither true nor false."),
+        ("schedule.discount=0.99", "schedule.discount=0.99: a schedule has an end and times of its own, NAME.to="),
+        ("decoys=paper", "decoys: is added, with a plus: +decoys=..."),
         (
             "schedule.max_std.by=gates",
             "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes, known].",

@@ -13,6 +13,7 @@ import torch
 from dreamer_racing.envs.race.gates import CrashCause, GateSweeper
 from dreamer_racing.envs.race.rewards import RewardWeights, race_reward
 from dreamer_racing.envs.tracks import Track
+from dreamer_racing.settings import quoted
 
 EPISODE_TIME = 20.0
 """Time after which a training episode is truncated, s [choice]."""
@@ -99,6 +100,8 @@ class Race:
         dtype: torch.dtype = torch.float32,
         miss_radius: float = 0.0,
     ):
+        if not isinstance(weights, RewardWeights | None):
+            raise ValueError(f"weights={quoted(weights)}: must be RewardWeights, of dreamer_racing.envs.race.rewards.")
         self.track = track
         self.weights = weights or RewardWeights()
         if episode_steps is not None and episode_steps < 1:
