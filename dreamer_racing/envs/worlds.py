@@ -267,10 +267,10 @@ class RaceWorlds:
                 f"Action of shape {tuple(action.shape)}: {self.num_envs} environment(s) take one of shape "
                 f"({self.num_envs}, {ACTION_SIZE}): collective thrust and body rates x, y, z, each in [-1, 1]."
             )
+        if action.device != self.device:
+            raise ValueError(f"Action on {action.device}: these worlds live on {self.device}, and so must it.")
         if self.device.type != "cuda":
             return self._fly(action)
-        if action.device.type != "cuda":
-            raise ValueError(f"Action on {action.device}: these worlds live on {self.device}, and so must it.")
         if self._graph is None:
             self._graph = self._capture(action)
         outcome = list(self._graph(action))

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dreamer_racing.envs.worlds import RaceWorlds, WorldOptions
 
@@ -38,6 +39,17 @@ def test_no_gradient_goes_back_to_the_action(preset: str) -> None:
         simulator.quadrotor.rotor_speed,
     ]
     assert not any(tensor.requires_grad for tensor in kept)
+
+
+@pytest.mark.parametrize(("lives", "acts"), [("cuda:0", "cuda:1"), ("cuda:0", "cpu"), ("cpu", "cuda:0")])
+def test_an_action_on_another_device_is_refused(lives: str, acts: str) -> None:
+    worlds = RaceWorlds("circle", 2, from_pixels=False, seed=0)
+    worlds.reset()
+    worlds.device = torch.device(lives)
+    with FakeTensorMode():
+        action = torch.zeros(2, 4, device=acts)
+        with pytest.raises(ValueError, match=f"Action on {acts}: these worlds live on {lives}"):
+            worlds.step(action)
 
 
 def in_a_fork(work: Callable[[], None]) -> bool:

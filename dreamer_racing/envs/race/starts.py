@@ -38,7 +38,8 @@ class StartSampler:
     flying towards its centre at 1.5–2.5 m/s; all of them with uniform noise of ±0.5/0.5/0.3 m (forward/left/up of the
     pose), ±5° roll and pitch, ±10° yaw. Positions are then moved into the free box, 0.3 m from its sides.
     ``load_track`` accepts only tracks on which neither the noise nor this move can carry a drone across the plane of
-    its first gate.
+    its first gate. Where gates are so close that one of these poses is within the frame of another gate, the drone
+    begins at the start pose, at rest, without noise.
 
     A share of the drones may begin beyond a gate instead: 0.6–2 m behind a random one, facing and flying along its
     direction at 1.5–5 m/s, to the next gate. They practise the turn from one gate to the next before the policy flies
@@ -110,6 +111,8 @@ class StartSampler:
         self._gate_yaws = track.gate_yaws(device, dtype)
         self._start_position = torch.tensor(track.start_position, device=device, dtype=dtype)
         self._start_yaw = torch.tensor(math.radians(track.start_yaw_degrees), device=device, dtype=dtype)
+        self._start_attitude = from_roll_pitch_yaw(*torch.zeros_like(self._start_yaw).expand(2), self._start_yaw)
+        self._shape = track.shape
         low, high = flyable_box(track, START_CLEARANCE)
         self._low = torch.tensor(low, device=device, dtype=dtype)
         self._high = torch.tensor(high, device=device, dtype=dtype)
@@ -172,12 +175,23 @@ class StartSampler:
         towards = torch.nn.functional.normalize(self._gate_positions[gate] - position, dim=-1)
         direction = torch.where(beyond.unsqueeze(-1), self._gate_normals[gate], towards)
         target = (gate + beyond) % len(self._gate_yaws)
+        blocked = self._in_a_frame(position)
         return StartPose(
-            position=position,
-            attitude=attitude,
-            linear_velocity=torch.where(at_gate, speed, 0.0).unsqueeze(-1) * direction,
-            target_gate=torch.where(at_gate, target, 0),
+            position=torch.where(blocked.unsqueeze(-1), self._start_position, position),
+            attitude=torch.where(blocked.unsqueeze(-1), self._start_attitude, attitude),
+            linear_velocity=torch.where(at_gate & ~blocked, speed, 0.0).unsqueeze(-1) * direction,
+            target_gate=torch.where(at_gate & ~blocked, target, 0),
         )
+
+    def _in_a_frame(self, position: torch.Tensor) -> torch.Tensor:
+        """Return which positions (N, 3) are within the frame of a race gate, as `GateSweeper` has it, (N,) bool."""
+        # (N, 1, 3) from (G, 3) -> (N, G) each
+        x, y, up = (position.unsqueeze(1) - self._gate_positions).unbind(-1)
+        cos, sin, _ = self._gate_normals.unbind(-1)
+        forward, left = x * cos + y * sin, y * cos - x * sin
+        aside = torch.maximum(left.abs(), up.abs())
+        in_bars = (aside >= self._shape.pass_half_width) & (aside <= self._shape.outer / 2)
+        return (in_bars & (forward.abs() <= self._shape.depth / 2)).any(-1)
 
     def _put_on_line(self, line: RacingLine, pose: StartPose) -> StartPose:
         """Move a share of the drones onto the racing line."""

@@ -12,7 +12,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, load_preset, without_randomisation
 from dreamer_racing.envs.drone.rotation import rotate
-from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.race.gates import CrashCause, GateSweeper
 from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.race.race import Race, RaceStep
 from dreamer_racing.envs.race.racing_line import plan_racing_line
@@ -434,6 +434,29 @@ def test_no_start_is_past_its_gate_however_tight_the_box(yaw, seed):
     distance = -(pose.position * track.gate_normals(dtype=torch.float64)[0]).sum(-1)
     assert distance.min() > 0.29
     assert pose.position[:, :2].abs().max() <= 1.01 + 1e-9
+
+
+@pytest.mark.parametrize("beyond_gate", [0.0, 0.5])
+def test_no_start_is_within_the_frame_of_a_gate_close_by(beyond_gate):
+    gates = [Gate((2.5 * index, 1.1 * (index % 2), 1.35), 0.0) for index in range(3)]
+    track = make_track("slalom", gates, start_position=(-3.0, 0.0, 1.35))
+    validate_track(track, "slalom")
+    sampler = StartSampler(track, torch.Generator().manual_seed(0), beyond_gate=beyond_gate)
+    pose = sampler.sample(20_000)
+    still = torch.stack((pose.position, pose.position))
+    crash = GateSweeper(track)(still, pose.target_gate).crash
+    assert crash.unique().tolist() == [CrashCause.NONE]
+    moved = (pose.position == torch.tensor(track.start_position)).all(-1)
+    assert 20 < moved.sum() < 1000
+    assert not pose.linear_velocity[moved].any() and not pose.target_gate[moved].any()
+    torch.testing.assert_close(pose.attitude[moved], torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(int(moved.sum()), 4))
+
+
+@pytest.mark.parametrize("name", BUILTIN_TRACKS)
+def test_no_start_of_a_built_in_track_is_moved_out_of_a_frame(name):
+    track = load_track(name)
+    pose = StartSampler(track, torch.Generator().manual_seed(0), beyond_gate=0.3).sample(20_000)
+    assert not (pose.position == torch.tensor(track.start_position)).all(-1).any()
 
 
 def test_starts_beyond_a_gate_face_the_turn_to_the_next():
