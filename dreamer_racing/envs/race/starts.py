@@ -111,7 +111,8 @@ class StartSampler:
         self._gate_yaws = track.gate_yaws(device, dtype)
         self._start_position = torch.tensor(track.start_position, device=device, dtype=dtype)
         self._start_yaw = torch.tensor(math.radians(track.start_yaw_degrees), device=device, dtype=dtype)
-        self._start_attitude = from_roll_pitch_yaw(*torch.zeros_like(self._start_yaw).expand(2), self._start_yaw)
+        level = torch.zeros_like(self._start_yaw)
+        self._start_attitude = from_roll_pitch_yaw(level, level, self._start_yaw)
         self._shape = track.shape
         low, high = flyable_box(track, START_CLEARANCE)
         self._low = torch.tensor(low, device=device, dtype=dtype)
