@@ -439,7 +439,7 @@ def test_no_start_is_past_its_gate_however_tight_the_box(yaw, seed):
 @pytest.mark.parametrize("beyond_gate", [0.0, 0.5])
 def test_no_start_is_within_the_frame_of_a_gate_close_by(beyond_gate):
     gates = [Gate((2.5 * index, 1.1 * (index % 2), 1.35), 0.0) for index in range(3)]
-    track = make_track("slalom", gates, start_position=(-3.0, 0.0, 1.35))
+    track = make_track("slalom", gates, start_position=(-2.5, 0.0, 1.35))
     validate_track(track, "slalom")
     sampler = StartSampler(track, torch.Generator().manual_seed(0), beyond_gate=beyond_gate)
     pose = sampler.sample(20_000)
