@@ -94,7 +94,7 @@ def check_setting(name: str, value: object, allowed: Range, whole: bool = False)
     Raises:
         ValueError: the message gives the setting, its value, and what is allowed.
     """
-    is_whole = isinstance(value, Integral)
+    is_whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if not is_number(value):
         raise ValueError(f"{name}={quoted(value)}: must be a number, {allowed}.")
     if value not in allowed:

@@ -176,7 +176,6 @@ def is_finished(config: DictConfig) -> bool:
     """
     directory = RunDirectory(Path(config.run_dir))
     if directory.finished_env_steps() < config.total_env_steps:
-        refuse_past(config)
         return False
     checkpoint = newest_sound(config.resume)
     config.resume = str(checkpoint)  # so that it is not looked for, and damage not told, again
@@ -185,13 +184,6 @@ def is_finished(config: DictConfig) -> bool:
         return False
     print(f"complete already, at {env_steps:,} env_steps: give a larger total_env_steps to go on")
     return True
-
-
-def refuse_past(config: DictConfig) -> None:
-    """Refuse a length that a run, which has not come to its end, is beyond already."""
-    made = env_steps_of(latest_checkpoint(config.resume))
-    if config.total_env_steps < made:
-        raise ValueError(f"total_env_steps={config.total_env_steps}: the run has made {made:,} env_steps already.")
 
 
 def what_next(config: RunConfig, directory: RunDirectory) -> str:
