@@ -252,7 +252,7 @@ def _described(contract: Path) -> dict[str, str]:
     """Return the names of the files that a contract describes, by kind; none if it is not there or cannot be read."""
     try:
         files = json.loads(contract.read_text(encoding="utf-8"))["files"]
-        return {kind: file["name"] for kind, file in files.items()}
+        return {kind: Path(file["name"]).name for kind, file in files.items()}  # of its own folder, whatever it says
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
