@@ -37,7 +37,7 @@ from torch import device as Device
 
 from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
+from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics, world_model_metrics
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.learners.learner import seeded
@@ -119,17 +119,22 @@ class DreamerRun(ReplayRun):
         if self.lag.limit is None or periods == self.lag.periods:
             return
         self.lag.periods = periods
-        measured = lag_error(self.held_out(), "held_out/")
-        error = parallel.agreed(None if measured is None else float(measured))  # the first holds out worlds for all
+        windows = self.replay.newest(self.config.model.batch_length)
+        if windows is None or not self.counters["updates"]:
+            return
+        self.wait()
+        with self.clock.timed("measure"):
+            error = lag_error(parallel.averaged(world_model_metrics(self.learner, windows)))
         if error is not None:
-            self.metrics.push({"held_out/lag": self.lag.measured(error), "held_out/actor_waits": float(self.lag.waits)})
+            ratio = self.lag.measured(error)
+            self.metrics.push({"lag/error": error, "lag/ratio": ratio, "lag/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Put what is scheduled where it belongs by now, and make the updates that are due."""
+        if rollout is not None:  # else updates that are owed have been made after it
+            self.look_at_lag()
         self.keep_to_schedule()
         super().learn(rollout, stop)
-        if not stop.signal_name:  # else after what is owed then
-            self.look_at_lag()
 
     def times(self) -> dict[RampClock, float]:
         """What the clocks of schedules say by now."""
@@ -161,9 +166,9 @@ class DreamerRun(ReplayRun):
         return super().save()
 
 
-def lag_error(metrics: dict[str, Tensor], prefix: str = "") -> Tensor | None:
+def lag_error(metrics: dict[str, Tensor]) -> Tensor | None:
     """The error by which a model is seen to lag; None if none of them was measured."""
-    return next((metrics[prefix + name] for name in LAG_ERRORS if prefix + name in metrics), None)
+    return next((metrics[name] for name in LAG_ERRORS if name in metrics), None)
 
 
 @recipe("dreamer_v3")

@@ -5,6 +5,9 @@ Shapes: W windows of T records, C context records, H horizon, F features.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -15,6 +18,22 @@ from dreamer_racing.modules.world_model import join_features
 
 SEEN = 16
 """Records that the model sees before it has to predict."""
+
+
+@torch.no_grad()
+def world_model_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str, Tensor]:
+    """Measure the world model on records as an update would, and change nothing: neither networks nor random state.
+
+    Args:
+        learner: Whose world model is measured.
+        batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them.
+
+    Returns:
+        Losses and metrics of the world-model loss, scalars on the learner's device.
+    """
+    with _untouched(learner):
+        losses = learner.losses["world_model"](batch.to(learner.device))
+    return dict(losses.exclude("replay_context").items())
 
 
 @torch.no_grad()
@@ -46,9 +65,16 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
     horizon = learner.horizon
     if batch.shape[1] < SEEN + horizon:
         raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
+    with _untouched(learner):
+        return _measure(learner, batch.to(learner.device)[:, : SEEN + horizon], horizon)
+
+
+@contextmanager
+def _untouched(learner: DreamerLearner) -> Iterator[None]:
+    """Run the learner's networks as updates do, and leave the random state as it was."""
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():
-        return _measure(learner, batch.to(learner.device)[:, : SEEN + horizon], horizon)
+        yield
 
 
 def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> dict[str, Tensor]:

@@ -114,6 +114,14 @@ class StreamReplay(TensorDictReplayBuffer):
             return None
         return self._transformed(self._storage.get(slots))
 
+    def newest(self, length: int) -> TensorDictBase | None:
+        """Returns the newest records of every stream, ``[N, length]``, delivered as samples are.
+
+        None as long as a stream holds fewer.
+        """
+        slots = self._sampler.newest(length)
+        return None if slots is None else self._transformed(self._storage.get(slots))
+
     def _transformed(self, records: TensorDictBase) -> TensorDictBase:
         return self._transform(records) if self._transform is not None and len(self._transform) else records
 

@@ -288,6 +288,14 @@ class StreamSampler(RandomSampler):
         generator = torch.Generator().manual_seed(self.writer._write_count)
         return self._draw(num_windows, length, reach, generator)
 
+    def newest(self, length: int) -> Tensor | None:
+        """Returns the slots of each stream's newest records, int64 ``(N, length)``, or None if one holds fewer."""
+        if int(self.writer.filled.min()) < length:
+            return None
+        writer = self.writer
+        position = (writer.cursor.unsqueeze(-1) + torch.arange(-length, 0)) % writer.stream_length  # (N, length)
+        return torch.arange(writer.num_streams).unsqueeze(-1) * writer.stream_length + position
+
     def _draw(self, count: int, length: int, reach: Tensor, generator: torch.Generator | None) -> Tensor:
         """Slots ``(count, length)`` of windows in the newest ``reach`` records ``(N,)`` of the streams."""
         writer = self.writer

@@ -13,13 +13,13 @@ MEMORY = 0.8
 
 
 class ModelLag:
-    """Compares a world model's error on fresh records it is never trained on with that on those it is trained on.
+    """Compares a world model's error on fresh records, not yet trained on, with that on those it is trained on.
 
     A policy that improves faster than its model flies where the model errs, and finds those of its errors that promise
     most. Then the fresh records' error stands above the other, and the policy should wait.
 
-    The two are not measured alike: fresh records are of the newest flights, and their windows are longer and begin with
-    latents that no update has refreshed. So a ratio somewhat above one is no lag yet.
+    Fresh are the newest records of all worlds: those of one that is held out follow single odd flights. Their windows
+    begin with latents that no update has refreshed, so a ratio somewhat above one is no lag yet.
 
     Args:
         limit: Ratio of the two above which the policy waits; None: it never does.
@@ -45,20 +45,20 @@ class ModelLag:
         self._sum: Tensor | float = 0.0  # of the errors of updates since the last measurement
         self._count = 0
         self._trained: float | None = None  # running means
-        self._held_out: float | None = None
+        self._fresh: float | None = None
 
     def trained(self, error: Tensor) -> None:
         """Take note of an update's error, a scalar; nothing waits for its device."""
         self._sum = self._sum + error.detach()
         self._count += 1
 
-    def measured(self, held_out: Tensor | float) -> float:
+    def measured(self, fresh: Tensor | float) -> float:
         """Take note of the error on fresh records, a scalar; return the ratio, and decide."""
         if self._count:
             self._trained = _moved(self._trained, float(self._sum) / self._count)
             self._sum, self._count = 0.0, 0
-        self._held_out = _moved(self._held_out, float(held_out))
-        ratio = self._held_out / self._trained if self._trained else math.nan
+        self._fresh = _moved(self._fresh, float(fresh))
+        ratio = self._fresh / self._trained if self._trained else math.nan
         if self.limit is not None and not math.isnan(ratio):
             self.waits = ratio > self.limit
         return ratio
@@ -71,14 +71,14 @@ class ModelLag:
             "sum": float(self._sum),
             "count": self._count,
             "trained": self._trained,
-            "held_out": self._held_out,
+            "fresh": self._fresh,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.waits, self.periods = state_dict["waits"], state_dict["periods"]
         self._sum, self._count = torch.tensor(state_dict["sum"]), state_dict["count"]
-        self._trained, self._held_out = state_dict["trained"], state_dict["held_out"]
+        self._trained, self._fresh = state_dict["trained"], state_dict.get("fresh")  # not saved by older versions
 
 
 def _moved(mean: float | None, value: float) -> float:

@@ -445,11 +445,6 @@ def check_wait(config: DreamerConfig) -> None:
             f"schedule.wait_for_model={limit} is for actors that step alone, loss.actor={', '.join(alone)}; with "
             f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
         )
-    if not config.replay.held_out:
-        raise ValueError(
-            f"schedule.wait_for_model={limit} measures worlds held out, and replay.held_out=0: hold out one, or set "
-            "schedule.wait_for_model=null."
-        )
 
 
 def steps_alone(actor_loss: str) -> bool:

@@ -269,6 +269,20 @@ def test_what_is_held_out_may_be_the_newest():
     assert {value.device.type for value in delivered.values()} == {"meta"}
 
 
+def test_the_newest_are_the_last_of_every_stream_in_order():
+    replay = make_replay(2 * 40, 2, 500, 4, held_out=1)
+    assert replay.newest(1) is None, "nothing has been written"
+    for length in (31, 62):  # the second time the rings have wrapped
+        replay.extend(collect(CountingEnv(2, end=0.0), steps=30, batches=1)[0])
+        newest = replay.newest(5)
+        assert newest.batch_size == (2, 5)
+        assert stream(newest["pixels"]).tolist() == [[0] * 5, [1] * 5], "held out or not"
+        assert counter(newest["pixels"]).tolist() == [[27, 28, 29, 30, 31]] * 2
+        assert (replay.newest(min(length, 40) + 1) is None) and replay.newest(min(length, 40)) is not None
+    delivered = make_both(device="meta", storage_device="cpu").newest(4)
+    assert delivered.device == torch.device("meta")
+
+
 def test_something_must_be_left_to_sample():
     for held_out in (2, 3, -1):
         with pytest.raises(ValueError, match=f"held_out={held_out} of num_envs=2"):

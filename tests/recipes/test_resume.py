@@ -135,6 +135,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     }  # fmt: skip
     assert_same(whole, resumed, "checkpoint")
     assert metrics(tmp_path / "whole") == metrics(tmp_path / "killed")
+    assert ("lag/ratio" in metrics(tmp_path / "whole")) is (tuned != ["tuned=none"])
 
 
 @pytest.mark.slow

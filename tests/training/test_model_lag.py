@@ -8,10 +8,10 @@ import torch
 from dreamer_racing.training.model_lag import MEMORY, ModelLag
 
 
-def measure(lag: ModelLag, trained: float, held_out: float) -> float:
+def measure(lag: ModelLag, trained: float, fresh: float) -> float:
     for _ in range(3):
         lag.trained(torch.tensor(trained))
-    return lag.measured(torch.tensor(held_out))
+    return lag.measured(torch.tensor(fresh))
 
 
 def test_it_waits_above_the_limit_and_goes_on_below():
@@ -51,5 +51,5 @@ def test_a_restored_one_goes_on_as_if_it_had_never_stopped():
     lag.trained(torch.tensor(0.5))
     other = ModelLag(limit=1.25)
     other.load_state_dict(lag.state_dict())
-    assert [measure(each, 1.0, 1.1) for each in (lag, other)] == [pytest.approx(lag._held_out / lag._trained)] * 2
+    assert [measure(each, 1.0, 1.1) for each in (lag, other)] == [pytest.approx(lag._fresh / lag._trained)] * 2
     assert lag.waits == other.waits
