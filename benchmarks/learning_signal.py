@@ -6,11 +6,14 @@
   By record of the window, `error` of the decoded state (mean square, symlogged), and how far the mean `action` and the
   `value` are from those of `warm`, which has seen the 64 records: `stored` begins with the context in the replay,
   `cold` from nothing. Only windows of a single flight are counted: in another, a record would soon be as warm as any.
-* Gradient: of the policy-gradient loss at the present actor, from N starts, `cosine` between two drawn independently
-  and `signal` power over noise power; N as one update has it, and as an improvement of `loss.actor=ppo` has it.
+* Gradient: of the actor's loss at the present actor, from N starts of imagination, `cosine` between two drawn
+  independently and `signal` power over noise power; N as one update has it, and as an improvement of `loss.actor=ppo`
+  has it. An actor that learns from what it flies flies anew here, as in training by then: N steps, as a minibatch and
+  as an improvement has them.
 * Drift: two copies of the learner after `drift_updates` updates on batches of their own, none of which wait for the
-  model; root mean square over states and dimensions of the mean actions' difference (`apart`) and of the way each went
-  (`moved`), beside the policy's mean deviation `std`. Mean over `--pairs`, and the least and most `apart`.
+  model, or, from what was flown, after one improvement, which comes once in as many updates; root mean square over
+  states and dimensions of the mean actions' difference (`apart`) and of the way each went (`moved`), beside the
+  policy's mean deviation `std`. Mean over `--pairs`, and the least and most `apart`.
 
 The trained weights are measured, not the averaged ones. The checkpoint must hold a replay, so no best/.
 """
@@ -27,27 +30,33 @@ import torch.nn.functional as F
 from measuring import print_table, write_json
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.collectors import Collector
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 from composing.arena import make_env
-from composing.building import make_curriculum, make_run_replay
+from composing.building import make_collector, make_curriculum, make_run_replay
+from composing.learners import clock_times, scheduled_numbers
 from composing.restoring import restore_learner
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
+from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import FlownPPOActorLoss, PPOActorLoss, imagine
+from dreamer_racing.losses.clipped_actor import Minibatch, clipped_objective, normalised
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.training.checkpoint import load_components
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.pass_share import PassShare
 
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from
 GRADIENTS = 12
+WARM_UP = 64  # rollouts, until not all flights are as old
 COLUMNS = {
     "windows": [
         "record", "windows", "error_warm", "error_stored", "error_cold", "action_stored", "action_cold",
@@ -94,7 +103,8 @@ def measure(checkpoint: Path, updates: int, pairs: int) -> Iterator[dict[str, An
         yield {**where, "measured": "windows", **record}
     del long
     if isinstance(learner.actor_loss, FlownPPOActorLoss):
-        print("gradient, drift: not measured, an actor that learns from what it flies does not learn from a replay")
+        for record in of_what_is_flown(config, checkpoint, learner, learner.actor_loss, pairs):
+            yield {**where, **record}
         return
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
     starts = config.model.imagination_starts or config.model.batch_size * config.model.batch_length
@@ -194,13 +204,81 @@ def gradient_noise(learner: DreamerLearner, replay: StreamReplay, number: int) -
         gain = actor(features[:-1]).log_prob(action) * (judged.lambda_return - judged.value)
         objective = -(judged.weight * gain).mean()
         gradients.append(torch.cat([part.flatten() for part in torch.autograd.grad(objective, parameters)]))
-    rows = torch.stack(gradients)  # (GRADIENTS, P)
+    return {"starts": number, **noise_of(torch.stack(gradients))}
+
+
+def noise_of(rows: Tensor) -> dict[str, float]:
+    """Compare independent gradients ``(G, P)``."""
     mean, count = rows.mean(0), len(rows)
     noise = (rows - mean).square().sum() / (count - 1)
     signal = mean.square().sum() - noise / count
     unit = F.normalize(rows, dim=1)
     cosine = ((unit @ unit.T).sum() - count) / (count * (count - 1))
-    return {"starts": number, "cosine": cosine.item(), "signal": (signal / noise).item()}
+    return {"cosine": cosine.item(), "signal": (signal / noise).item()}
+
+
+def of_what_is_flown(
+    config: DreamerConfig, checkpoint: Path, learner: DreamerLearner, loss: FlownPPOActorLoss, pairs: int
+) -> Iterator[dict[str, Any]]:
+    """Fly as the run would go on, and yield the records of gradient and drift."""
+    env = cast(DroneRacingEnv, make_env(config))
+    passes = PassShare(env.track.num_gates)
+    times = clock_times(config, load_components(checkpoint, {"passes": passes})["env_steps"], passes)
+    numbers = scheduled_numbers(config, times)
+    env.worlds.start_on_line = config.schedule.start_on_line.at(config.env.start_on_line, times)
+    learner.adjust(**numbers)
+    flights = list(fly(make_collector(config, env, learner.policy()), loss, max(GRADIENTS, 2 * pairs)))
+    improvements = [kept_as_minibatch(loss, flight) for flight in flights[:GRADIENTS]]
+    features = improvements[0].features
+    size = min(loss.ppo.minibatch, len(features))
+    parts = [Minibatch(*(value[torch.randperm(len(value))[:size]] for value in each)) for each in improvements]
+    for records in (parts, improvements):
+        rows = torch.stack([gradient_of(loss, each) for each in records])
+        yield {"measured": "gradient", "starts": len(records[0].features), **noise_of(rows)}
+    means = []
+    for seed, flight in enumerate(flights[: 2 * pairs]):
+        copy, _ = restore(config, checkpoint)
+        copy.adjust(**numbers)
+        copy.actor_loss.load_state_dict(flight, strict=False)
+        torch.manual_seed(seed)
+        copy.actor_loss.improve(0)
+        with torch.no_grad():
+            means.append(copy.agent.actor(features).mean)
+    between = len(features) * config.model.replay_ratio / (config.model.batch_size * config.model.batch_length)
+    yield {"measured": "drift", "drift_updates": round(between), **apart(learner, features, means, pairs)}
+
+
+def fly(collector: Collector, loss: FlownPPOActorLoss, number: int) -> Iterator[dict[str, Tensor]]:
+    """Fly a few times as much as an improvement takes; yield what the loss has kept each time."""
+    kept = {*loss.kept, "flown"}
+    rollouts = iter(collector)
+    for _ in range(WARM_UP):
+        next(rollouts)
+    for _ in range(number):
+        loss._count(0)
+        while not loss._flown or loss._flown < len(loss.reward):
+            loss.watch(next(rollouts))
+        yield {name: value.clone() for name, value in loss.named_buffers(recurse=False) if name in kept}
+    collector.shutdown()
+
+
+def kept_as_minibatch(loss: FlownPPOActorLoss, flight: dict[str, Tensor]) -> Minibatch:
+    """All that was kept, as an improvement takes it."""
+    loss.load_state_dict(flight, strict=False)
+    value = loss._value()
+    advantage = loss._return(value) - value
+    weight = torch.ones_like(advantage)
+    advantage = normalised(advantage, weight).clamp(-loss.ppo.advantage_clip, loss.ppo.advantage_clip)
+    steps = (loss.features, loss.action, loss.old, advantage, weight)
+    return Minibatch(*(part.flatten(0, 1).clone() for part in steps))
+
+
+def gradient_of(loss: FlownPPOActorLoss, records: Minibatch) -> Tensor:
+    """Of the clipped objective, at the actor that flew, ``(P,)``."""
+    policy = loss.actor(records.features)
+    objective, _ = clipped_objective(policy, records, loss.ppo.clip_epsilon, loss.entropy_scale, loss.log_prob)
+    gradients = torch.autograd.grad(objective, list(loss.actor.parameters()))
+    return torch.cat([part.flatten() for part in gradients])
 
 
 def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates: int, pairs: int) -> dict[str, float]:
@@ -218,16 +296,20 @@ def drift(config: DreamerConfig, checkpoint: Path, replay: StreamReplay, updates
             copy.update(replay.sample())
         with torch.no_grad():
             means.append(copy.agent.actor(features).mean)
-    with torch.no_grad():
-        policy = base.agent.actor(features)
+    return {"drift_updates": updates, **apart(base, features, means, pairs)}
+
+
+@torch.no_grad()
+def apart(base: DreamerLearner, features: Tensor, means: list[Tensor], pairs: int) -> dict[str, float]:
+    """How far the mean actions ``(N, A)`` of pairs of copies are apart, and from those of the learner they were."""
+    policy = base.agent.actor(features)
     after = torch.stack(means).unflatten(0, (pairs, 2))  # (pairs, 2, N, A)
-    apart = (after[:, 0] - after[:, 1]).square().mean((1, 2)).sqrt()
+    distance = (after[:, 0] - after[:, 1]).square().mean((1, 2)).sqrt()
     return {
-        "drift_updates": updates,
         "std": policy.std.mean().item(),
-        "apart": apart.mean().item(),
-        "least": apart.min().item(),
-        "most": apart.max().item(),
+        "apart": distance.mean().item(),
+        "least": distance.min().item(),
+        "most": distance.max().item(),
         "moved": (after - policy.mean).square().mean().sqrt().item(),
     }
 
