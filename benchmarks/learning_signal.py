@@ -231,7 +231,8 @@ def of_what_is_flown(
     improvements = [kept_as_minibatch(loss, flight) for flight in flights[:GRADIENTS]]
     features = improvements[0].features
     size = min(loss.ppo.minibatch, len(features))
-    parts = [Minibatch(*(value[torch.randperm(len(value))[:size]] for value in each)) for each in improvements]
+    order = torch.randperm(len(features))[:size]
+    parts = [Minibatch(*(value[order] for value in each)) for each in improvements]
     for records in (parts, improvements):
         rows = torch.stack([gradient_of(loss, each) for each in records])
         yield {"measured": "gradient", "starts": len(records[0].features), **noise_of(rows)}

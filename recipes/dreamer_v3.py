@@ -21,7 +21,7 @@ from composing.building import (
     resolve_common,
     seed_generators,
 )
-from composing.checks import check_dreamer
+from composing.checks import check_dreamer, steps_alone
 from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, choose_mixed_precision
 from composing.entry import recipe
@@ -126,7 +126,11 @@ class DreamerRun(ReplayRun):
         with self.clock.timed("measure"):
             error = lag_error(parallel.averaged(world_model_metrics(self.learner, windows)))
         if error is not None:
-            ratio = self.lag.measured(error)
+            waited, ratio = self.lag.waits, self.lag.measured(error)
+            if self.lag.waits is not waited:
+                reason = f"the model errs {ratio:.1f} times as much on new records as in training"
+                limit = f"schedule.wait_for_model={self.lag.limit:g}"
+                self.say(f"the actor {'waits' if self.lag.waits else 'goes on'}: {reason} ({limit})")
             self.metrics.push({"lag/error": error, "lag/ratio": ratio, "lag/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
@@ -272,7 +276,7 @@ def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
         parts = {
             "replay": make_sequence_replay(own, env, curriculum, latents),
             "owed": UpdatesOwed(config.replay_ratio),
-            "lag": ModelLag(config.schedule.wait_for_model),
+            "lag": ModelLag(config.schedule.wait_for_model if steps_alone(config.loss.actor) else None),
             "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
         }
         return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)

@@ -34,7 +34,6 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import (
-    ACTOR_LOSSES,
     ActorLoss,
     ActorPPOConfig,
     AsymmetricPPOActorLoss,
@@ -113,6 +112,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
+        ("schedule.wait_for_model", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
         ("schedule.wait_every", config.schedule.wait_for_model is not None, "schedule.wait_for_model"),
     ):
         for leaf in given:
@@ -383,8 +383,9 @@ def check_schedule(config: DreamerConfig) -> None:
         if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     check_deviations(config)
-    if config.schedule.wait_for_model is not None:
-        check_wait(config)
+    limit = config.schedule.wait_for_model
+    if limit is not None and limit <= 1:
+        raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
     check_kl(config.loss.ppo, config.schedule.kl_target.to)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
@@ -428,23 +429,6 @@ def check_kl(ppo: ActorPPOConfig, to: float | None) -> None:
                 f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before {name}={target} is seen to be exceeded: the "
                 f"stop must be at least {KL_TOLERANCE} times the target."
             )
-
-
-def check_wait(config: DreamerConfig) -> None:
-    """Refuse a limit that cannot be kept, and one for an actor that cannot wait.
-
-    Raises:
-        ValueError: the message names the setting to change.
-    """
-    limit = config.schedule.wait_for_model
-    if limit is not None and limit <= 1:
-        raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
-    if not steps_alone(config.loss.actor):
-        alone = filter(steps_alone, ACTOR_LOSSES)
-        raise ValueError(
-            f"schedule.wait_for_model={limit} is for actors that step alone, loss.actor={', '.join(alone)}; with "
-            f"loss.actor={config.loss.actor} it must be schedule.wait_for_model=null."
-        )
 
 
 def steps_alone(actor_loss: str) -> bool:

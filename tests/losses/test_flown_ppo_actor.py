@@ -127,6 +127,23 @@ def test_what_is_full_before_the_actor_may_move_keeps_the_newest():
     assert loss.improve(1)
 
 
+def test_an_actor_that_waits_stands_still_while_the_model_learns_and_then_learns_from_the_newest():
+    from tests.learners.test_dreamer import make_batch
+
+    learner = make_learner(warmup_updates=0)
+    for _ in range(3):
+        learner.watch(newest := make_rollout(learner))
+    learner.actor_waits = True
+    before = copy.deepcopy(learner.agent.state_dict())
+    assert "ppo/kl" not in learner.update(make_batch())
+    moved = {name for name, value in learner.agent.state_dict().items() if not torch.equal(value, before[name])}
+    assert any(name.startswith("world_model.") for name in moved)
+    assert not any(name.startswith("actor.") for name in moved)
+    assert torch.equal(actor_loss(learner).reward[-T:], newest["next", "reward"].transpose(0, 1))
+    learner.actor_waits = False
+    assert "ppo/kl" in learner.update(make_batch())
+
+
 def test_what_pays_becomes_likelier():
     """Rewards that are the first dimension of the action: its mean rises, the others' stay."""
     torch.manual_seed(0)

@@ -182,6 +182,7 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
     assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("asymmetric_ppo", False, True)
     assert (tuned.env.start_at_gate, tuned.schedule.start_on_line.to) == (0, 0)
+    assert tuned.schedule.wait_for_model == 2
     assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)

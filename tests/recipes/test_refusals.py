@@ -104,7 +104,6 @@ REFUSED = [
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
     (["loss.min_std=0.3", "schedule.max_std.to=0.15"], ["loss.min_std=0.3 must be below schedule.max_std.to=0.15"]),
-    (["schedule.wait_for_model=1.2"], ["schedule.wait_for_model=1.2 is for actors that step alone, loss.actor=ppo"]),
     (["schedule.wait_for_model=0.9", "loss.actor=ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
@@ -170,6 +169,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
+        (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=ppo, flown_ppo or asymmetric_ppo"),
         (["schedule.wait_every=9"], "schedule.wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
