@@ -8,8 +8,8 @@
   `cold` from nothing. Only windows of a single flight are counted: in another, a record would soon be as warm as any.
 * Gradient: of the actor's loss at the present actor, from N starts of imagination, `cosine` between two drawn
   independently and `signal` power over noise power; N as one update has it, and as an improvement of `loss.actor=ppo`
-  has it. An actor that learns from what it flies flies anew here, as in training by then: N steps, as a minibatch and
-  as an improvement has them.
+  has it. An actor that learns from what it flies flies on here, as the run would: N (`starts`) steps, as a minibatch
+  and as an improvement has them, 10 s of flight at 25 Hz between them.
 * Drift: two copies of the learner after `drift_updates` updates on batches of their own, none of which wait for the
   model, or, from what was flown, after one improvement, which comes once in as many updates; root mean square over
   states and dimensions of the mean actions' difference (`apart`) and of the way each went (`moved`), beside the
@@ -30,18 +30,18 @@ import torch.nn.functional as F
 from measuring import print_table, write_json
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 from composing.arena import make_env
 from composing.building import make_collector, make_curriculum, make_run_replay
-from composing.learners import clock_times, scheduled_numbers
+from composing.learners import clock_times
 from composing.restoring import restore_learner
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses import FlownPPOActorLoss, PPOActorLoss, imagine
@@ -55,8 +55,8 @@ from dreamer_racing.training.pass_share import PassShare
 
 BEHIND, LENGTH, RECORDS = 64, 16, (0, 1, 3, 8, 12)
 WINDOWS, RECENT = 128, 20_000  # windows compared, and the newest records they are drawn from
-GRADIENTS = 12
-WARM_UP = 64  # rollouts, until not all flights are as old
+GRADIENTS = 8
+BETWEEN = 256  # steps of each world between flights that are compared
 COLUMNS = {
     "windows": [
         "record", "windows", "error_warm", "error_stored", "error_cold", "action_stored", "action_cold",
@@ -220,26 +220,19 @@ def noise_of(rows: Tensor) -> dict[str, float]:
 def of_what_is_flown(
     config: DreamerConfig, checkpoint: Path, learner: DreamerLearner, loss: FlownPPOActorLoss, pairs: int
 ) -> Iterator[dict[str, Any]]:
-    """Fly as the run would go on, and yield the records of gradient and drift."""
-    env = cast(DroneRacingEnv, make_env(config))
-    passes = PassShare(env.track.num_gates)
-    times = clock_times(config, load_components(checkpoint, {"passes": passes})["env_steps"], passes)
-    numbers = scheduled_numbers(config, times)
-    env.worlds.start_on_line = config.schedule.start_on_line.at(config.env.start_on_line, times)
-    learner.adjust(**numbers)
-    flights = list(fly(make_collector(config, env, learner.policy()), loss, max(GRADIENTS, 2 * pairs)))
-    improvements = [kept_as_minibatch(loss, flight) for flight in flights[:GRADIENTS]]
-    features = improvements[0].features
+    """Fly on as the resumed run would, and yield the records of gradient and drift."""
+    flights = fly(config, checkpoint, learner, loss, max(GRADIENTS, 2 * pairs) + 1)
+    improvements = [kept_as_minibatch(loss, flight) for flight in flights]
+    features = improvements.pop().features  # that no copy learns from
     size = min(loss.ppo.minibatch, len(features))
     order = torch.randperm(len(features))[:size]
     parts = [Minibatch(*(value[order] for value in each)) for each in improvements]
     for records in (parts, improvements):
-        rows = torch.stack([gradient_of(loss, each) for each in records])
+        rows = torch.stack([gradient_of(loss, each) for each in records[:GRADIENTS]])
         yield {"measured": "gradient", "starts": len(records[0].features), **noise_of(rows)}
     means = []
     for seed, flight in enumerate(flights[: 2 * pairs]):
         copy, _ = restore(config, checkpoint)
-        copy.adjust(**numbers)
         copy.actor_loss.load_state_dict(flight, strict=False)
         torch.manual_seed(seed)
         copy.actor_loss.improve(0)
@@ -249,18 +242,28 @@ def of_what_is_flown(
     yield {"measured": "drift", "drift_updates": round(between), **apart(learner, features, means, pairs)}
 
 
-def fly(collector: Collector, loss: FlownPPOActorLoss, number: int) -> Iterator[dict[str, Tensor]]:
-    """Fly a few times as much as an improvement takes; yield what the loss has kept each time."""
-    kept = {*loss.kept, "flown"}
-    rollouts = iter(collector)
-    for _ in range(WARM_UP):
-        next(rollouts)
+def fly(
+    config: DreamerConfig, checkpoint: Path, learner: DreamerLearner, loss: FlownPPOActorLoss, number: int
+) -> list[dict[str, Tensor]]:
+    """Fly a few times as much as an improvement takes, with some time between; return what the loss has kept."""
+    env = cast(DroneRacingEnv, make_env(config))
+    collector = make_collector(config, env, learner.policy())
+    passes = PassShare(env.track.num_gates)
+    parts = {"env": env, "collector": CollectorState(collector), "passes": passes}
+    env_steps = load_components(checkpoint, parts)["env_steps"]
+    times = clock_times(config, env_steps, passes)
+    env.worlds.start_on_line = config.schedule.start_on_line.at(config.env.start_on_line, times)
+    rollouts, flights = iter(collector), []
     for _ in range(number):
+        for _ in range(BETWEEN // config.rollout_steps):
+            next(rollouts)
         loss._count(0)
         while not loss._flown or loss._flown < len(loss.reward):
             loss.watch(next(rollouts))
-        yield {name: value.clone() for name, value in loss.named_buffers(recurse=False) if name in kept}
+        kept = loss.named_buffers(recurse=False)
+        flights.append({name: value.clone() for name, value in kept if name in (*loss.kept, "flown")})
     collector.shutdown()
+    return flights
 
 
 def kept_as_minibatch(loss: FlownPPOActorLoss, flight: dict[str, Tensor]) -> Minibatch:
@@ -275,9 +278,9 @@ def kept_as_minibatch(loss: FlownPPOActorLoss, flight: dict[str, Tensor]) -> Min
 
 
 def gradient_of(loss: FlownPPOActorLoss, records: Minibatch) -> Tensor:
-    """Of the clipped objective, at the actor that flew, ``(P,)``."""
+    """Of the clipped objective without its entropy, at the actor that flew, ``(P,)``."""
     policy = loss.actor(records.features)
-    objective, _ = clipped_objective(policy, records, loss.ppo.clip_epsilon, loss.entropy_scale, loss.log_prob)
+    objective, _ = clipped_objective(policy, records, loss.ppo.clip_epsilon, 0.0, loss.log_prob)
     gradients = torch.autograd.grad(objective, list(loss.actor.parameters()))
     return torch.cat([part.flatten() for part in gradients])
 

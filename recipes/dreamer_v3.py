@@ -119,7 +119,10 @@ class DreamerRun(ReplayRun):
         if self.lag.limit is None or periods == self.lag.periods:
             return
         self.lag.periods = periods
-        windows = self.replay.newest(self.config.model.batch_length)
+        length = self.config.model.batch_length
+        if self.config.replay.context:  # begins warm: the newest rollout alone
+            length = min(length, self.config.rollout_steps)
+        windows = self.replay.newest(length)
         if windows is None or not self.counters["updates"]:
             return
         self.wait()
@@ -128,15 +131,14 @@ class DreamerRun(ReplayRun):
         if error is not None:
             waited, ratio = self.lag.waits, self.lag.measured(error)
             if self.lag.waits is not waited:
-                reason = f"the model errs {ratio:.1f} times as much on new records as in training"
+                reason = f"the model errs {ratio:.2f} times as much on the newest records as in training"
                 limit = f"schedule.wait_for_model={self.lag.limit:g}"
                 self.say(f"the actor {'waits' if self.lag.waits else 'goes on'}: {reason} ({limit})")
             self.metrics.push({"lag/error": error, "lag/ratio": ratio, "lag/actor_waits": float(self.lag.waits)})
 
     def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
         """Put what is scheduled where it belongs by now, and make the updates that are due."""
-        if rollout is not None:  # else updates that are owed have been made after it
-            self.look_at_lag()
+        self.look_at_lag()  # before the newest records are learned from
         self.keep_to_schedule()
         super().learn(rollout, stop)
 

@@ -1,4 +1,4 @@
-"""How good the world model is where it was never trained, and whether its dreams pay what the world pays.
+"""How good the world model is where it was not trained, and whether its dreams pay what the world pays.
 
 Shapes: W windows of T records, C context records, H horizon, F features.
 """

@@ -97,6 +97,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     """
     actor, model = find_loss(ActorLoss, config.loss.actor), find_loss(WorldModelLoss, config.loss.world_model)
     images = _is(model, ReconstructionLoss) and config.env.from_pixels
+    waits = config.schedule.wait_for_model is not None and _is(actor, ClippedActorLoss)
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
@@ -113,7 +114,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
         ("schedule.wait_for_model", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
-        ("schedule.wait_every", config.schedule.wait_for_model is not None, "schedule.wait_for_model"),
+        ("schedule.wait_every", waits, "schedule.wait_for_model, of an actor that steps alone"),
     ):
         for leaf in given:
             if not reads and (leaf == name or leaf.startswith(f"{name}.")):

@@ -156,7 +156,7 @@ class ScheduleConfig:
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     max_std: Ramp = field(default_factory=Ramp)  # loss.max_std
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
-    # actors that step alone (loss.actor=..._ppo) wait while the model errs so many times as much where they fly now
+    # actors that step alone (loss.actor=..._ppo) wait while the newest records' error is so many times that in training
     wait_for_model: float | None = None
     wait_every: int = setting(5_000, COUNT)  # env_steps between two looks at those errors
 

@@ -278,7 +278,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
 
 def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
-    overrides = ["tuned=race", "schedule.wait_for_model=null", "device=cpu", "total_env_steps=100000"]
+    overrides = ["tuned=race", "device=cpu", "total_env_steps=100000"]
     found = []
     for actor in ("asymmetric_ppo", "reinforce"):
         resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))

@@ -170,7 +170,10 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=ppo, flown_ppo or asymmetric_ppo"),
-        (["schedule.wait_every=9"], "schedule.wait_every=9 is for schedule.wait_for_model, which is not chosen"),
+        (
+            ["schedule.wait_every=9"],
+            "wait_every=9 is for schedule.wait_for_model, of an actor that steps alone, which is not chosen",
+        ),
     ],
 )
 def test_what_nothing_would_read_is_refused(overrides: list[str], words: str) -> None:

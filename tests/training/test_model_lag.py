@@ -5,30 +5,44 @@ import math
 import pytest
 import torch
 
-from dreamer_racing.training.model_lag import MEMORY, ModelLag
+from dreamer_racing.training.model_lag import LOOKS, PATIENCE, ModelLag
 
 
-def measure(lag: ModelLag, trained: float, fresh: float) -> float:
+def measure(lag: ModelLag, ratio: float) -> float:
     for _ in range(3):
-        lag.trained(torch.tensor(trained))
-    return lag.measured(torch.tensor(fresh))
+        lag.trained(torch.tensor(0.5))
+    return lag.measured(torch.tensor(0.5 * ratio))
 
 
 def test_it_waits_above_the_limit_and_goes_on_below():
     lag = ModelLag(limit=1.25)
-    assert measure(lag, 1.0, 1.2) == pytest.approx(1.2) and not lag.waits
-    for _ in range(20):
-        measure(lag, 1.0, 1.5)
+    assert measure(lag, 1.2) == pytest.approx(1.2) and not lag.waits
+    for _ in range(LOOKS):
+        measure(lag, 1.5)
     assert lag.waits
-    for _ in range(20):
-        measure(lag, 1.0, 1.0)
+    for _ in range(LOOKS):
+        measure(lag, 1.0)
     assert not lag.waits
 
 
-def test_a_single_measurement_counts_a_fifth():
-    lag = ModelLag(limit=None)
-    measure(lag, 1.0, 1.0)
-    assert measure(lag, 1.0, 2.0) == pytest.approx(MEMORY + (1 - MEMORY) * 2.0)
+def test_one_odd_flight_is_no_lag_and_one_good_one_not_its_end():
+    lag = ModelLag(limit=2.0)
+    for ratio in (1.0, 1.0, 1.0, 30.0, 1.0, 1.0):
+        assert measure(lag, ratio) == pytest.approx(1.0) and not lag.waits
+    for _ in range(LOOKS):
+        measure(lag, 3.0)
+    assert measure(lag, 1.0) == pytest.approx(3.0) and lag.waits
+
+
+def test_it_does_not_wait_for_ever_and_again_only_after_the_model_has_caught_up():
+    lag = ModelLag(limit=2.0)
+    waited = [measure(lag, 3.0) and lag.waits for _ in range(2 * PATIENCE)]
+    assert waited == [True] * PATIENCE + [False] * PATIENCE
+    for _ in range(LOOKS):
+        measure(lag, 1.0)
+    for _ in range(LOOKS):
+        measure(lag, 3.0)
+    assert lag.waits
 
 
 def test_the_training_error_is_the_mean_since_the_last_measurement():
@@ -40,16 +54,33 @@ def test_the_training_error_is_the_mean_since_the_last_measurement():
 
 def test_without_a_limit_or_before_any_update_it_never_waits():
     lag = ModelLag(limit=None)
-    assert measure(lag, 1.0, 100.0) == pytest.approx(100.0) and not lag.waits
+    assert measure(lag, 100.0) == pytest.approx(100.0) and not lag.waits
     lag = ModelLag(limit=1.1)
     assert math.isnan(lag.measured(torch.tensor(1.0))) and not lag.waits
 
 
 def test_a_restored_one_goes_on_as_if_it_had_never_stopped():
     lag = ModelLag(limit=1.25)
-    measure(lag, 1.0, 1.5)
+    measure(lag, 1.5)
     lag.trained(torch.tensor(0.5))
     other = ModelLag(limit=1.25)
     other.load_state_dict(lag.state_dict())
-    assert [measure(each, 1.0, 1.1) for each in (lag, other)] == [pytest.approx(lag._fresh / lag._trained)] * 2
-    assert lag.waits == other.waits
+    for ratio in (1.1, 3.0, 1.0, 1.0):
+        assert measure(lag, ratio) == measure(other, ratio)
+        assert (lag.waits, lag.state_dict()) == (other.waits, other.state_dict())
+
+
+def test_one_that_waited_goes_on_where_the_limit_was_taken_away():
+    lag = ModelLag(limit=1.25)
+    measure(lag, 1.5)
+    assert lag.waits
+    other = ModelLag(limit=None)
+    other.load_state_dict(lag.state_dict())
+    assert not other.waits
+
+
+def test_what_an_older_version_saved_is_measured_anew():
+    lag = ModelLag(limit=1.25)
+    lag.load_state_dict({"waits": True, "periods": 7, "sum": 1.0, "count": 2, "trained": 0.5, "held_out": 1.0})
+    assert lag.periods == 7 and not lag.waits
+    assert lag.measured(torch.tensor(1.0)) == pytest.approx(2.0)
