@@ -165,3 +165,14 @@ def test_correlation() -> None:
     # Deviations (−1, 0, 1) and (−1, 1, 0): product 1, norms √2.
     assert correlation(first, torch.tensor([0.0, 2.0, 1.0])).item() == pytest.approx(0.5)
     assert correlation(first, torch.full((3,), 7.0)).item() == 0.0
+
+
+def test_the_world_model_is_measured_as_an_update_measures_it() -> None:
+    learner, batch = make_learner(), make_batch(windows=3)
+    torch.manual_seed(3)
+    measured = world_model_metrics(learner, batch)
+    torch.manual_seed(3)
+    learned = learner.update(batch)
+    assert {"reward_error", "loss_vector", "kl"} <= measured.keys()
+    for name, value in measured.items():
+        assert value.item() == pytest.approx(learned[name].item(), rel=1e-6), name
