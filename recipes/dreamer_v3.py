@@ -58,7 +58,8 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   70 % of training episodes begin in flight on a planned racing line, until the hardest gate is passed; then all come
   to begin at the start, as a race does; a missed gate ends one
   25 actions a second; the actor learns by PPO from what it flew, in the model's latents; in training a critic that
-  sees the simulator's state judges it, and nothing is imagined; averaged weights fly evaluations and exports
+  sees the simulator's state judges it, and nothing is imagined; where the model errs twice as much on new records as in
+  training the actor waits for it; averaged weights fly evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 SUITE_SETTINGS = """settings: tuned=suite, which learn a task from images on a CPU (tuned=none: as model=cpu_small):
   a small DreamerV3 that trains on 128 records for each action, and averaged weights fly evaluations
