@@ -212,6 +212,9 @@ def resolve(config: DictConfig) -> DictConfig:
         print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
     config.model.size = size
     shorten_windows(config, device)
+    if config.loss.drift_scale and not config.replay.context:
+        config.loss.drift_scale = 0.0
+        print("policy's drift: not held, because records keep no latents (replay.context=false)")
     resolve_workers(config)
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:

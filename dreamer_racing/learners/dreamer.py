@@ -32,7 +32,7 @@ from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.cast_weights import cast_once
 from dreamer_racing.modules.few_kernels import save_kernels
 from dreamer_racing.modules.layers import autocast
-from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
 from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.settings import check_settings
 
@@ -272,9 +272,18 @@ class DreamerLearner:
         """Compute all losses and metrics of a batch ``[B, T]`` without a step; losses carry gradient."""
         with timed("world_model"):
             model: TensorDict = self.losses["world_model"](batch)
+            latents: TensorDict = model.pop("replay_context")
+            drift = self._drift(latents, batch) if self.actor_loss.drift_scale else {}
         with timed("imagine"):
-            behavior = self._behavior_losses(model.pop("replay_context"), batch)
-        return {key: value for part in (model, behavior) for key, value in part.items()}
+            behavior = self._behavior_losses(latents, batch)
+        return {key: value for part in (model, drift, behavior) for key, value in part.items()}
+
+    def _drift(self, latents: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Hold the policy at the records of a batch ``[B, T]`` whose latents the next record has stored."""
+        require_keys(self.actor_loss, batch, [CONTEXT])
+        before = join_features(*self.latent_format.unpack(batch[CONTEXT][:, 1:]))
+        after = join_features(latents["belief"][:, :-1], latents["state"][:, :-1])
+        return self.actor_loss.hold(before, after, (~batch["is_init"][:, 1:]).float())
 
     def _behavior_losses(self, context: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
         """Imagine from the latents of a batch, if the actor's loss does, and judge; losses and metrics of both."""

@@ -61,6 +61,7 @@ class ActorLoss(LossModule):
         entropy_scale: Weight of the entropy.
         return_decay: Decay of the moving percentiles.
         continuation: Whether predicted ends of episodes cut returns; if not, imagination goes on for ever.
+        drift_scale: Weight of ``hold``; 0: it is not asked for.
 
     Reads ``belief``, ``state`` and ``terminated`` of the starts, batch ``[N]`` (or any, which is flattened). Writes the
     scalars ``loss_actor``, ``entropy``, ``return_mean``, ``return_scale``, ``imagined_reward``, ``continuation`` (mean
@@ -99,6 +100,7 @@ class ActorLoss(LossModule):
         entropy_scale: float = LossConfig.entropy_scale,
         return_decay: float = LossConfig.return_decay,
         continuation: bool = LossConfig.continuation,
+        drift_scale: float = LossConfig.drift_scale,
     ) -> None:
         super().__init__()
         self.world_model = world_model
@@ -109,6 +111,7 @@ class ActorLoss(LossModule):
         self.lambda_ = lambda_
         self.entropy_scale = scheduled(entropy_scale)
         self.continuation = continuation
+        self.drift_scale = drift_scale
         self.return_normalizer = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - return_decay, min_scale=1.0)
 
     @classmethod
@@ -124,6 +127,7 @@ class ActorLoss(LossModule):
             entropy_scale=config.entropy_scale,
             return_decay=config.return_decay,
             continuation=config.continuation,
+            drift_scale=config.drift_scale,
             **own,
         )
 
@@ -136,6 +140,32 @@ class ActorLoss(LossModule):
             {key: judged.pop(key) for key in ("features", "lambda_return", "weight")}, [self.horizon, len(belief)]
         )
         return TensorDict({"loss_actor": loss, **judged, "imagination": imagination}, [])
+
+    def hold(self, before: Tensor, after: Tensor, weight: Tensor) -> dict[str, Tensor]:
+        """Hold the policy where it was while the world model learns; the actor gets no gradient.
+
+        Latents that move are, to an actor that has become precise, another policy: by a nat and more between two
+        visits of a record (docs/experiments.md, 40). What is minimised is the divergence of the policy at a record's
+        latents as the model makes them now from the policy at those that were stored, so that they may move wherever
+        the actor does not look.
+
+        Args:
+            before: Features of the stored latents, ``(..., F)``.
+            after: Of the model's own, which carry gradient, ``(..., F)``.
+            weight: What a record counts for, ``(..., 1)``.
+
+        Returns:
+            ``loss_drift`` and ``policy_drift``, the divergence, nats, mean over what counts; scalars.
+
+        Reference: Cobbe et al. 2021, "Phasic policy gradient", the cloning term of Eq. 4; there the policy's own
+        network moves, too.
+        """
+        with torch.no_grad():
+            old = self.actor(before)
+        with frozen(self.actor):
+            drift = old.divergence(self.actor(after))
+        drift = (weight * drift).sum() / weight.sum().clamp_min(1.0)
+        return {"loss_drift": self.drift_scale * drift, "policy_drift": drift.detach()}
 
     def prepare(self, starts: int) -> None:
         """Make room for what a loss keeps of an update with so many starts."""

@@ -242,13 +242,7 @@ def clipped_objective(
     loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
     with torch.no_grad():
         reached = parallel.total(batch.weight.sum()).clamp_min(1e-8)
-        diverged = parallel.total((batch.weight * normal_divergence(old, policy)).sum())
+        diverged = parallel.total((batch.weight * old.divergence(policy)).sum())
         kl = diverged / reached  # of what the objective counts, in all processes: it ends the epochs of all
         clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
     return loss, {"ppo/kl": kl, "ppo/clipped": clipped}
-
-
-def normal_divergence(old: ActionDistribution, new: ActionDistribution) -> Tensor:
-    """Return KL(old ‖ new) of independent normals, nats, ``(..., 1)``."""
-    variances = (old.std.square() + (old.mean - new.mean).square()) / (2.0 * new.std.square())
-    return (new.std.log() - old.std.log() + variances - 0.5).sum(-1, keepdim=True)

@@ -74,6 +74,7 @@ class LossConfig:
             the reference decodes all. Less makes an update cheaper.
         privileged_scale: Weight of decoding the privileged state: losses ``informed`` and ``privileged``.
         barlow_scale: Weight of the redundancy reduction: loss ``decoder_free``.
+        drift_scale: Weight of the policy's drift, ``ActorLoss.hold``, of a replay with context; 0 turns it off.
         continuation: Whether predicted ends of episodes cut imagined returns.
         slow_critic_scale: Weight of the regularisation towards the slow critic.
         replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.
@@ -100,6 +101,7 @@ class LossConfig:
     image_share: float = setting(1.0, POSITIVE_SHARE)
     privileged_scale: float = setting(1.0, NOT_NEGATIVE)
     barlow_scale: float = setting(0.05, NOT_NEGATIVE)
+    drift_scale: float = setting(0.0, NOT_NEGATIVE)
     continuation: bool = True
     slow_critic_scale: float = setting(1.0, NOT_NEGATIVE)
     replay_value_scale: float = setting(0.3, NOT_NEGATIVE)

@@ -67,6 +67,11 @@ class ActionDistribution(NamedTuple):
         beyond = torch.special.log_ndtr(torch.where(action < 0, deviation, -deviation))
         return torch.where(action.abs() < 1.0, inside, beyond).sum(-1, keepdim=True)
 
+    def divergence(self, other: ActionDistribution) -> Tensor:
+        """Return KL(self ‖ other), nats, ``(..., 1)``."""
+        variances = (self.std.square() + (self.mean - other.mean).square()) / (2.0 * other.std.square())
+        return (other.std.log() - self.std.log() + variances - 0.5).sum(-1, keepdim=True)
+
     def entropy(self) -> Tensor:
         """Return the differential entropy Σ ln(σ√(2πe)), nats, ``(..., 1)``."""
         return (self.std.log() + (0.5 + _LOG_SQRT_2PI)).sum(-1, keepdim=True)

@@ -111,6 +111,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
         ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
         ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),
+        ("loss.drift_scale", bool(config.replay.context), "replay.context=true, by which records keep their latents"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
         ("schedule.wait_for_model", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),

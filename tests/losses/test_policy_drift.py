@@ -1,0 +1,107 @@
+"""Holding the policy where it was while the world model learns: what counts, who learns from it, and that it holds."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.modules import SIZES
+from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.modules.world_model import join_features
+from tests.dreamers import learner_of
+from tests.learners.test_dreamer import make_batch
+
+NO_DRAWS = replace(SIZES["debug"], sampled=False)
+
+
+def make_learner(**numbers) -> DreamerLearner:
+    """Of latents that are not drawn, and an actor that tells them apart: a fresh one hardly does."""
+    learner = learner_of(NO_DRAWS, seed=0, horizon=3, **numbers)
+    nn.init.normal_(learner.agent.actor.mlp.output.weight, generator=torch.Generator().manual_seed(0))
+    return learner
+
+
+def latents_of(learner: DreamerLearner, batch: TensorDictBase) -> TensorDict:
+    return learner.losses["world_model"](batch)["replay_context"].detach()
+
+
+def stored_by(learner: DreamerLearner) -> TensorDict:
+    """A batch whose context is what the model makes of it now, of the record before, as a collector stores it."""
+    batch = make_batch()
+    batch["is_init"][:, 0] = True  # so that windows begin alike with a context and without
+    seen = latents_of(learner, batch)
+    before = (torch.roll(seen[key], 1, 1) for key in ("belief", "state"))
+    batch[CONTEXT] = learner.latent_format.pack(*before)
+    return batch
+
+
+def drift(learner: DreamerLearner, batch: TensorDictBase) -> Tensor:
+    return learner.compute_losses(batch)["policy_drift"]
+
+
+def test_latents_that_stayed_are_no_drift():
+    learner = make_learner(drift_scale=2.0)
+    losses = learner.compute_losses(stored_by(learner))
+    assert losses["policy_drift"] < 1e-3  # what float16 leaves
+    assert losses["loss_drift"] == 2.0 * losses["policy_drift"]
+
+
+def test_it_is_the_divergence_of_the_two_policies_over_what_counts():
+    loss = make_learner(drift_scale=0.5).actor_loss
+    before, after = torch.randn(2, 3, 48), torch.randn(2, 3, 48)
+    weight = torch.tensor([[[1.0], [0.0], [1.0]], [[1.0], [1.0], [0.0]]])
+    held = loss.hold(before, after, weight)
+    old, new = loss.actor(before), loss.actor(after)
+    divergence = torch.distributions.kl_divergence(torch.distributions.Normal(*old), torch.distributions.Normal(*new))
+    expected = (weight * divergence.sum(-1, keepdim=True)).sum() / 4
+    torch.testing.assert_close(held["policy_drift"], expected.detach())
+    torch.testing.assert_close(held["loss_drift"], 0.5 * expected)
+    assert loss.hold(before, after, torch.zeros_like(weight))["loss_drift"] == 0.0
+
+
+def test_the_model_learns_from_it_and_the_actor_does_not():
+    loss = make_learner(drift_scale=1.0).actor_loss
+    before, after = torch.randn(2, 48, requires_grad=True), torch.randn(2, 48, requires_grad=True)
+    loss.hold(before, after, torch.ones(2, 1))["loss_drift"].backward()
+    assert before.grad is None and after.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in loss.actor.parameters())
+    assert all(parameter.requires_grad for parameter in loss.actor.parameters())
+
+
+def test_what_an_episode_begins_after_is_not_its_own():
+    """The latents that the first record of an episode has stored are not those that its predecessor was seen with."""
+    learner = make_learner(drift_scale=1.0)
+    batch = stored_by(learner)
+    odd = copy.deepcopy(batch)
+    odd[CONTEXT, "belief"][0, 3] = 1.0  # make_batch begins an episode there
+    assert drift(learner, odd) == drift(learner, batch)
+    odd[CONTEXT, "belief"][0, 2] = 1.0
+    assert drift(learner, odd) > 10 * drift(learner, batch)
+
+
+def test_records_without_latents_are_refused():
+    with pytest.raises(KeyError, match=r"ReinforceLoss needs \['context'\]"):
+        make_learner(drift_scale=1.0).update(make_batch())
+    assert "loss_drift" not in make_learner().update(make_batch())
+
+
+@pytest.mark.parametrize("few_kernels", [False, True])
+def test_a_policy_that_is_held_moves_less_while_the_model_learns(few_kernels: bool):
+    """The actor stands still, so what moves its actions on the same records is the model alone."""
+    moved = {}
+    for scale in (0.0, 3.0):
+        learner = make_learner(drift_scale=scale, learning_rate=3e-3, warmup_updates=0, few_kernels=few_kernels)
+        learner.optimizer.param_groups[1]["lr"] = 0.0  # actor and critic
+        batch = stored_by(learner)
+        actor = learner.agent.actor
+        with torch.no_grad():
+            before = actor(join_features(*latents_of(learner, batch).values()))
+        for _ in range(20):
+            learner.update(batch)
+        with torch.no_grad():
+            moved[scale] = before.divergence(actor(join_features(*latents_of(learner, batch).values()))).mean()
+    assert moved[3.0] < 0.2 * moved[0.0]
