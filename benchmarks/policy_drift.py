@@ -1,0 +1,85 @@
+"""How far the world model's learning moves a policy whose actor stands still, on a run's own replay.
+
+    OMP_NUM_THREADS=1 python benchmarks/policy_drift.py runs/kidney --json policy_drift.json
+
+Each record of the replay has the latents that the model had for the one before it when that was last trained on, or
+flown. The divergence of the actor's policy at them from its policy at what the model makes of the same record now,
+nats: mean and quantiles over records of batches drawn as the run draws them, those of the newest
+(`replay.recent_share`) and the others apart. The trained weights are measured. The checkpoint must hold a replay with
+context, so no best/.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from learning_signal import restore, restore_replay
+from measuring import print_table, write_json
+
+sys.path.append(str(Path(__file__).parents[1] / "recipes"))
+
+from composing.saved import trained_config
+from composing.schema import DreamerConfig
+
+from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+
+BATCHES = 12
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
+COLUMNS = ["env_steps", "of", "records", "mean", *(f"q{100 * share:.0f}" for share in QUANTILES)]
+
+
+def main() -> None:
+    """Measure every checkpoint."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    records = [record for path in arguments.checkpoints for record in measure(latest_checkpoint(path))]
+    print_table(records, COLUMNS)
+    write_json(records, arguments.json)
+
+
+@torch.no_grad()
+def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
+    """Yield a record for the newest records and one for the others.
+
+    Raises:
+        ValueError: the checkpoint is of another algorithm, or its replay keeps no latents.
+    """
+    config = trained_config(RunDirectory.of(checkpoint).path)
+    if not isinstance(config, DreamerConfig):
+        raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
+    if not config.replay.context:
+        raise ValueError(f"{checkpoint}: its records keep no latents; those of replay.context=true do.")
+    config.device, config.replay.device = "cpu", "auto"  # wherever it was trained
+    learner, counters = restore(config, checkpoint)
+    replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
+    torch.manual_seed(0)
+    moved, recent = [], []
+    for _ in range(BATCHES):
+        batch = replay.sample()
+        seen = learner.losses["world_model"](batch)["replay_context"]
+        before = learner.agent.actor(join_features(*learner.latent_format.unpack(batch[CONTEXT][:, 1:])))
+        after = learner.agent.actor(join_features(seen["belief"][:, :-1], seen["state"][:, :-1]))
+        same = ~batch["is_init"][:, 1:, 0]
+        moved.append(before.divergence(after).squeeze(-1)[same])
+        recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])
+    divergence, newest = torch.cat(moved), torch.cat(recent)
+    for name, chosen in (("newest", newest), ("others", ~newest)):
+        values = divergence[chosen]
+        if len(values):
+            quantiles = values.quantile(torch.tensor(QUANTILES)).tolist()
+            yield {
+                "benchmark": "policy_drift", "track": config.track, **counters, "of": name, "records": len(values),
+                "drift_scale": config.loss.drift_scale, "mean": values.mean().item(),
+                **dict(zip(COLUMNS[4:], quantiles, strict=True)),
+            }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
