@@ -182,10 +182,17 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
     assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("asymmetric_ppo", False, True)
     assert (tuned.env.start_at_gate, tuned.schedule.start_on_line.to) == (0, 0)
-    assert tuned.schedule.wait_for_model == 2
+    assert (tuned.schedule.wait_for_model, tuned.loss.drift_scale) == (2, 1)
     assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
+
+
+def test_a_policy_is_not_held_where_records_keep_no_latents(capsys: pytest.CaptureFixture[str]) -> None:
+    for context, scale in (("true", 1), ("false", 0)):
+        config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", f"replay.context={context}"))
+        assert config.loss.drift_scale == scale
+        assert ("policy's drift: not held, because records keep no latents" in capsys.readouterr().out) == (not scale)
 
 
 def test_what_races_goes_with_a_state_space_model() -> None:
