@@ -4,9 +4,9 @@
 
 Each record of the replay has the latents that the model had for the one before it when that was last trained on, or
 flown. The divergence of the actor's policy at them from its policy at what the model makes of the same record now,
-nats: mean and quantiles over records of batches drawn as the run draws them, those of the newest
-(`replay.recent_share`) and the others apart. The trained weights are measured. The checkpoint must hold a replay with
-context, so no best/.
+nats: mean and quantiles over records of batches drawn as the run draws them; apart for windows drawn from the newest
+records (`replay.recent_share`) and for those drawn from all, which the model has mostly not seen for long. The trained
+weights are measured. The checkpoint must hold a replay with context, so no best/.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 BATCHES = 12
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
-COLUMNS = ["env_steps", "of", "records", "mean", *(f"q{100 * share:.0f}" for share in QUANTILES)]
+COLUMNS = ["run", "env_steps", "of", "records", "mean", *(f"q{100 * share:.0f}" for share in QUANTILES)]
 
 
 def main() -> None:
@@ -46,12 +46,13 @@ def main() -> None:
 
 @torch.no_grad()
 def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
-    """Yield a record for the newest records and one for the others.
+    """Yield a record for windows of the newest records and one for those of all.
 
     Raises:
         ValueError: the checkpoint is of another algorithm, or its replay keeps no latents.
     """
-    config = trained_config(RunDirectory.of(checkpoint).path)
+    run = RunDirectory.of(checkpoint)
+    config = trained_config(run.path)
     if not isinstance(config, DreamerConfig):
         raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
     if not config.replay.context:
@@ -70,14 +71,14 @@ def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
         moved.append(before.divergence(after).squeeze(-1)[same])
         recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])
     divergence, newest = torch.cat(moved), torch.cat(recent)
-    for name, chosen in (("newest", newest), ("others", ~newest)):
+    for name, chosen in (("newest", newest), ("all", ~newest)):
         values = divergence[chosen]
         if len(values):
             quantiles = values.quantile(torch.tensor(QUANTILES)).tolist()
             yield {
-                "benchmark": "policy_drift", "track": config.track, **counters, "of": name, "records": len(values),
-                "drift_scale": config.loss.drift_scale, "mean": values.mean().item(),
-                **dict(zip(COLUMNS[4:], quantiles, strict=True)),
+                "benchmark": "policy_drift", "run": run.path.name, "track": config.track, "seed": config.seed,
+                **counters, "of": name, "records": len(values), "mean": values.mean().item(),
+                **dict(zip(COLUMNS[5:], quantiles, strict=True)),
             }  # fmt: skip
 
 

@@ -59,7 +59,8 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   to begin at the start, as a race does; a missed gate ends one
   25 actions a second; the actor learns by PPO from what it flew, in the model's latents; in training a critic that
   sees the simulator's state judges it, and nothing is imagined; where the model errs twice as much on new records as in
-  training the actor waits for it; averaged weights fly evaluations and exports
+  training the actor waits for it, and what the model learns leaves the policy where it was; averaged weights fly
+  evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 SUITE_SETTINGS = """settings: tuned=suite, which learn a task from images on a CPU (tuned=none: as model=cpu_small):
   a small DreamerV3 that trains on 128 records for each action, and averaged weights fly evaluations
@@ -212,9 +213,7 @@ def resolve(config: DictConfig) -> DictConfig:
         print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
     config.model.size = size
     shorten_windows(config, device)
-    if config.loss.drift_scale and not config.replay.context:
-        config.loss.drift_scale = 0.0
-        print("policy's drift: not held, because records keep no latents (replay.context=false)")
+    let_drift(config)
     resolve_workers(config)
     numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
     for name in config.model:
@@ -255,6 +254,17 @@ def shorten_windows(config: DictConfig, device: Device) -> None:
         print(f"batch: {config.model.batch_size} windows of {SHORT_WINDOW} records that begin warm, on a CUDA device")
     if config.replay.context is None:
         config.replay.context = shortened
+
+
+def let_drift(config: DictConfig) -> None:
+    """Hold the policy nowhere where no latents are kept to hold it at, or where they differ by their draw already."""
+    reasons = {
+        "records keep no latents (replay.context=false)": not config.replay.context,
+        "latents are drawn (model.sampled=true)": config.model.sampled,
+    }
+    if config.loss.drift_scale and any(reasons.values()):
+        config.loss.drift_scale = 0.0
+        print(f"policy's drift: not held, because {' and '.join(name for name, holds in reasons.items() if holds)}")
 
 
 def captures(config: DictConfig, device: Device) -> bool:

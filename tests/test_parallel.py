@@ -22,6 +22,7 @@ from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.losses import ActorPPOConfig, LossConfig, make_losses
 from dreamer_racing.modules import Agent, Interface, get_size
 from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
 from tests.learners.test_dreamer import make_batch
@@ -31,7 +32,7 @@ SEES = Interface(privileged_dim=5)
 WINDOWS, LENGTH = 4, 6  # of the joint batch
 WORLDS, STEPS = 4, 8  # of the joint rollout
 PPO = ActorPPOConfig(flown=WORLDS * STEPS, epochs=3, minibatch=2 * WORLDS, kl_stop=1e9)
-ASYMMETRIC = LossConfig(actor="asymmetric_ppo", world_model="privileged", ppo=PPO)
+ASYMMETRIC = LossConfig(actor="asymmetric_ppo", world_model="privileged", ppo=PPO, drift_scale=1.0)
 
 
 def share_of_ppo(ppo: ActorPPOConfig) -> ActorPPOConfig:
@@ -65,6 +66,9 @@ def joint_batch(seed: int) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
     batch = make_batch(WINDOWS, LENGTH)
     batch["reward"] += torch.randn(batch["reward"].shape, generator=generator)
+    widths = [SIZE.belief, SIZE.state]
+    latents = torch.rand(WINDOWS, LENGTH, sum(widths), generator=generator).split(widths, -1)
+    batch["context"] = LatentFormat(SIZE.belief, SIZE.latents, SIZE.classes, sampled=False).pack(*latents)
     return batch.set(("privileged", "vector"), torch.randn(WINDOWS, LENGTH, 5, generator=generator))
 
 

@@ -126,7 +126,8 @@ class DreamerLearner:
 
         Args:
             batch: Replay records, batch size ``[B, T]``: what the encoder sees, ``previous_action``, ``reward``,
-                ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``.
+                ``is_init``, ``terminated``, ``truncated``; scalars ``(B, T, 1)``; and ``context``, from whose first
+                record windows go on where it is there, and which ``drift_scale`` needs.
             timed: Context manager by activity (``world_model``, ``imagine``, of actor and critic whether they imagine
                 or not, ``optimise``), to measure the time spent in each; tells them apart only on a CPU.
 
@@ -280,7 +281,11 @@ class DreamerLearner:
 
     def _drift(self, latents: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
         """Hold the policy at the records of a batch ``[B, T]`` whose latents the next record has stored."""
-        require_keys(self.actor_loss, batch, [CONTEXT])
+        if batch.get(CONTEXT, None) is None:
+            raise KeyError(
+                f"drift_scale={self.actor_loss.drift_scale:g} holds the policy at the latents that records keep, and "
+                f"the batch has no {CONTEXT!r}: replay with them (replay.context=true), or set drift_scale=0."
+            )
         before = join_features(*self.latent_format.unpack(batch[CONTEXT][:, 1:]))
         after = join_features(latents["belief"][:, :-1], latents["state"][:, :-1])
         return self.actor_loss.hold(before, after, (~batch["is_init"][:, 1:]).float())

@@ -147,7 +147,7 @@ class ActorLoss(LossModule):
         Latents that move are, to an actor that has become precise, another policy: by a nat and more between two
         visits of a record (docs/experiments.md, 40). What is minimised is the divergence of the policy at a record's
         latents as the model makes them now from the policy at those that were stored, so that they may move wherever
-        the actor does not look.
+        the actor does not look. Latents that are drawn differ by the draw already: it is for those that are not.
 
         Args:
             before: Features of the stored latents, ``(..., F)``.
@@ -155,7 +155,8 @@ class ActorLoss(LossModule):
             weight: What a record counts for, ``(..., 1)``.
 
         Returns:
-            ``loss_drift`` and ``policy_drift``, the divergence, nats, mean over what counts; scalars.
+            ``policy_drift``, the divergence, nats, weighted mean over all records as every loss is, so that several
+            processes average to the joint batch's; ``loss_drift``, that by ``drift_scale``; scalars.
 
         Reference: Cobbe et al. 2021, "Phasic policy gradient", the cloning term of Eq. 4; there the policy's own
         network moves, too.
@@ -164,7 +165,7 @@ class ActorLoss(LossModule):
             old = self.actor(before)
         with frozen(self.actor):
             drift = old.divergence(self.actor(after))
-        drift = (weight * drift).sum() / weight.sum().clamp_min(1.0)
+        drift = (weight * drift).mean()
         return {"loss_drift": self.drift_scale * drift, "policy_drift": drift.detach()}
 
     def prepare(self, starts: int) -> None:

@@ -74,7 +74,8 @@ class LossConfig:
             the reference decodes all. Less makes an update cheaper.
         privileged_scale: Weight of decoding the privileged state: losses ``informed`` and ``privileged``.
         barlow_scale: Weight of the redundancy reduction: loss ``decoder_free``.
-        drift_scale: Weight of the policy's drift, ``ActorLoss.hold``, of a replay with context; 0 turns it off.
+        drift_scale: Weight of the policy's drift, ``ActorLoss.hold``, where a replay keeps latents that are not drawn
+            (``replay.context=true``, ``model.sampled=false``); 0 turns it off.
         continuation: Whether predicted ends of episodes cut imagined returns.
         slow_critic_scale: Weight of the regularisation towards the slow critic.
         replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.

@@ -98,6 +98,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     actor, model = find_loss(ActorLoss, config.loss.actor), find_loss(WorldModelLoss, config.loss.world_model)
     images = _is(model, ReconstructionLoss) and config.env.from_pixels
     waits = config.schedule.wait_for_model is not None and _is(actor, ClippedActorLoss)
+    drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
@@ -111,7 +112,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
         ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
         ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),
-        ("loss.drift_scale", bool(config.replay.context), "replay.context=true, by which records keep their latents"),
+        ("loss.drift_scale", drift, "records that keep latents, replay.context=true, as they are, model.sampled=false"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
         ("schedule.wait_for_model", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),

@@ -97,9 +97,8 @@ def test_no_update_waits_for_the_device(
     monkeypatch: pytest.MonkeyPatch, world_model: str, actor: str, mixed_precision: bool
 ) -> None:
     monkeypatch.setattr(clipped_actor, "masks_steps", lambda device: True)
-    learner = learner_of(
-        "debug", INTERFACE, seed=0, horizon=3, world_model=world_model, actor=actor, mixed_precision=mixed_precision
-    )
+    kinds = {"world_model": world_model, "actor": actor, "drift_scale": 1.0, "mixed_precision": mixed_precision}
+    learner = learner_of("debug", INTERFACE, seed=0, horizon=3, **kinds)
     batch = with_context(records(), learner)
     learner.update(batch)  # optimisers make their moments
     seen = launches(captured(learner, batch))
@@ -122,7 +121,8 @@ def test_no_size_waits_for_the_device(size: str, options: dict[str, object]) -> 
 def test_no_update_makes_tensors_on_another_device(world_model: str, actor: str) -> None:
     """On the meta device, which holds nothing: what is on the CPU beside it would be beside CUDA, too."""
     with torch.device("cpu"):  # the default of what forgets to say where
-        learner = learner_of("debug", INTERFACE, device="meta", horizon=3, world_model=world_model, actor=actor)
+        kinds = {"world_model": world_model, "actor": actor, "drift_scale": 1.0}
+        learner = learner_of("debug", INTERFACE, device="meta", horizon=3, **kinds)
         batch = with_context(records("meta"), learner)
         seen = launches(captured(learner, batch))
     assert seen.count > 100 and seen.mixed == []

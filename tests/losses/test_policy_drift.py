@@ -57,7 +57,7 @@ def test_it_is_the_divergence_of_the_two_policies_over_what_counts():
     held = loss.hold(before, after, weight)
     old, new = loss.actor(before), loss.actor(after)
     divergence = torch.distributions.kl_divergence(torch.distributions.Normal(*old), torch.distributions.Normal(*new))
-    expected = (weight * divergence.sum(-1, keepdim=True)).sum() / 4
+    expected = (weight * divergence.sum(-1, keepdim=True)).sum() / 6  # of all records, as other losses
     torch.testing.assert_close(held["policy_drift"], expected.detach())
     torch.testing.assert_close(held["loss_drift"], 0.5 * expected)
     assert loss.hold(before, after, torch.zeros_like(weight))["loss_drift"] == 0.0
@@ -72,6 +72,15 @@ def test_the_model_learns_from_it_and_the_actor_does_not():
     assert all(parameter.requires_grad for parameter in loss.actor.parameters())
 
 
+def test_the_actor_of_an_update_learns_as_without_it():
+    gradients = {}
+    for scale in (0.0, 5.0):
+        learner = make_learner(drift_scale=scale)
+        learner._backward(stored_by(learner))
+        gradients[scale] = [parameter.grad.clone() for parameter in learner.agent.actor.parameters()]
+    assert all(map(torch.equal, gradients[0.0], gradients[5.0])) and any(gradient.any() for gradient in gradients[0.0])
+
+
 def test_what_an_episode_begins_after_is_not_its_own():
     """The latents that the first record of an episode has stored are not those that its predecessor was seen with."""
     learner = make_learner(drift_scale=1.0)
@@ -84,7 +93,9 @@ def test_what_an_episode_begins_after_is_not_its_own():
 
 
 def test_records_without_latents_are_refused():
-    with pytest.raises(KeyError, match=r"ReinforceLoss needs \['context'\]"):
+    with pytest.raises(
+        KeyError, match=r"drift_scale=1 .* no 'context': replay with them \(replay.context=true\), or set"
+    ):
         make_learner(drift_scale=1.0).update(make_batch())
     assert "loss_drift" not in make_learner().update(make_batch())
 

@@ -188,11 +188,21 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
-def test_a_policy_is_not_held_where_records_keep_no_latents(capsys: pytest.CaptureFixture[str]) -> None:
-    for context, scale in (("true", 1), ("false", 0)):
-        config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", f"replay.context={context}"))
-        assert config.loss.drift_scale == scale
-        assert ("policy's drift: not held, because records keep no latents" in capsys.readouterr().out) == (not scale)
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("replay.context=true", None),
+        ("replay.context=false", "records keep no latents (replay.context=false)"),
+        ("model.sampled=true", "latents are drawn (model.sampled=true)"),
+    ],
+)
+def test_a_policy_is_held_only_at_latents_that_are_kept_as_they_are(
+    capsys: pytest.CaptureFixture[str], override: str, reason: str | None
+) -> None:
+    config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
+    assert config.loss.drift_scale == (1 if reason is None else 0)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("policy's drift: ")]
+    assert lines == ([] if reason is None else [f"policy's drift: not held, because {reason}"])
 
 
 def test_what_races_goes_with_a_state_space_model() -> None:

@@ -167,10 +167,8 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["env.from_pixels=false", "loss.image_share=0.5"], "is for loss=reconstruction or informed, from images"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
         (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
-        (
-            ["loss.drift_scale=1"],
-            "loss.drift_scale=1.* is for replay.context=true, by which records keep their latents",
-        ),
+        (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for .*, as they are, model.sampled=false"),
+        (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for records that keep latents, replay.con"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
         (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=ppo, flown_ppo or asymmetric_ppo"),
