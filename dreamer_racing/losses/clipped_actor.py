@@ -132,14 +132,21 @@ class ClippedActorLoss(ActorLoss):
         return metrics
 
     def _make_epochs(self, records: Minibatch) -> dict[str, Tensor]:
-        """Make epochs of gradient steps, until one comes upon too large a divergence."""
+        """Make epochs of gradient steps, until one comes upon too large a divergence.
+
+        It is that from the policy as it is now: from the one that sampled, a bound of the deviation that has come down
+        since would count as if the steps had done it, and end them (docs/experiments.md, 40).
+        """
+        with torch.no_grad():
+            before = torch.cat(self.actor(records.features), -1)  # (M, 2·A)
         number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
         going = records.features.new_ones((), dtype=torch.bool)
         done, made = list[dict[str, Tensor]](), list[Tensor]()
         for _ in range(self.ppo.epochs):
             order = torch.randperm(number, device=records.features.device)
             for chosen in order.split(size):
-                metrics = self._minibatch(Minibatch(*(value[chosen] for value in records)), going)
+                batch = Minibatch(*(value[chosen] for value in records))
+                metrics = self._minibatch(batch, before[chosen], going)
                 done.append(metrics)
                 made.append(going)
                 going = going & (metrics["ppo/kl"] <= self.ppo.kl_stop)
@@ -169,10 +176,14 @@ class ClippedActorLoss(ActorLoss):
         pace = torch.where(kl < target / KL_TOLERANCE, faster, self.pace)
         self.pace.copy_(torch.where(kl <= KL_TOLERANCE * target, pace, slower))  # the latter also where it is no number
 
-    def _minibatch(self, batch: Minibatch, going: Tensor) -> dict[str, Tensor]:
-        """Make one gradient step if ``going``, bool, a scalar; the divergence is that from before it."""
+    def _minibatch(self, batch: Minibatch, before: Tensor, going: Tensor) -> dict[str, Tensor]:
+        """Make one gradient step if ``going``, bool, a scalar.
+
+        Its divergence is that of the policy ahead of the step from the one ``before`` the improvement, ``(M, 2·A)``.
+        """
         policy = self.actor(batch.features)
-        loss, metrics = clipped_objective(policy, batch, self.ppo.clip_epsilon, self.entropy_scale, self.log_prob)
+        numbers = self.ppo.clip_epsilon, self.entropy_scale, self.log_prob
+        loss, metrics = clipped_objective(policy, batch, *numbers, ActionDistribution(*before.chunk(2, -1)))
         norm = self._descend(loss, self.actor, going)
         return {"ppo/loss": loss.detach(), **metrics, "gradient_norm/actor": norm}
 
@@ -223,6 +234,7 @@ def clipped_objective(
     clip_epsilon: float,
     entropy_scale: float | Tensor,
     log_prob: LogProb = ActionDistribution.log_prob,
+    before: ActionDistribution | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Compute PPO's loss on a minibatch, a scalar, and what to watch: ``ppo/kl`` and ``ppo/clipped``.
 
@@ -232,6 +244,7 @@ def clipped_objective(
         clip_epsilon: ε.
         entropy_scale: Weight of the entropy.
         log_prob: Of an action as the minibatch has it.
+        before: Policy that ``ppo/kl`` is the divergence from; None: the one that sampled.
 
     Reference: Schulman et al. 2017, Eq. 7.
     """
@@ -242,7 +255,7 @@ def clipped_objective(
     loss = -(batch.weight * (gain + entropy_scale * policy.entropy())).mean()
     with torch.no_grad():
         reached = parallel.total(batch.weight.sum()).clamp_min(1e-8)
-        diverged = parallel.total((batch.weight * old.divergence(policy)).sum())
+        diverged = parallel.total((batch.weight * (old if before is None else before).divergence(policy)).sum())
         kl = diverged / reached  # of what the objective counts, in all processes: it ends the epochs of all
         clipped = ((ratio - 1.0).abs() > clip_epsilon).float().mean()
     return loss, {"ppo/kl": kl, "ppo/clipped": clipped}

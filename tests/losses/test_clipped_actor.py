@@ -14,6 +14,7 @@ from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses import clipped_actor
 from dreamer_racing.losses.clipped_actor import ClippedActorLoss
+from dreamer_racing.modules.actor import ActionDistribution
 from tests.losses import test_asymmetric_ppo_actor as asymmetric
 from tests.losses.test_flown_ppo_actor import PPO, N, T
 
@@ -111,3 +112,16 @@ def test_a_checkpoint_goes_on_with_masks_or_without(monkeypatch: pytest.MonkeyPa
     back, _ = make_pair(monkeypatch)
     back.load_state_dict(copy.deepcopy(masked.state_dict()))
     assert [group["fused"] for group in back.losses["actor"].optimizer.param_groups] == [None, None]
+
+
+def test_a_bound_that_came_down_since_the_flight_is_no_divergence_of_the_steps() -> None:
+    learner = asymmetric.make_learner(ppo=replace(PPO, kl_stop=0.05, kl_target=0.05, learning_rate=1e-5))
+    loss = learner.losses["actor"]
+    for _ in range(2):
+        learner.watch(asymmetric.make_rollout(learner))
+    learner.adjust(max_std=0.2)
+    flown = ActionDistribution(*loss.old.flatten(0, 1).chunk(2, -1))
+    with torch.no_grad():
+        assert flown.divergence(loss.actor(loss.features.flatten(0, 1))).mean() > 1.0
+    metrics = loss.improve(1)
+    assert metrics["ppo/epochs"] == PPO.epochs and metrics["ppo/kl"] < 0.05
