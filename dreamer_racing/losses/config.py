@@ -26,8 +26,9 @@ class ActorPPOConfig:
         minibatch: M, steps of a gradient step.
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
         advantage_clip: Largest normalised advantage.
-        kl_stop: Divergence KL(old ‖ new), nats, beyond which the remaining minibatches are left out.
-        kl_target: Divergence before an improvement's last gradient step, nats, to which the learning rate is steered:
+        kl_stop: Divergence KL(before ‖ now) of what the improvement's own steps did, nats, beyond which the remaining
+            minibatches are left out.
+        kl_target: The same before an improvement's last gradient step, nats, to which the learning rate is steered:
             1.5 times more, and the next improvement is made at a lower one, 1.5 times less, and at a higher one; None:
             it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
         learning_rate: Of Adam; the largest, where there is a ``kl_target``.
