@@ -24,8 +24,6 @@ sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
-from dreamer_racing.modules.stored_latents import CONTEXT
-from dreamer_racing.modules.world_model import join_features
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 BATCHES = 12
@@ -65,14 +63,13 @@ def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
     for _ in range(BATCHES):
         batch = replay.sample()
         seen = learner.losses["world_model"](batch)["replay_context"]
-        before = learner.agent.actor(join_features(*learner.latent_format.unpack(batch[CONTEXT][:, 1:])))
-        after = learner.agent.actor(join_features(seen["belief"][:, :-1], seen["state"][:, :-1]))
-        same = ~batch["is_init"][:, 1:, 0]
-        moved.append(before.divergence(after).squeeze(-1)[same])
+        before, after, same = learner.then_and_now(seen, batch)
+        divergence, same = learner.agent.actor(before).divergence(learner.agent.actor(after)), same.squeeze(-1)
+        moved.append(divergence.squeeze(-1)[same])
         recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])
-    divergence, newest = torch.cat(moved), torch.cat(recent)
+    of_all, newest = torch.cat(moved), torch.cat(recent)
     for name, chosen in (("newest", newest), ("all", ~newest)):
-        values = divergence[chosen]
+        values = of_all[chosen]
         if len(values):
             quantiles = values.quantile(torch.tensor(QUANTILES)).tolist()
             yield {

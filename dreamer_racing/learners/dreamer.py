@@ -286,9 +286,23 @@ class DreamerLearner:
                 f"drift_scale={self.actor_loss.drift_scale:g} holds the policy at the latents that records keep, and "
                 f"the batch has no {CONTEXT!r}: replay with them (replay.context=true), or set drift_scale=0."
             )
+        before, after, same = self.then_and_now(latents, batch)
+        return self.actor_loss.hold(before, after, same.float())
+
+    def then_and_now(self, latents: TensorDictBase, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return features of records as they were stored and as the model makes them now.
+
+        Args:
+            latents: Belief and state of a batch's records now, ``[B, T]``.
+            batch: The records ``[B, T]``, with ``context``: each has the latents of the one before it.
+
+        Returns:
+            Both of all but the last record, ``(B, T - 1, F)``, and whether they are of the same one, bool
+            ``(B, T - 1, 1)``: what the first record of an episode has stored is not of the one before it.
+        """
         before = join_features(*self.latent_format.unpack(batch[CONTEXT][:, 1:]))
         after = join_features(latents["belief"][:, :-1], latents["state"][:, :-1])
-        return self.actor_loss.hold(before, after, (~batch["is_init"][:, 1:]).float())
+        return before, after, ~batch["is_init"][:, 1:]
 
     def _behavior_losses(self, context: TensorDictBase, batch: TensorDictBase) -> dict[str, Tensor]:
         """Imagine from the latents of a batch, if the actor's loss does, and judge; losses and metrics of both."""
