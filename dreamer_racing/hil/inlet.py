@@ -44,6 +44,8 @@ class Inlet(Protocol):
 class UdpInlet:
     """Listens on a UDP port; pieces are datagrams, with the time at which the kernel received them.
 
+    Linux begins to note it a few ms after the machine's first socket asked; until then it says when they are read.
+
     Args:
         port: To listen on; 0 for a free one.
         host: Address to listen on; other machines reach it only if this says so.

@@ -100,7 +100,7 @@ def test_a_hundred_thousand_hostile_packets_are_ignored():
     assert not any(decode_pose(row.tobytes()) for row in damaged)
 
 
-def test_packets_carry_the_time_of_their_arrival(poses, sender):
+def test_packets_carry_the_time_of_their_arrival(poses, sender, kernel_stamps):
     before = time.monotonic()
     sender.sendto(encode_pose(packet(1)), poses.address)
     sender.sendto(b"nonsense", poses.address)
@@ -115,7 +115,7 @@ def test_packets_carry_the_time_of_their_arrival(poses, sender):
 
 
 @pytest.mark.parametrize("step", [-3600.0, -0.02, 0.02, 0.5, 3600.0])
-def test_a_wall_clock_that_is_set_does_not_move_arrivals(poses, sender, monkeypatch, step):
+def test_a_wall_clock_that_is_set_does_not_move_arrivals(poses, sender, kernel_stamps, monkeypatch, step):
     """What waits was stamped by the clock of before, what comes later by the one of after."""
     assert poses.poll() == []
     real = time.time

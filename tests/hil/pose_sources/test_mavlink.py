@@ -210,7 +210,7 @@ def test_an_autopilot_may_begin_anew_after_a_silence(listening):
     assert [clock.read(packet) is not None for packet in received] == [True] * 3
 
 
-def test_arrival_is_the_kernels_time(listening):
+def test_arrival_is_the_kernels_time(listening, kernel_stamps):
     one = listening()
     before = time.monotonic()
     one._socket.sendto(pack(odometry()), one.inlet.address)
