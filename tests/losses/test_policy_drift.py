@@ -7,13 +7,17 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import InitTracker, TransformedEnv
 
+from dreamer_racing.experience.records import records_from_rollout
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.modules import SIZES
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import join_features
 from tests.dreamers import learner_of
 from tests.learners.test_dreamer import make_batch
+from tests.modules.test_policy import NoiseEnv
 
 NO_DRAWS = replace(SIZES["debug"], sampled=False)
 
@@ -48,6 +52,25 @@ def test_latents_that_stayed_are_no_drift():
     losses = learner.compute_losses(stored_by(learner))
     assert losses["policy_drift"] < 1e-3  # what float16 leaves
     assert losses["loss_drift"] == 2.0 * losses["policy_drift"]
+
+
+def test_what_was_just_flown_has_not_drifted():
+    """At every record of every window, whether it goes on from latents or begins an episode; and windows do both."""
+    learner = make_learner(drift_scale=1.0)
+    policy = learner.policy()
+    env = TransformedEnv(NoiseEnv(), InitTracker())
+    env.append_transform(policy.make_primer())
+    collector = Collector(env, policy, frames_per_batch=36, total_frames=36)
+    records = records_from_rollout(next(iter(collector)), reward_keys=("reward",), latents=learner.latent_format)
+    collector.shutdown()
+    for stream in range(3):
+        own = records[records["stream"] == stream]
+        own = own[own["order"].argsort()]
+        for start in range(len(own) - 1):
+            window = own[start:].unsqueeze(0)
+            before, after, same = learner.then_and_now(latents_of(learner, window), window)
+            assert same.any() or start == len(own) - 2
+            torch.testing.assert_close(before[same.squeeze(-1)], after[same.squeeze(-1)], atol=2e-3, rtol=0)
 
 
 def test_it_is_the_divergence_of_the_two_policies_over_what_counts():
