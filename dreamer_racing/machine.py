@@ -186,3 +186,12 @@ def _cpu() -> str:
 def available_cpus() -> int:
     """CPUs this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def usable_threads() -> int:
+    """Threads that work at once where nobody says how many: one for each CPU, or ``OMP_NUM_THREADS``, if fewer.
+
+    So that what holds for torch holds for physics and rendering, and two trainings can share a machine.
+    """
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # "4,2": 4 outside, 2 within each
+    return min(available_cpus(), int(asked)) if asked.isdecimal() and int(asked) else available_cpus()

@@ -20,6 +20,7 @@ from dreamer_racing.machine import (
     check_space,
     keep_freed_memory,
     out_of_memory_advice,
+    usable_threads,
 )
 
 
@@ -99,3 +100,16 @@ print(kept.trim(), largest - resident_memory() > 70_000_000, kept.trim(), torch.
 def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: object())
     assert not keep_freed_memory() and not KeptMemory(growth=-1).trim()
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"), [(None, 4), ("", 4), ("1", 1), ("3,2", 3), ("16", 4), ("0", 4), ("-1", 4), ("many", 4)]
+)
+def test_physics_and_rendering_take_as_many_threads_as_torch_is_given(
+    asked: str | None, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "available_cpus", lambda: 4)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if asked is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", asked)
+    assert usable_threads() == expected

@@ -15,7 +15,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.machine import available_cpus
+from dreamer_racing.machine import usable_threads
 
 _batches: weakref.WeakSet[Batch] = weakref.WeakSet()
 
@@ -42,7 +42,7 @@ class MujocoSimulator(Simulator):
         num_envs: N worlds.
         camera: the nose camera.
         renderer: as `make_renderer` takes it, or None for no images.
-        num_threads: physics and rendering threads; the CPUs of this process if None.
+        num_threads: physics and rendering threads; `usable_threads` if None.
         generator: source of the randomisation of physics and looks.
         looks: how far looks vary; None for the same in every episode.
 
@@ -66,7 +66,7 @@ class MujocoSimulator(Simulator):
     ) -> None:
         if num_threads is not None and num_threads < 1:
             raise ValueError(f"num_threads={num_threads}: must be at least 1.")
-        num_threads = min(num_threads or available_cpus(), num_envs)
+        num_threads = min(num_threads or usable_threads(), num_envs)
         model = build_drone(parameters).compile()
         # a broken state must be seen and ended by the race, not hidden by an automatic reset
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
