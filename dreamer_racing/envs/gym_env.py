@@ -35,6 +35,7 @@ from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions
+from dreamer_racing.settings import FINITE, check_setting
 
 OBSERVATIONS = ("pixels", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
@@ -107,6 +108,8 @@ class GymWorlds:
             raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
+        if body_rate_weight is not None:
+            check_setting("body_rate_weight", body_rate_weight, FINITE)
         device = worlds.get("device", "cpu")
         if str(device).partition(":")[0] == "cuda":  # others are for the worlds to refuse
             raise ValueError(

@@ -1,9 +1,11 @@
 """The Gymnasium environments: the checker's verdict, seeds, and the same race as everywhere else."""
 
+import math
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -129,6 +131,13 @@ def test_body_rate_weight_follows_the_reward_weights_unless_given() -> None:
     assert DroneRaceGymEnv(observation="state").race.body_rate_weight == RewardWeights().body_rate
     assert DroneRaceGymEnv(observation="state", weights=weights).race.body_rate_weight == 0.5
     assert DroneRaceGymEnv(observation="state", weights=weights, body_rate_weight=0.0).race.body_rate_weight == 0.0
+
+
+@pytest.mark.parametrize("weight", [math.nan, math.inf, "0.01"])
+def test_a_body_rate_weight_that_is_no_finite_number_is_refused(weight) -> None:
+    for make_one in (DroneRaceGymEnv, partial(make_vec, 2)):
+        with pytest.raises(ValueError, match=r"body_rate_weight='?\S+'?: must be .*finite"):
+            make_one(observation="state", body_rate_weight=weight)
 
 
 def test_time_limit_truncates() -> None:
