@@ -163,8 +163,8 @@ def fly(place: str, config: DashboardConfig) -> Source:
     """Fly the deterministic policy of an agent once, as recipes/fly.py does."""
     restored = restore(EvaluateConfig(checkpoint=place, renderer=config.renderer, seed=config.seed))
     worlds = worlds_of(restored.trained) | {"seed": config.seed}
-    policy, judge = restored.flyer.evaluation_policy(), restored.flyer.judge()
-    flown = fly_races(policy, worlds, episodes=1, judge=judge)
+    policy, value_function = restored.flyer.evaluation_policy(), restored.flyer.value_function()
+    flown = fly_races(policy, worlds, episodes=1, value_function=value_function)
     print(flown.summary())
     name = restored.checkpoint.name if is_agent(restored.checkpoint) else restored.run_dir.name
     flight = ShownFlight(f"{name}, {restored.env_steps:,} env_steps", flown.trajectories[0])

@@ -247,7 +247,7 @@ def agents_flight(config: FlyConfig) -> PlannedFlight:
         track = load_track(worlds["track"])
     print(f"{config.agent} on {track.name}, {track.laps} laps, physics: {restored.trained.env.preset}")
     course = Course(restored.flyer.evaluation_policy(), worlds, episodes=1)
-    return PlannedFlight(course.base, partial(course.evaluate, judge=restored.flyer.judge()))
+    return PlannedFlight(course.base, partial(course.evaluate, value_function=restored.flyer.value_function()))
 
 
 def write(directory: Path, track: Track, result: Evaluation) -> None:

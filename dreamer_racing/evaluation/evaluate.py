@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.evaluation.trajectory import CRASHES, FINISHED, TIMEOUT, Trajectory, TrajectoryRecorder
-from dreamer_racing.learners.learner import Judge
+from dreamer_racing.learners.learner import ValueFunction
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def evaluate(
     num_trajectories: int = 1,
     max_recorded_steps: int | None = None,
     record_pixels: bool = True,
-    judge: Judge | None = None,
+    value_function: ValueFunction | None = None,
     on_episode: Callable[[int, int], None] | None = None,
     on_step: Callable[[TensorDictBase], None] | None = None,
 ) -> Evaluation:
@@ -242,7 +242,7 @@ def evaluate(
         num_trajectories: the first episode of this many environments is recorded.
         max_recorded_steps: a recording stops here, K at most; None: at the end of the episode.
         record_pixels: whether recordings keep images, 12 KB a step.
-        judge: what says the value of each recorded state, after the policy has acted on it; None: recordings have none.
+        value_function: of each recorded state, after the policy has acted on it; None: recordings have no values.
         on_episode: is told after each step in which one ended how many have, and of how many.
         on_step: is shown before each step what the policy is about to see, as `RaceWindow.show`.
 
@@ -275,7 +275,7 @@ def evaluate(
             if on_step:
                 on_step(tensordict)
             acted = policy(tensordict)
-            value = judge(acted[:recorded]) if judge and recorder.running else None
+            value = value_function(acted[:recorded]) if value_function and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)
             action, action_before = _as_flown(tensordict["action"]), action
             steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))

@@ -147,7 +147,7 @@ class ShippedAgent:
         """Return the acting step, which shares the agent's parameters."""
         return DreamerPolicy(self.agent.world_model, self.agent.actor)
 
-    def judge(self) -> None:
+    def value_function(self) -> None:
         """Return None: the critic does not ship."""
 
 

@@ -79,8 +79,8 @@ class EvaluationReport:
 
     def evaluate(self, deterministic: bool) -> Evaluation:
         """Fly the episodes."""
-        judge = self._learner.judge()
-        return self._course.evaluate(deterministic, judge=judge, on_episode=self.on_episode)
+        value_function = self._learner.value_function()
+        return self._course.evaluate(deterministic, value_function=value_function, on_episode=self.on_episode)
 
     def write(self, name: str, result: Evaluation) -> None:
         """Write `evaluations/<name>.json`, `plots/<name>.png` and, of an agent that sees, `videos/<name>.mp4`.

@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.learner import Judge
+from dreamer_racing.learners.learner import ValueFunction
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_layers, layers_of
 from dreamer_racing.modules import Interface
 
@@ -50,7 +50,7 @@ class BaselineLearner(ABC):
         """Return the acting step to evaluate: the one that is trained."""
         return self.policy()
 
-    def judge(self) -> Judge | None:
+    def value_function(self) -> ValueFunction | None:
         """Return what the critic makes of a state; None of learners without a critic of states."""
         return None
 

@@ -21,7 +21,7 @@ from dreamer_racing.learners.cuda_graph import GraphedStep
 from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
 from dreamer_racing.learners.finite_guard import FiniteGuard
-from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
+from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import check_optimizers, check_saved, load_parameters, own_state
 from dreamer_racing.losses import ActorLoss, LossConfig, WorldModelLoss, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
@@ -327,12 +327,12 @@ class DreamerLearner:
         """Return the acting step of `flying_agent`, which shares its parameters."""
         return DreamerPolicy(self.flying_agent.world_model, self.flying_agent.actor)
 
-    def judge(self) -> Judge:
+    def value_function(self) -> ValueFunction:
         """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
-        return getattr(self.actor_loss, "judge", None) or self._judge_latents
+        return getattr(self.actor_loss, "value_of_state", None) or self._value_of_latents
 
     @torch.no_grad()
-    def _judge_latents(self, acted: TensorDictBase) -> Tensor:
+    def _value_of_latents(self, acted: TensorDictBase) -> Tensor:
         """Return what the critic makes of the latents that `DreamerPolicy` has updated by what it saw, ``(N, 1)``."""
         after = acted["next"].select("belief", "state").to(self.device)
         return self.flying_agent.critic.value(join_features(after["belief"], after["state"]))

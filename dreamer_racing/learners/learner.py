@@ -15,7 +15,7 @@ Timer = Callable[[str], AbstractContextManager]
 """Context manager by the name of an activity, as ``RunClock.timed``."""
 
 
-Judge = Callable[[TensorDictBase], Tensor]
+ValueFunction = Callable[[TensorDictBase], Tensor]
 """What a critic expects: of records [N] that the evaluation's policy has acted on, the return from there, (N, 1)."""
 
 
@@ -47,7 +47,7 @@ class Evaluable(Protocol):
         """Return the acting step to evaluate, which may be one of averaged weights."""
         ...
 
-    def judge(self) -> Judge | None:
+    def value_function(self) -> ValueFunction | None:
         """Return what the critic that teaches the actor makes of a state; None without one."""
         ...
 

@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from dreamer_racing.learners.baseline import BaselineLearner, detached
-from dreamer_racing.learners.learner import Judge, Timer, seeded, untimed
+from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.networks import (
     GaussianNetwork,
     NetworkModule,
@@ -138,12 +138,12 @@ class PPOLearner(BaselineLearner):
                 steps += [self._step(records[indices]) for indices in order.tensor_split(self.config.minibatches)]
         return {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
 
-    def judge(self) -> Judge:
+    def value_function(self) -> ValueFunction:
         """Return what the critic makes of what is seen, in units of the reward."""
 
         @torch.no_grad()
         def value(acted: TensorDictBase) -> Tensor:
-            return self._judge(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
+            return self._value(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
 
         return value
 
@@ -170,16 +170,16 @@ class PPOLearner(BaselineLearner):
         What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
         a crash it counts for nothing. So hardly any image is looked at twice.
         """
-        value = self._judge(records.flatten()).view(*records.shape, 1)
+        value = self._value(records.flatten()).view(*records.shape, 1)
         next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
         apart = following["done"].squeeze(-1).clone()
         apart[:, -1] = True
         apart &= ~following["terminated"].squeeze(-1)  # (N, T)
         others = following.select(*self._keys)[apart].to(self.device)
-        next_value[apart.to(self.device)] = self._judge(others)
+        next_value[apart.to(self.device)] = self._value(others)
         return value, next_value
 
-    def _judge(self, records: TensorDictBase) -> Tensor:
+    def _value(self, records: TensorDictBase) -> Tensor:
         """Return the values of records ``[N]``, ``(N, 1)``, in parts, for a rollout of images is large."""
         seen, size = records.select(*self._keys), max(1, math.ceil(len(records) / self.config.minibatches))
         starts = range(0, max(1, len(records)), size)

@@ -66,7 +66,7 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         return super().from_config(agent, config, horizon, privileged_dim=agent.interface.privileged_dim, **own)
 
     @torch.no_grad()
-    def judge(self, acted: TensorDictBase) -> Tensor:
+    def value_of_state(self, acted: TensorDictBase) -> Tensor:
         """Return what the critic expects of states ``[N]`` that a policy has acted on, ``(N, 1)``."""
         privileged = acted[PRIVILEGED].to(self.flown.device)
         return self.state_critic.mean(symlog(privileged))

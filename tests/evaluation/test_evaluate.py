@@ -233,14 +233,14 @@ def test_records_without_images_and_none_at_all():
 
 
 def test_what_a_critic_makes_of_each_state_is_recorded_beside_the_action():
-    """The judge sees what the policy has acted on, of the recorded worlds only, and no more than is recorded."""
+    """It sees what the policy has acted on, of the recorded worlds only, and no more than is recorded."""
     asked = []
 
-    def judge(acted):
+    def value(acted):
         asked.append(len(acted["action"]))
         return acted["pixels"][:, 0, 0, :1].float() * 10
 
-    result = evaluate(ScriptedRace(SCRIPT), idle(), 6, num_trajectories=2, max_recorded_steps=20, judge=judge)
+    result = evaluate(ScriptedRace(SCRIPT), idle(), 6, num_trajectories=2, max_recorded_steps=20, value_function=value)
     crashed, stopped = result.trajectories
     assert crashed.value.tolist() == [0.0, 10.0]
     assert stopped.value.tolist() == [10.0 * step for step in range(20)]

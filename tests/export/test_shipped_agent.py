@@ -145,7 +145,7 @@ def test_only_what_flies_is_in_it(shipped: Path, env: DroneRacingEnv) -> None:
     assert {name.partition(".")[0] for name in read_weights(shipped / "weights.safetensors")} == {
         "encoder", "rssm", "actor",
     }  # fmt: skip
-    assert restored.judge() is None
+    assert restored.value_function() is None
     assert restored.agent.critic is None and restored.agent.world_model.reward_head is None
     assert {name for name, _ in restored.agent.named_children()} == {"world_model", "actor"}
     held = sum(parameter.numel() for parameter in restored.agent.parameters())

@@ -470,7 +470,7 @@ def test_evaluations_ask_the_critic_that_belongs_to_what_flies():
     )
     acted = TensorDict({"belief": 0 * belief, "next": {"belief": belief, "state": state}}, [3])
     expected = learner.averaged.critic.value(torch.cat((belief, state), -1))
-    value = learner.judge()(acted)
+    value = learner.value_function()(acted)
     assert value.shape == (3, 1) and not value.requires_grad and torch.equal(value, expected)
 
 

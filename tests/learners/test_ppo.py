@@ -95,7 +95,7 @@ def test_evaluations_are_told_values_in_units_of_the_reward() -> None:
     learner.critic = TensorDictModule(Echo(), ["vector"], ["state_value"])
     seen = torch.tensor([[1.0], [2.0], [-3.0]])
     acted = TensorDict({"vector": seen, "action": torch.zeros(3, 1)}, [3])
-    assert torch.equal(learner.judge()(acted), 4 * seen)
+    assert torch.equal(learner.value_function()(acted), 4 * seen)
 
 
 def bandit(learner: PPOLearner, rounds: int) -> float:

@@ -60,7 +60,7 @@ def test_evaluations_ask_the_critic_of_the_state():
     torch.nn.init.normal_(actor_loss(learner).state_critic.mlp.output.weight)
     acted = TensorDict({"privileged": {"vector": torch.randn(3, P)}}, [3])
     expected = actor_loss(learner).state_critic.mean(symlog(acted["privileged", "vector"]))
-    value = learner.judge()(acted)
+    value = learner.value_function()(acted)
     assert value.shape == (3, 1) and not value.requires_grad and torch.equal(value, expected)
 
 
