@@ -55,7 +55,8 @@ class Way(NamedTuple):
     Attributes:
         name: In the table.
         worlds: Of each process or worker.
-        processes: With one thread each and nothing in common; 0 for this process with all its cores, or for workers.
+        processes: With one thread each and nothing in common; 0 for workers, or for this process
+            with all its cores, as long as ``OMP_NUM_THREADS`` is not set.
         workers: On Ray.
     """
 

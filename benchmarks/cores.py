@@ -33,7 +33,7 @@ class Way(NamedTuple):
 
     Attributes:
         cores: Cores it may run on.
-        threads: Threads of torch.
+        threads: Threads of torch, and of physics and drawing.
         collector: As the recipe's setting.
     """
 

@@ -189,9 +189,9 @@ def available_cpus() -> int:
 
 
 def usable_threads() -> int:
-    """Threads that work at once where nobody says how many: one for each CPU, or ``OMP_NUM_THREADS``, if fewer.
+    """Threads of physics and rendering where nobody says how many: one for each CPU, at most ``OMP_NUM_THREADS``.
 
-    So that what holds for torch holds for physics and rendering, and two trainings can share a machine.
+    By that variable, which torch obeys, too, two trainings share a machine.
     """
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # "4,2": 4 outside, 2 within each
     return min(available_cpus(), int(asked)) if asked.isdecimal() and int(asked) else available_cpus()

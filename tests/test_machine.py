@@ -105,7 +105,7 @@ def test_a_c_library_that_cannot_keep_memory_says_so(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("asked", "expected"), [(None, 4), ("", 4), ("1", 1), ("3,2", 3), ("16", 4), ("0", 4), ("-1", 4), ("many", 4)]
 )
-def test_physics_and_rendering_take_as_many_threads_as_torch_is_given(
+def test_threads_are_one_a_cpu_and_at_most_what_the_variable_says(
     asked: str | None, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine, "available_cpus", lambda: 4)

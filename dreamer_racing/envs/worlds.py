@@ -77,7 +77,7 @@ class RaceWorlds:
         camera: the nose camera.
         looks: `nominal`, or `randomised` for another light, colours, camera tilt, lens and noise in every episode, or
             how far each varies.
-        num_threads: of physics and rendering on CPU; if None all CPUs of the process, or `OMP_NUM_THREADS`.
+        num_threads: of physics and rendering on CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
         device: `cpu` or a CUDA device, where everything lives. On CUDA a step is one graph that never waits.
         backend: `auto` (`mujoco` on CPU, `mujoco_warp` on CUDA), `mujoco`, or `mujoco_warp` (on CPU for tests: slow).
         seed: of start poses and of the randomisation of physics and looks.

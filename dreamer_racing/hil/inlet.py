@@ -44,7 +44,8 @@ class Inlet(Protocol):
 class UdpInlet:
     """Listens on a UDP port; pieces are datagrams, with the time at which the kernel received them.
 
-    Linux begins to note it a few ms after the machine's first socket asked; until then it says when they are read.
+    Linux begins to do so a few ms after the machine's first socket has asked for it; until then the time is that of
+    reading.
 
     Args:
         port: To listen on; 0 for a free one.

@@ -329,7 +329,7 @@ class DreamerLearner:
 
     def value_function(self) -> ValueFunction:
         """Return what the critic that teaches the actor makes of a state: the actor's loss may have one of its own."""
-        return getattr(self.actor_loss, "value_of_state", None) or self._value_of_latents
+        return self.actor_loss.value_function() or self._value_of_latents
 
     @torch.no_grad()
     def _value_of_latents(self, acted: TensorDictBase) -> Tensor:

@@ -143,7 +143,7 @@ class PPOLearner(BaselineLearner):
 
         @torch.no_grad()
         def value(acted: TensorDictBase) -> Tensor:
-            return self._value(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
+            return self._values(acted.select(*self._keys).to(self.device)) / self.config.reward_scale
 
         return value
 
@@ -152,7 +152,7 @@ class PPOLearner(BaselineLearner):
         """Return the records of a rollout ``[N T]`` with ``advantage`` and ``value_target`` ``(N T, 1)``."""
         records = rollout.select(*self._keys, "action", "action_log_prob").to(self.device)
         outcome = rollout["next"].select("reward", "done", "terminated").to(self.device)
-        value, next_value = self._values(records, rollout["next"])
+        value, next_value = self._values_and_next(records, rollout["next"])
         advantage, target = vec_generalized_advantage_estimate(
             self.config.discount,
             self.config.lambda_,
@@ -164,22 +164,22 @@ class PPOLearner(BaselineLearner):
         )
         return records.update({"advantage": advantage, "value_target": target}).flatten()
 
-    def _values(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _values_and_next(self, records: TensorDictBase, following: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the values of what was seen and of what came next, ``(N, T, 1)`` each.
 
         What comes next is what is seen in the next step, but for the last step and where an episode was cut off; after
         a crash it counts for nothing. So hardly any image is looked at twice.
         """
-        value = self._value(records.flatten()).view(*records.shape, 1)
+        value = self._values(records.flatten()).view(*records.shape, 1)
         next_value = torch.cat((value[:, 1:], value[:, -1:]), 1)
         apart = following["done"].squeeze(-1).clone()
         apart[:, -1] = True
         apart &= ~following["terminated"].squeeze(-1)  # (N, T)
         others = following.select(*self._keys)[apart].to(self.device)
-        next_value[apart.to(self.device)] = self._value(others)
+        next_value[apart.to(self.device)] = self._values(others)
         return value, next_value
 
-    def _value(self, records: TensorDictBase) -> Tensor:
+    def _values(self, records: TensorDictBase) -> Tensor:
         """Return the values of records ``[N]``, ``(N, 1)``, in parts, for a rollout of images is large."""
         seen, size = records.select(*self._keys), max(1, math.ceil(len(records) / self.config.minibatches))
         starts = range(0, max(1, len(records)), size)

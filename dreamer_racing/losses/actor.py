@@ -5,7 +5,7 @@ Shape legend: N starts, H horizon, D belief, S state, F = D + S features.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -181,6 +181,13 @@ class ActorLoss(LossModule):
             Nothing, or metrics of what it did, scalars, with ``gradient_norm/actor`` among them.
         """
         return {}
+
+    def value_function(self) -> Callable[[TensorDictBase], Tensor] | None:
+        """Return what a critic of the loss's own makes of records ``[N]`` that a policy has acted on, ``(N, 1)``.
+
+        None: the agent's critic teaches the actor.
+        """
+        return None
 
     def _objective(self, belief: Tensor, state: Tensor, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Imagine from starts ``(N, ...)``; return the loss and everything else that ``forward`` writes."""

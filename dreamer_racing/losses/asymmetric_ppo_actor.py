@@ -9,6 +9,7 @@ Shape legend: N environments, S steps kept of each environment, P privileged num
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Self
 
 import torch
@@ -65,9 +66,12 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         """Make the loss of an agent with the losses' numbers, and with arguments of a subclass's own."""
         return super().from_config(agent, config, horizon, privileged_dim=agent.interface.privileged_dim, **own)
 
+    def value_function(self) -> Callable[[TensorDictBase], Tensor]:
+        """Return what the critic of the simulator's state expects."""
+        return self._value_of_states
+
     @torch.no_grad()
-    def value_of_state(self, acted: TensorDictBase) -> Tensor:
-        """Return what the critic expects of states ``[N]`` that a policy has acted on, ``(N, 1)``."""
+    def _value_of_states(self, acted: TensorDictBase) -> Tensor:
         privileged = acted[PRIVILEGED].to(self.flown.device)
         return self.state_critic.mean(symlog(privileged))
 

@@ -75,7 +75,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
     Args:
         config: resolved.
         num_envs: worlds; those of the configuration if None.
-        num_threads: that step and draw a race's worlds on a CPU; if None all that there are, or `OMP_NUM_THREADS`.
+        num_threads: that step and draw a race's worlds on a CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
     """
     env = config.env
     num_envs = num_envs or env.num_envs

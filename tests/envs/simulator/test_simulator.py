@@ -14,11 +14,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from dreamer_racing import machine
 from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
-from dreamer_racing.envs.simulator import opengl, rendering
+from dreamer_racing.envs.simulator import mujoco_cpu, opengl, rendering
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import DRONE_GROUP, Camera, build_scene
@@ -57,6 +58,18 @@ def actions(steps: int, num_envs: int, seed: int = 1) -> Tensor:
 def snapshot(made: MujocoSimulator) -> Tensor:
     state = made.state
     return torch.cat((state.position, state.attitude, state.linear_velocity, state.body_rates), dim=1).clone()
+
+
+@pytest.mark.parametrize(("num_envs", "num_threads", "expected"), [(5, None, 2), (5, 3, 3), (1, None, 1), (1, 3, 1)])
+def test_threads_of_physics_and_drawing(num_envs: int, num_threads: int | None, expected: int, monkeypatch) -> None:
+    """One a CPU, at most OMP_NUM_THREADS; as many as are asked for; never more than worlds."""
+    seen, make_batch = [], mujoco_cpu.Batch
+    monkeypatch.setattr(machine, "available_cpus", lambda: 4)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(mujoco_cpu, "Batch", lambda *given: seen.append(given[2]) or make_batch(*given))
+    monkeypatch.setattr(mujoco_cpu, "make_renderer", lambda *given: seen.append(given[4]))
+    MujocoSimulator(KIDNEY, EASY, num_envs, num_threads=num_threads)
+    assert seen == [expected, expected]
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])
