@@ -91,8 +91,9 @@ def test_the_cuda_of_torch_is_read_without_importing_it() -> None:
     assert examination.cuda_of_torch() == torch.version.cuda
 
 
-def test_more_threads_than_cores_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "512")
+@pytest.mark.parametrize("asked", ["512", "512,2"])
+def test_more_threads_than_cores_are_wrong(asked: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", asked)
     threads = next(finding for finding in examination.cores() if finding.what == "threads")
     assert threads.state is Verdict.wrong and "more threads than cores" in threads.remedy
 
