@@ -4,6 +4,7 @@
     OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --updates 600 --variant loss.world_model=privileged \
         loss.world_model=reconstruction "loss.world_model=reconstruction loss.image_scale=0.003"
     OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --as-trained
+    OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/circle runs/circle_from_images_alone --flown
 
 A variant is a list of overrides of the run's settings, or `size.<field>` of the networks' size. The loss of the world
 model alone is trained, on windows as the run draws them, but without stored latents; no actor is there.
@@ -11,9 +12,12 @@ model alone is trained, on windows as the run draws them, but without stored lat
 nothing, so that losses can be compared; `error` that of the loss's own decoder, if it has one; both mean squares of
 symlogs on windows that the run never trains on, the same ones for all variants. With `--as-trained` the model is the
 run's own, which stands still and goes on from the latents stored, and the probe alone learns.
+With `--flown` it is probed in what the agent flies now, sampling, in 64 worlds of which half begin on a line: from the
+latents with which it acts, 52 worlds for the probe and 12 to measure; so any run can be compared, whatever its replay.
 `share` is `probe` by their variance,
 `trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
-best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`.
+best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`;
+but for `--flown`.
 """
 
 import argparse
@@ -29,16 +33,19 @@ import torch
 from learning_signal import restore, restore_replay
 from measuring import print_table, write_json
 from omegaconf import OmegaConf
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
+from composing.arena import make_env
+from composing.building import make_collector
 from composing.learners import size_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
+from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
 from dreamer_racing.losses import WorldModelLoss, find_loss, make_losses
 from dreamer_racing.modules import Agent, ModelSize, join_features, symlog
@@ -49,35 +56,43 @@ from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
+WORLDS, MEASURED, STEPS, MINIBATCH = 64, 12, 704, 512  # with --flown: worlds, those held out, steps, records an update
 COLUMNS = ["variant", "updates", "seconds", "probe", "share", "error", "image_error", "reward_error", "kl"]
 
 
 def main() -> None:
     """Measure every variant."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", help="run directory or checkpoint of a dreamer_v3 race")
+    parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
     parser.add_argument("--variant", nargs="+", default=[""])
     parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--every", type=int, default=150, help="updates between two measurements")
-    parser.add_argument("--as-trained", action="store_true", help="probe the run's own model instead of fresh ones")
+    own = parser.add_mutually_exclusive_group()
+    own.add_argument("--as-trained", action="store_true", help="probe the run's own model instead of fresh ones")
+    own.add_argument("--flown", action="store_true", help="the same, in what its agent flies now")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    if arguments.as_trained and arguments.variant != [""]:
-        parser.error("--as-trained is of the run as it is: leave --variant out")
-    checkpoint, records = latest_checkpoint(arguments.checkpoint), []
-    for variant in arguments.variant:
-        found = list(measure(checkpoint, variant, arguments.updates, arguments.every, arguments.as_trained))
-        print_table(found, COLUMNS)
-        records += found
-        write_json(records, arguments.json)  # of all so far: a later variant may not fit
-        gc.collect()  # replay and learner, gigabytes, are in cycles
+    if (arguments.as_trained or arguments.flown) and arguments.variant != [""]:
+        parser.error("--as-trained and --flown are of the run as it is: leave --variant out")
+    records = []
+    for path in arguments.checkpoints:
+        checkpoint = latest_checkpoint(path)
+        for variant in arguments.variant:
+            updates, every = arguments.updates, arguments.every
+            found = list(
+                probe_flights(checkpoint, updates, every)
+                if arguments.flown
+                else measure(checkpoint, variant, updates, every, arguments.as_trained)
+            )
+            print_table(found, COLUMNS)
+            records += found
+            write_json(records, arguments.json)  # of all so far: a later variant may not fit
+            gc.collect()  # replay and learner, gigabytes, are in cycles
 
 
 def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained: bool) -> Iterator[dict[str, Any]]:
     """Yield a record for each measurement of a variant."""
-    trained = trained_config(RunDirectory.of(checkpoint).path)
-    assert isinstance(trained, DreamerConfig), "a run of recipes/dreamer_v3.py"
-    trained.device, trained.replay.device = "cpu", "auto"
+    trained = config_of(checkpoint)
     learner, counters = restore(trained, checkpoint)
     config, size = varied(trained, variant)
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
@@ -105,17 +120,68 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         seconds += time.process_time() - begun
-        probe.learn(metrics, batch)
+        probe.learn(latents_of(metrics), batch[PRIVILEGED])
         if number % every == 0:
             with torch.no_grad(), context:
                 seen = loss(test)
-            probed = probe.error(seen, test).item()
+            probed = probe.error(latents_of(seen), test[PRIVILEGED]).item()
             yield {
                 "benchmark": "seeing", "track": config.track, "env_steps": counters["env_steps"],
                 "trained_updates": counters["updates"], "variant": "as trained" if as_trained else variant,
                 "updates": number, "seconds": seconds, "probe": probed, "share": probed / variance.item(),
                 "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
+
+
+def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[str, Any]]:
+    """Yield a record for each measurement of the latents with which a run's agent flies now."""
+    config = config_of(checkpoint)
+    learner, counters = restore(config, checkpoint)
+    features, state = fly(config, learner)
+    learned, measured = (
+        TensorDict({"features": features[worlds].flatten(0, 1), PRIVILEGED: state[worlds].flatten(0, 1)})
+        for worlds in (slice(MEASURED, None), slice(MEASURED))
+    )
+    torch.manual_seed(0)
+    probe = Probe(features.shape[-1], state.shape[-1])
+    variance = symlog(measured[PRIVILEGED]).var(0).mean()
+    for number in range(1, updates + 1):
+        drawn = torch.randint(len(learned["features"]), (MINIBATCH,))
+        probe.learn(learned["features"][drawn], learned[PRIVILEGED][drawn])
+        if number % every == 0:
+            error = probe.error(measured["features"], measured[PRIVILEGED]).item()
+            yield {
+                "benchmark": "seeing", "track": config.track, "run": RunDirectory.of(checkpoint).path.name,
+                "env_steps": counters["env_steps"], "trained_updates": counters["updates"], "variant": "as it flies",
+                "updates": number, "probe": error, "share": error / variance.item(),
+            }  # fmt: skip
+
+
+@torch.no_grad()
+def fly(config: DreamerConfig, learner: DreamerLearner) -> tuple[Tensor, Tensor]:
+    """Let the agent fly, and return its latents `(WORLDS, STEPS, F)` and the state `(WORLDS, STEPS, P)` that it saw."""
+    env_config = replace(config.env, num_envs=WORLDS, start_on_line=0.5, start_at_gate=0.0)
+    config = replace(config, env=env_config)
+    shown = replace(config.loss, actor="asymmetric_ppo")  # that actor's critic reads the state, so the worlds tell it
+    env = make_env(replace(config, loss=shown))
+    collector = make_collector(config, env, learner.policy())
+    rollouts = []
+    for rollout in collector:
+        latents = join_features(rollout["next", "belief"], rollout["next", "state"]).float()
+        rollouts.append((latents, rollout[PRIVILEGED].clone()))
+        if config.rollout_steps * len(rollouts) >= STEPS:
+            break
+    collector.shutdown()
+    features, state = (torch.cat(parts, 1) for parts in zip(*rollouts, strict=True))
+    return features, state
+
+
+def config_of(checkpoint: Path) -> DreamerConfig:
+    """Return the settings of the run that wrote a checkpoint, for a CPU."""
+    trained = trained_config(RunDirectory.of(checkpoint).path)
+    assert isinstance(trained, DreamerConfig), "a run of recipes/dreamer_v3.py"
+    trained.device, trained.replay.device = "cpu", "auto"
+    return trained
 
 
 def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple[LossModule, torch.optim.Optimizer]:
@@ -140,17 +206,21 @@ class Probe:
         self.decoder = VectorDecoder(features, privileged, layers=2, units=256)
         self.optimizer = torch.optim.Adam(self.decoder.parameters(), 1e-3)
 
-    def error(self, metrics: TensorDictBase, batch: TensorDictBase) -> Tensor:
-        """Return the mean squared error of symlogs on the latents that a world-model loss has found, a scalar."""
-        latents, state = metrics["replay_context"].detach(), batch[PRIVILEGED]
-        features = join_features(latents["belief"], latents["state"]).float()
+    def error(self, features: Tensor, state: Tensor) -> Tensor:
+        """Return the mean squared error of symlogs on latents `(..., F)` and the state `(..., P)`, a scalar."""
         return self.decoder.squared_error(features, state) / state.shape[-1]
 
-    def learn(self, metrics: TensorDictBase, batch: TensorDictBase) -> None:
+    def learn(self, features: Tensor, state: Tensor) -> None:
         """Make one gradient step."""
         self.optimizer.zero_grad()
-        self.error(metrics, batch).backward()
+        self.error(features, state).backward()
         self.optimizer.step()
+
+
+def latents_of(metrics: TensorDictBase) -> Tensor:
+    """Return the latents that a world-model loss has found, `(..., F)`, without gradient."""
+    latents = metrics["replay_context"].detach()
+    return join_features(latents["belief"], latents["state"]).float()
 
 
 def varied(config: DreamerConfig, variant: str) -> tuple[DreamerConfig, ModelSize]:
