@@ -73,6 +73,11 @@ def count() -> int:
     return _here.processes
 
 
+def count_here() -> int:
+    """How many of them are on this machine."""
+    return min(count(), int(os.environ.get("LOCAL_WORLD_SIZE", count())))
+
+
 def rank() -> int:
     """Which of them this is, from 0."""
     return _here.rank

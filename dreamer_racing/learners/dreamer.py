@@ -22,7 +22,13 @@ from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optimizer, restore, trained_parameters
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
-from dreamer_racing.learners.saved_dreamer import check_optimizers, check_saved, load_parameters, own_state
+from dreamer_racing.learners.saved_dreamer import (
+    check_optimizers,
+    check_saved,
+    check_weights,
+    load_parameters,
+    own_state,
+)
 from dreamer_racing.losses import ActorLoss, LossConfig, WorldModelLoss, find_loss, make_losses
 from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.losses.contract import require_keys, set_number
@@ -160,6 +166,8 @@ class DreamerLearner:
             improved = parallel.averaged(improved)
             if improved:
                 kept = TensorDict(dict(self.actor_loss.named_buffers(recurse=False)))
+                if self.device.type == "cuda":
+                    kept = kept.clone()  # the guard looks two entries later, and rollouts are written there meanwhile
                 self._guard.check(improved, kept, of=" of the actor's improvement")
             metrics |= improved
         self._average()
@@ -366,7 +374,7 @@ class DreamerLearner:
             "size": asdict(self.size),
             "image_size": self.agent.interface.image_size,
             "agent": self.agent.state_dict(),
-            "losses": {name: own_state(loss) for name, loss in self.losses.items()},
+            "losses": {name: own_state(loss, self.agent) for name, loss in self.losses.items()},
             "optimizer": self.optimizer.state_dict(),
             "updates": self.updates,
             **({} if self.averaged is None else {"averaged": self.averaged.state_dict()}),
@@ -380,8 +388,8 @@ class DreamerLearner:
             ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
                 changed then.
         """
-        check_saved(state_dict, self.agent, self.losses)
         check_optimizers(state_dict, self._actor_optimizer is not None)
+        check_saved(state_dict, self.agent, self.losses)
         self.agent.load_state_dict(state_dict["agent"])
         for name, loss in self.losses.items():
             loss.load_state_dict(state_dict["losses"][name], strict=False)
@@ -393,16 +401,17 @@ class DreamerLearner:
         self.updates = state_dict["updates"]
 
     def adopt(self, state_dict: dict[str, Any]) -> None:
-        """Take over the weights of what another learner's ``state_dict`` returned, and nothing else.
+        """Take over the weights of what another learner's ``state_dict`` returned, whatever its actor's loss.
 
-        They are those that flew, so the averaged ones where it kept them. No optimiser, no counters, no bounds of the
-        actor's deviation, and nothing that losses keep from update to update: neither flown steps nor statistics.
+        They are those that flew, so the averaged ones where it kept them, and nothing else: no optimiser, no counters,
+        no bounds of the actor's deviation, and nothing that losses keep from update to update: neither flown steps nor
+        statistics.
 
         Raises:
-            ValueError: If it is that of a model of another size, of other losses or of another environment; nothing is
-                changed then.
+            ValueError: If it is that of a model of another size, lacks a network of a loss's own, or is of another
+                environment; nothing is changed then.
         """
-        check_saved(state_dict, self.agent, self.losses)
+        check_weights(state_dict, self.agent, self.losses)
         flying = state_dict.get("averaged", state_dict["agent"])
         for agent in filter(None, (self.agent, self.averaged)):
             load_parameters(agent, flying)

@@ -92,5 +92,5 @@ def seeded(seed: int | None) -> Iterator[None]:
     """Draw initial weights by a seed, without a trace in the global generator; None draws them from that."""
     with torch.random.fork_rng(devices=[], enabled=seed is not None):
         if seed is not None:
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # of weights drawn on the CPU; CUDA's generators stay as they are
         yield

@@ -208,6 +208,12 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
     Raises:
         ValueError: If they differ.
     """
+    if (saved["image_size"] is None) is not (present["image_size"] is None):
+        there, here = (str(layers["image_size"] is not None).lower() for layers in (saved, present))
+        raise ValueError(
+            f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
+            f"env.from_pixels={there}, or begin anew."
+        )
     names = {"layers": "network.layers", "units": "network.units", "image_size": "env.image_size"}
     for key, setting in names.items():
         if saved[key] != present[key]:

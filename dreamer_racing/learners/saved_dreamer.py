@@ -15,10 +15,11 @@ VARIANTS = ("sampled", "state_std")
 """What of a `ModelSize` the command line chooses beside the size, as ``model.sampled=false``."""
 
 
-def own_state(loss: LossModule) -> dict[str, Tensor]:
-    """Return a loss's state without that of the agent's networks, which it holds under their names."""
-    networks = ("world_model.", "actor.", "critic.")
-    return {key: value for key, value in loss.state_dict().items() if not key.startswith(networks)}
+def own_state(loss: LossModule, agent: Agent) -> dict[str, Tensor]:
+    """Return a loss's state without that of the agent's networks, which it holds under whatever names."""
+    shared = {id(tensor) for tensor in agent.state_dict(keep_vars=True).values()}
+    state = loss.state_dict(keep_vars=True)
+    return {key: tensor.detach() for key, tensor in state.items() if id(tensor) not in shared}
 
 
 class LossState:
@@ -26,14 +27,16 @@ class LossState:
 
     Args:
         loss: Of any of them.
+        agent: Whose networks it trains.
     """
 
-    def __init__(self, loss: LossModule) -> None:
+    def __init__(self, loss: LossModule, agent: Agent) -> None:
         self._loss = loss
+        self._agent = agent
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return it."""
-        return own_state(self._loss)
+        return own_state(self._loss, self._agent)
 
     def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
         """Restore what ``state_dict`` returned."""
@@ -52,7 +55,38 @@ def check_saved(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> N
         ValueError: If it is that of a model of another size, of other losses or of another environment.
     """
     check_size(saved["size"], agent.size)
-    _check_parts(saved, agent, losses)
+    parts = _networks(saved, agent)
+    for name, loss in losses.items():
+        # What a loss keeps from update to update it may do without; older versions keep less.
+        kept = {key for key, _ in loss.named_buffers()}
+        wanted, found = (
+            {key: value for key, value in state.items() if key not in kept}
+            for state in (own_state(loss, agent), saved["losses"][name])
+        )
+        parts[f"{name} loss"] = wanted, found
+    _check_parts(parts, saved, agent)
+
+
+def check_weights(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
+    """Refuse what another learner saved, if the weights of this one are not in it; what else is there is no matter.
+
+    Args:
+        saved: ``state_dict()`` of a learner.
+        agent: The networks that are to load it.
+        losses: Theirs.
+
+    Raises:
+        ValueError: If it is that of a model of another size, lacks a network of a loss's own, or is of another
+            environment.
+    """
+    check_size(saved["size"], agent.size)
+    parts = _networks(saved, agent)
+    for name, loss in losses.items():
+        kept = {key for key, _ in loss.named_buffers()}
+        wanted = {key: value for key, value in own_state(loss, agent).items() if key not in kept}
+        there = saved["losses"][name]
+        parts[f"{name} loss"] = wanted, {key: there[key] for key in wanted if key in there}
+    _check_parts(parts, saved, agent)
 
 
 def check_optimizers(saved: dict[str, Any], of_actor: bool) -> None:
@@ -109,8 +143,17 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _check_parts(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
-    """Refuse networks or losses of other parameters than these."""
+Parts = dict[str, tuple[dict[str, Tensor], dict[str, Tensor]]]
+"""What is wanted of a part of a learner, and what is found, by the part's name."""
+
+
+def _networks(saved: dict[str, Any], agent: Agent) -> Parts:
+    older = {f"actor.{name}": agent.actor.get_buffer(name) for name in ("min_std", "max_std")}  # they do not say
+    return {"networks": (agent.state_dict(), older | saved["agent"])}
+
+
+def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:
+    """Refuse parts of other parameters than these."""
     # Older checkpoints do not say: their images were of the default size.
     there, here = saved.get("image_size", Interface.image_size), agent.interface.image_size
     where = (
@@ -118,16 +161,6 @@ def _check_parts(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> 
         if there == here
         else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
     )
-    older = {f"actor.{name}": agent.actor.get_buffer(name) for name in ("min_std", "max_std")}  # they do not say
-    parts = {"networks": (agent.state_dict(), older | saved["agent"])}
-    for name, loss in losses.items():
-        # What a loss keeps from update to update it may do without; older versions keep less.
-        kept = {key for key, _ in loss.named_buffers()}
-        own, there = (
-            {key: value for key, value in state.items() if key not in kept}
-            for state in (own_state(loss), saved["losses"][name])
-        )
-        parts[f"{name} loss"] = (own, there)
     for part, (wanted, found) in parts.items():
         lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
         if lacking or surplus:

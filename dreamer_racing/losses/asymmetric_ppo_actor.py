@@ -86,24 +86,26 @@ class AsymmetricPPOActorLoss(FlownPPOActorLoss):
         """Teach the critic.
 
         Returns:
-            ``ppo/critic_loss``, ``ppo/explained_variance`` (of the returns, by the values before) and ``entropy`` of
-            the policy that flew, nats.
+            ``ppo/critic_loss``, ``ppo/explained_variance`` (of the returns, by the values before), ``entropy`` of the
+            policy that flew, nats, and ``gradient_norm/state_critic``.
         """
         state, target = self.privileged.flatten(0, 1), returns.flatten(0, 1)
-        losses = []
-        for _ in range(self.ppo.epochs):
-            for chosen in torch.randperm(len(state), device=state.device).split(self.ppo.minibatch):
-                losses.append(self._regress(state[chosen], target[chosen]))
+        steps = [
+            self._regress(state[chosen], target[chosen])
+            for _ in range(self.ppo.epochs)
+            for chosen in self._shuffled(len(state))
+        ]
+        losses, norms = zip(*steps, strict=True)
         flown = ActionDistribution(*self.old.chunk(2, -1))
         return {
             "ppo/critic_loss": torch.stack(losses).mean(),
             "ppo/explained_variance": 1.0 - (returns - value).var() / returns.var().clamp_min(1e-8),
             "entropy": flown.entropy().mean(),
+            "gradient_norm/state_critic": torch.stack(norms).mean(),
         }
 
-    def _regress(self, state: Tensor, target: Tensor) -> Tensor:
-        """Make one gradient step of the critic; return its loss."""
+    def _regress(self, state: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Make one gradient step of the critic; return its loss and the norm of its gradient."""
         log_probabilities = self.state_critic(state).log_softmax(-1)
         loss = self.state_critic.two_hot.cross_entropy(log_probabilities, target).mean()
-        self._descend(loss, self.state_critic)
-        return loss.detach()
+        return loss.detach(), self._descend(loss, self.state_critic)

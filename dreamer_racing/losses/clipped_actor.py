@@ -14,7 +14,7 @@ Shape legend: M records of a minibatch, F features, A action.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, Self
 
@@ -139,20 +139,28 @@ class ClippedActorLoss(ActorLoss):
         """
         with torch.no_grad():
             before = torch.cat(self.actor(records.features), -1)  # (M, 2·A)
-        number, size = len(records.features), min(self.ppo.minibatch, len(records.features))
+        number = len(records.features)
         going = records.features.new_ones((), dtype=torch.bool)
         done, made = list[dict[str, Tensor]](), list[Tensor]()
         for _ in range(self.ppo.epochs):
-            order = torch.randperm(number, device=records.features.device)
-            for chosen in order.split(size):
+            for chosen in self._shuffled(number):
                 batch = Minibatch(*(value[chosen] for value in records))
                 metrics = self._minibatch(batch, before[chosen], going)
                 done.append(metrics)
                 made.append(going)
                 going = going & (metrics["ppo/kl"] <= self.ppo.kl_stop)
                 if not self._masked and not going:
-                    return _summary(done, made, math.ceil(number / size))
-        return _summary(done, made, math.ceil(number / size))
+                    return _summary(done, made, self._minibatches(number))
+        return _summary(done, made, self._minibatches(number))
+
+    def _minibatches(self, number: int) -> int:
+        """Return how many minibatches make an epoch of so many records."""
+        return math.ceil(number / self.ppo.minibatch)
+
+    def _shuffled(self, number: int) -> Sequence[Tensor]:
+        """Draw an epoch of so many records: the places of each minibatch, which differ in size by one at most."""
+        order = torch.randperm(number, device=self.pace.device)
+        return order.tensor_split(self._minibatches(number))
 
     @contextmanager
     def _paced(self) -> Iterator[None]:

@@ -162,7 +162,7 @@ class FlownPPOActorLoss(ClippedActorLoss):
             for name in self.kept:
                 self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=self.flown.device))
         else:
-            for name in self.kept:
+            for name in (*self.kept, "flown"):  # a count without steps would be taken for a full memory
                 state_dict.pop(prefix + name, None)
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._flown = int(self.flown)

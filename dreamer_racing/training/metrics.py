@@ -99,7 +99,7 @@ class MetricsLog:
 
         Raises:
             OSError: the file cannot be written; then it is as it was, and the rows go on waiting. Or a logger cannot
-                write, which they do not wait for.
+                write, which neither they nor the other loggers wait for.
         """
         rows = self._pending.rows
         if not rows:
@@ -110,16 +110,19 @@ class MetricsLog:
         self._append(rows)
         written, self._pending.rows = rows, []
         self._pending.written = written[-1][0]
+        failed: OSError | None = None
         for sink in self.loggers:
             try:
                 for env_steps, values in written:
                     sink.log_metrics(values, step=env_steps)
                 if flush := getattr(sink.experiment, "flush", None):
                     flush()
-            except OSError:
+            except OSError as error:
+                failed = failed or error
                 if renew := getattr(sink, "renew", None):
                     renew()
-                raise
+        if failed:
+            raise failed
 
     def close(self) -> None:
         """Closes the loggers that can be closed."""

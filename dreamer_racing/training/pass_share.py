@@ -29,8 +29,8 @@ class PassShare:
         num_gates: Of the track, G; 0: there is no race, and the share stays 0.
 
     Attributes:
-        best: The highest that the share has been since each gate was tried half of `MEMORY` times, 0 before: it never
-            goes back, so that what is scheduled by it does not swing with it.
+        best: The highest that the share has been since each gate's decayed count of attempts was half of `MEMORY`, 0
+            before: it never goes back, so that what is scheduled by it does not swing with it.
         known_since: env_steps at which `best` reached `KNOWN`; None before.
 
     Example:

@@ -1,7 +1,7 @@
 """A training run: collect, learn, log, evaluate, save, end.
 
-The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.every`,
-`logger.media`, `evaluation.every`, `evaluation.stochastic`, `checkpoint.every` and `checkpoint.minutes`.
+The configuration that a run reads is a recipe's: any object with the fields `total_env_steps`, `seed`, `logger.media`,
+`evaluation.stochastic` and `checkpoint.minutes`; when it logs, evaluates and saves is its journal's `Schedule`.
 
 Several processes may train together (`parallel`): they go through the loop in step, each with worlds and
 replay of its own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.

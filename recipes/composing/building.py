@@ -176,21 +176,19 @@ def make_run_replay(
     image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
     assert config.run_dir is not None, "resolve_common() names it"
-    of_all, asked = parallel.count(), f"replay.capacity={settings.capacity:,}"  # each process has such a replay
     files = RunDirectory(Path(config.run_dir)).replay if settings.storage is Storage.memmap else None
     storage_device = settings.device if files is None else "cpu"
     if storage_device == "auto":
         on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
         storage_device = config.device if on_learner else "cpu"
-    if files is None:
-        check_fits(size, storage_device, asked)
-    else:
+    if files is not None:
         shutil.rmtree(files, ignore_errors=True)  # of a run that was killed
-        check_space(size * of_all, files, asked)
+    check_room(size, settings.capacity, storage_device, files)
+    if files is not None:
         files.mkdir(parents=True, exist_ok=True)
     where = f"memory of {storage_device}" if files is None else f"files below {files}, until the process ends"
     print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in {where}")
-    print(disk_needed(config, round(size * min(of_all, config.total_env_steps / settings.capacity))))
+    print(disk_needed(config, round(size * min(parallel.count(), config.total_env_steps / settings.capacity))))
     return make_replay(
         settings.capacity,
         config.env.num_envs,
@@ -208,6 +206,25 @@ def make_run_replay(
         prefetch=2 if config.device != "cpu" and storage_device == "cpu" and latents is None else None,
         **windows,
     )
+
+
+def check_room(size: int, capacity: int, device: str, files: Path | None) -> None:
+    """Refuse replays of so many bytes and records, of which each process has one, if they do not fit together.
+
+    Args:
+        size: bytes of one.
+        capacity: its records.
+        device: whose memory it is kept in.
+        files: the folder in which it is kept instead, or None.
+
+    Raises:
+        ValueError: the message gives what is needed, what there is, and what to change.
+    """
+    asked = f"replay.capacity={capacity * parallel.count():,}"
+    if files is not None:
+        check_space(size * parallel.count(), files, asked)
+    else:
+        check_fits(size * parallel.count_here() if device == "cpu" else size, device, asked)
 
 
 def disk_needed(config: ReplayRunConfig, replay: int) -> str:
@@ -299,8 +316,8 @@ def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMet
     return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
 
 
-def begin_anew(env: Environment, curriculum: BodyRateCurriculum | None, rollouts: Rollouts, env_steps: int) -> None:
-    """Tell worlds that begin anew, in the midst of a run, how far it is."""
+def tell_how_far(env: Environment, curriculum: BodyRateCurriculum | None, rollouts: Rollouts, env_steps: int) -> None:
+    """Tell the worlds of a resumed run how far it is: they may have begun anew."""
     if curriculum:
         env.body_rate_weight = curriculum.body_rate_weight
     rollouts.begin_at(env_steps)
@@ -351,7 +368,7 @@ def assemble(
     if not rollouts.has_worlds:
         del parts["env"], parts["collector"]
     if not parallel.is_first() and isinstance(learner, DreamerLearner):
-        parts["actor_loss"] = LossState(learner.losses["actor"])
+        parts["actor_loss"] = LossState(learner.losses["actor"], learner.agent)
     periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
     parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
     checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
@@ -359,7 +376,7 @@ def assemble(
     if config.resume:
         clock.total = checkpoints.load(config.resume, may_lack=("owed", "lag", "passes", "journal", *OF_WORLDS))
         print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
-        begin_anew(env, curriculum, rollouts, counters["env_steps"])
+        tell_how_far(env, curriculum, rollouts, counters["env_steps"])
         go_on_owing(own.get("owed"), config, counters["env_steps"])
         if not journal.restored:
             journal.begin_at(counters["env_steps"])

@@ -73,7 +73,7 @@ def check_devices(config: DreamerConfig) -> None:
     Raises:
         ValueError: the message says what there is.
     """
-    here, there = int(os.environ.get("LOCAL_WORLD_SIZE", parallel.count())), torch.cuda.device_count()
+    here, there = parallel.count_here(), torch.cuda.device_count()
     for name, device in (("device", config.device), ("env.device", config.env.device)):
         if not device.startswith("cuda"):
             continue

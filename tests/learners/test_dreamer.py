@@ -9,7 +9,14 @@ from tensordict import TensorDict
 from dreamer_racing.learners.dreamer import make_dreamer
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.learners.learner import seeded
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, LossConfig, ReinforceLoss, make_losses
+from dreamer_racing.losses import (
+    ACTOR_LOSSES,
+    WORLD_MODEL_LOSSES,
+    LossConfig,
+    ReconstructionLoss,
+    ReinforceLoss,
+    make_losses,
+)
 from dreamer_racing.modules import SIZES, Agent, Interface, get_size
 from tests.dreamers import learner_of
 
@@ -427,7 +434,37 @@ def test_another_learner_s_weights_are_those_that_flew_and_nothing_that_it_kept(
 def test_state_of_an_actor_that_learned_otherwise_is_refused_before_anything_changes(first, second):
     saved, learner = (learner_of(seed=seed, **CONFIG | {"actor": kind}) for seed, kind in ((0, first), (1, second)))
     saved.update(make_batch())
-    assert_refused(saved, learner, "loss.actor|trained with another loss")
+    assert_refused(saved, learner, r"loss.actor that it was trained with, or begin a run with its weights \(init_from=")
+
+
+@pytest.mark.parametrize("first", ["reinforce", "ppo", "flown_ppo"])
+@pytest.mark.parametrize("second", ["reinforce", "ppo", "flown_ppo"])
+def test_weights_are_taken_over_whatever_the_actor_learned_by(first, second):
+    saved, learner = (learner_of(seed=seed, **CONFIG | {"actor": kind}) for seed, kind in ((0, first), (1, second)))
+    learner.adopt(copy.deepcopy(saved.state_dict()))
+    flew = dict(saved.agent.named_parameters())
+    assert all(torch.equal(value, flew[name]) for name, value in learner.agent.named_parameters())
+
+
+class CriticOfItsOwn(ReconstructionLoss):
+    """With a network under a name that the agent's networks have, too."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.critic = torch.nn.Linear(self.world_model.size.features, 1)
+
+    def represent(self, posterior, features, embedding, tensordict):
+        losses = super().represent(posterior, features, embedding, tensordict)
+        return losses | {"loss_own": self.critic(features).square().mean()}
+
+
+def test_a_loss_s_own_network_is_saved_under_whatever_name(monkeypatch):
+    monkeypatch.setitem(WORLD_MODEL_LOSSES, "own", CriticOfItsOwn)
+    saved, learner = (learner_of(seed=seed, **CONFIG | {"world_model": "own"}) for seed in (0, 1))
+    saved.update(make_batch())
+    learner.load_state_dict(copy.deepcopy(saved.state_dict()))
+    here, there = (of.losses["world_model"].critic.weight for of in (learner, saved))
+    assert torch.equal(here, there)
 
 
 def test_a_loss_that_is_no_scalar_is_refused_by_name():
@@ -524,6 +561,17 @@ def test_composing_by_names_draws_the_weights_that_composing_by_hand_does(actor)
     drawn = losses["world_model"].privileged_decoder.state_dict()
     for name, value in named.losses["world_model"].privileged_decoder.state_dict().items():
         assert torch.equal(value, drawn[name]), name
+
+
+def test_a_seed_is_of_the_cpu_s_generator_alone(monkeypatch):
+    """Weights are drawn there; a CUDA device's generator, which the policy's noise comes from, keeps its own seed."""
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", lambda seed: pytest.fail("CUDA was seeded"))
+    before = torch.get_rng_state()
+    with seeded(3):
+        first = torch.rand(1)
+    with seeded(3):
+        assert torch.equal(torch.rand(1), first)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 @pytest.mark.skipif(torch.__version__ < "2.13", reason="trunc_normal_ of torch before 2.13 draws other numbers")

@@ -143,6 +143,9 @@ def test_networks_for_other_images_are_refused() -> None:
     learner = PPOLearner(SMALL, Interface(image_size=64), seed=0)
     with pytest.raises(ValueError, match=r"env.image_size=96, this learner's with 64"):
         learner.load_state_dict(PPOLearner(SMALL, Interface(image_size=96), seed=0).state_dict())
+    of_numbers = Interface(pixels=False, vector_dim=21)
+    with pytest.raises(ValueError, match=r"env.from_pixels=false, this learner's with true: set env.from_pixels=false"):
+        learner.load_state_dict(PPOLearner(SMALL, of_numbers, seed=0).state_dict())
 
 
 @pytest.mark.parametrize(("minibatches", "steps"), [(1, 1), (7, 7), (48, 48)])

@@ -114,6 +114,15 @@ def test_a_checkpoint_goes_on_with_masks_or_without(monkeypatch: pytest.MonkeyPa
     assert [group["fused"] for group in back.losses["actor"].optimizer.param_groups] == [None, None]
 
 
+@pytest.mark.parametrize(("number", "sizes"), [(32, [16, 16]), (36, [12, 12, 12]), (17, [9, 8]), (5, [5])])
+def test_no_minibatch_is_a_small_rest(number: int, sizes: list[int]) -> None:
+    """Each makes a step of full size, and the divergence of the last one sets the pace."""
+    loss = asymmetric.make_learner(ppo=replace(PPO, minibatch=16)).losses["actor"]
+    places = loss._shuffled(number)
+    assert [len(each) for each in places] == sizes
+    assert torch.cat(list(places)).sort().values.tolist() == list(range(number))
+
+
 def test_a_bound_that_came_down_since_the_flight_is_no_divergence_of_the_steps() -> None:
     learner = asymmetric.make_learner(ppo=replace(PPO, kl_stop=0.05, kl_target=0.05, learning_rate=1e-5))
     loss = learner.losses["actor"]

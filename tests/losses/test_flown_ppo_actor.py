@@ -194,6 +194,17 @@ def test_a_checkpoint_between_two_improvements_loses_nothing():
         assert torch.equal(value, resumed.agent.state_dict()[name]), name
 
 
+def test_steps_of_another_kind_are_forgotten_with_their_number():
+    """A full memory of a loss that keeps less: nothing is there to improve on, instead of a count without steps."""
+    learner, other = make_learner(), make_learner()
+    while actor_loss(learner)._flown < len(actor_loss(learner).reward) or not actor_loss(learner)._flown:
+        learner.watch(make_rollout(learner))
+    state = learner.state_dict()
+    del state["losses"]["actor"]["old"]
+    other.load_state_dict(state)
+    assert actor_loss(other).improve(1) == {}
+
+
 def test_flights_of_another_number_of_environments_begin_anew():
     learner = make_learner()
     learner.watch(make_rollout(learner, 3))

@@ -93,6 +93,19 @@ def test_shares_add_up_to_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [own.seed for own in shares] == [3, 1_000_003]
 
 
+def test_replays_of_all_processes_must_fit_together(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    building, machine = recipe_module("composing.building"), sys.modules["dreamer_racing.machine"]
+    monkeypatch.setattr(machine, "available_memory", lambda device: 3_000_000_000)
+    building.check_room(1_000_000_000, 500, "cpu", None)
+    monkeypatch.setattr(parallel._here, "processes", 4)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    with pytest.raises(ValueError, match=r"replay.capacity=2,000 needs 4.0 GB when full, and cpu has 3.0 GB left"):
+        building.check_room(1_000_000_000, 500, "cpu", None)
+    building.check_room(1_000_000_000, 500, "cuda", None)  # each has a device of its own
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    building.check_room(1_000_000_000, 500, "cpu", None)  # the others are on another machine
+
+
 @pytest.mark.parametrize(
     ("overrides", "processes", "words"),
     [

@@ -237,6 +237,29 @@ def test_tensorboard_goes_on_after_a_write_that_failed(tmp_path, monkeypatch):
     assert [row["env_steps"] for row in read(tmp_path)] == ["10", "20", "30"]
 
 
+def test_a_logger_that_cannot_write_takes_no_row_from_those_after_it(tmp_path):
+    got: list[int] = []
+
+    class Full:
+        experiment = None
+
+        def log_metrics(self, values: dict[str, float], step: int) -> None:
+            raise OSError(28, "No space left on device")
+
+    class Other:
+        experiment = None
+
+        def log_metrics(self, values: dict[str, float], step: int) -> None:
+            got.append(step)
+
+    log = MetricsLog(tmp_path, [Full(), Other()])
+    for step in (10, 20):
+        log.push({"loss": 1.0})
+        with pytest.raises(OSError, match="No space left"):
+            log.write(step)
+    assert got == [10, 20]
+
+
 def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from torchrl.record.loggers.csv import CSVLogger
