@@ -29,6 +29,7 @@ from composing.launching import launch
 from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
 from composing.schema import CollectorKind, DreamerConfig, register
 from composing.sharing import imagines, share_of
+from composing.tuned import changed_from_tuned
 from composing.workers import make_own_env, make_rollouts, place_worlds, resolve_workers
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -227,8 +228,11 @@ def resolve(config: DictConfig) -> DictConfig:
         if config.model.cuda_graph:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
     if config.tuned == "race":
-        hours = config.total_env_steps / RACE_SPEED / 3600
-        print(f"length: {config.total_env_steps:,} env_steps, {hours:.1f} hours at one core's {RACE_SPEED} a second")
+        if changed := changed_from_tuned(config):
+            print(f"  but as asked for: {', '.join(changed)}")
+        minutes = config.total_env_steps / RACE_SPEED / 60
+        time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
+        print(f"length: {config.total_env_steps:,} env_steps, {time} at one core's {RACE_SPEED} a second")
     if config.replay.held_out is None:
         worlds = config.env.num_envs // parallel.asked_for()  # of the first process, which holds them out
         config.replay.held_out = int(worlds >= FEW_WORLDS)

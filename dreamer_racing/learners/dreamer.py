@@ -23,6 +23,7 @@ from dreamer_racing.learners.dreamer_optimizer import gradient_norms, make_optim
 from dreamer_racing.learners.finite_guard import FiniteGuard
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
 from dreamer_racing.learners.saved_dreamer import (
+    Unmatched,
     check_optimizers,
     check_saved,
     check_weights,
@@ -400,23 +401,26 @@ class DreamerLearner:
             restore(self._actor_optimizer, state_dict["actor_optimizer"])
         self.updates = state_dict["updates"]
 
-    def adopt(self, state_dict: dict[str, Any]) -> None:
+    def adopt(self, state_dict: dict[str, Any]) -> Unmatched:
         """Take over the weights of what another learner's ``state_dict`` returned, whatever its actor's loss.
 
         They are those that flew, so the averaged ones where it kept them, and nothing else: no optimiser, no counters,
         no bounds of the actor's deviation, and nothing that losses keep from update to update: neither flown steps nor
-        statistics.
+        statistics. A network of a loss's own that it has not, as the critic of the state, begins anew.
+
+        Returns:
+            The losses' own networks that begin anew, and those that are left behind.
 
         Raises:
-            ValueError: If it is that of a model of another size, lacks a network of a loss's own, or is of another
-                environment; nothing is changed then.
+            ValueError: If it is that of a model of another size or of another environment; nothing is changed then.
         """
-        check_weights(state_dict, self.agent, self.losses)
+        unmatched = check_weights(state_dict, self.agent, self.losses)
         flying = state_dict.get("averaged", state_dict["agent"])
         for agent in filter(None, (self.agent, self.averaged)):
             load_parameters(agent, flying)
         for name, loss in self.losses.items():
             load_parameters(loss, state_dict["losses"][name])
+        return unmatched
 
     @property
     def _groups(self) -> list[dict[str, Any]]:

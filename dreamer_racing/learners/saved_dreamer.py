@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -67,26 +67,43 @@ def check_saved(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> N
     _check_parts(parts, saved, agent)
 
 
-def check_weights(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> None:
-    """Refuse what another learner saved, if the weights of this one are not in it; what else is there is no matter.
+class Unmatched(NamedTuple):
+    """Networks of losses' own, by name, that only one of two learners has."""
+
+    anew: list[str]
+    """Those of the learner that takes weights over: they begin anew."""
+    left: list[str]
+    """Those of the saved one: they are left behind."""
+
+
+def check_weights(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) -> Unmatched:
+    """Refuse what another learner saved, if the agent's networks are not in it.
 
     Args:
         saved: ``state_dict()`` of a learner.
         agent: The networks that are to load it.
-        losses: Theirs.
+        losses: Theirs; of networks that they have of their own, those that are there must be of the same shapes.
+
+    Returns:
+        The losses' own networks that only one of the two has.
 
     Raises:
-        ValueError: If it is that of a model of another size, lacks a network of a loss's own, or is of another
-            environment.
+        ValueError: If it is that of a model of another size or of another environment.
     """
     check_size(saved["size"], agent.size)
     parts = _networks(saved, agent)
+    unmatched = Unmatched([], [])
     for name, loss in losses.items():
         kept = {key for key, _ in loss.named_buffers()}
-        wanted = {key: value for key, value in own_state(loss, agent).items() if key not in kept}
-        there = saved["losses"][name]
+        here = {key: value for key, value in own_state(loss, agent).items() if key not in kept}
+        there = {key: value for key, value in saved["losses"][name].items() if "." in key}  # those of networks
+        ours, theirs = ({key.partition(".")[0] for key in state} for state in (here, there))
+        unmatched.anew.extend(sorted(ours - theirs))
+        unmatched.left.extend(sorted(theirs - ours - {child for child, _ in loss.named_children()}))
+        wanted = {key: value for key, value in here.items() if key.partition(".")[0] in theirs}
         parts[f"{name} loss"] = wanted, {key: there[key] for key in wanted if key in there}
     _check_parts(parts, saved, agent)
+    return unmatched
 
 
 def check_optimizers(saved: dict[str, Any], of_actor: bool) -> None:

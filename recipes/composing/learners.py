@@ -77,9 +77,12 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
         state, metadata = load_state(folder, "learner")
-        learner.adopt(state)
+        unmatched = learner.adopt(state)
         kind = "the averaged ones" if "averaged" in state else "all those"
-        return f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=)"
+        line = f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic, too"
+        if unmatched.anew:
+            line += f"; {' and '.join(unmatched.anew)}, which that run had not, begins anew"
+        return line + (f"; left behind: {' and '.join(unmatched.left)}" if unmatched.left else "")
     contract = read_contract(folder / CONTRACT)
     check_size(contract["model"], learner.size)
     if not isinstance(env, DroneRacingEnv):

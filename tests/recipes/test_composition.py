@@ -377,3 +377,18 @@ def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
             build("init_from=nowhere", f"run_dir={tmp_path}")
         assert "init_from=nowhere" in capsys.readouterr().err
     assert (tmp_path / "log.txt").exists()
+
+
+def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing for the settings as they are; else each with what the file has, also of a group that it takes."""
+    recipe = recipe_module("dreamer_v3")
+    recipe.resolve(compose("dreamer_v3", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
+    assert "as asked for" not in capsys.readouterr().out
+    changed = ["loss=reconstruction", "loss.actor=flown_ppo", "schedule.kl_target.to=null", "replay.context=false"]
+    recipe.resolve(compose("dreamer_v3", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
+    for words in (
+        "loss.world_model=reconstruction (privileged)", "loss.actor=flown_ppo (asymmetric_ppo)",
+        "schedule.kl_target.to=null (0.004)", "replay.context=false (true)", "loss.drift_scale=0.0 (1.0)",
+    ):  # fmt: skip
+        assert words in line
