@@ -198,7 +198,7 @@ def _read_config(directory: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not YAML") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path} holds no settings")
-    flat = dict(_flatten(config))
+    flat = dict(flatten(config))
     if described := flat.get("track_description"):  # long; it need only tell one track from another
         flat["track_description"] = hashlib.sha256(str(described).encode()).hexdigest()[:8]
     return flat
@@ -214,10 +214,11 @@ def _read_overrides(directory: Path) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested settings with its dotted name."""
     for name, value in config.items():
         if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{name}.")
+            yield from flatten(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
 

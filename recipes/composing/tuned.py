@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from enum import Enum
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from composing.command_line import CONFIG_DIR
+from dreamer_racing.figures.runs import flatten
 
 
 def changed_from_tuned(config: DictConfig) -> list[str]:
@@ -27,7 +27,7 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
     numbers.pop("tuned")
     return [
         f"{name}={said(value)} ({said(there)})"
-        for name, there in leaves(numbers)
+        for name, there in flatten(numbers)
         if plain(value := OmegaConf.select(config, name)) != there
     ]
 
@@ -35,15 +35,6 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
 def numbers_of(group: str, name: str) -> dict[str, Any]:
     """Return what a file of a group has."""
     return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(CONFIG_DIR / group / f"{name}.yaml")))
-
-
-def leaves(numbers: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every value of nested settings with its dotted name."""
-    for name, value in numbers.items():
-        if isinstance(value, dict):
-            yield from leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def plain(value: Any) -> Any:
