@@ -33,7 +33,7 @@ import torch
 from learning_signal import restore, restore_replay
 from measuring import print_table, write_json
 from omegaconf import OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
@@ -138,18 +138,16 @@ def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[s
     config = config_of(checkpoint)
     learner, counters = restore(config, checkpoint)
     features, state = fly(config, learner)
-    learned, measured = (
-        TensorDict({"features": features[worlds].flatten(0, 1), PRIVILEGED: state[worlds].flatten(0, 1)})
-        for worlds in (slice(MEASURED, None), slice(MEASURED))
-    )
+    learned = features[MEASURED:].flatten(0, 1), state[MEASURED:].flatten(0, 1)
+    measured = features[:MEASURED].flatten(0, 1), state[:MEASURED].flatten(0, 1)
     torch.manual_seed(0)
     probe = Probe(features.shape[-1], state.shape[-1])
-    variance = symlog(measured[PRIVILEGED]).var(0).mean()
+    variance = symlog(measured[1]).var(0).mean()
     for number in range(1, updates + 1):
-        drawn = torch.randint(len(learned["features"]), (MINIBATCH,))
-        probe.learn(learned["features"][drawn], learned[PRIVILEGED][drawn])
+        drawn = torch.randint(len(learned[0]), (MINIBATCH,))
+        probe.learn(*(part[drawn] for part in learned))
         if number % every == 0:
-            error = probe.error(measured["features"], measured[PRIVILEGED]).item()
+            error = probe.error(*measured).item()
             yield {
                 "benchmark": "seeing", "track": config.track, "run": RunDirectory.of(checkpoint).path.name,
                 "env_steps": counters["env_steps"], "trained_updates": counters["updates"], "variant": "as it flies",
@@ -160,8 +158,7 @@ def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[s
 @torch.no_grad()
 def fly(config: DreamerConfig, learner: DreamerLearner) -> tuple[Tensor, Tensor]:
     """Let the agent fly, and return its latents `(WORLDS, STEPS, F)` and the state `(WORLDS, STEPS, P)` that it saw."""
-    env_config = replace(config.env, num_envs=WORLDS, start_on_line=0.5, start_at_gate=0.0)
-    config = replace(config, env=env_config)
+    config = replace(config, env=replace(config.env, num_envs=WORLDS, start_on_line=0.5, start_at_gate=0.0))
     shown = replace(config.loss, actor="asymmetric_ppo")  # that actor's critic reads the state, so the worlds tell it
     env = make_env(replace(config, loss=shown))
     collector = make_collector(config, env, learner.policy())

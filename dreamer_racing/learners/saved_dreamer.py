@@ -96,10 +96,11 @@ def check_weights(saved: dict[str, Any], agent: Agent, losses: nn.ModuleDict) ->
     for name, loss in losses.items():
         kept = {key for key, _ in loss.named_buffers()}
         here = {key: value for key, value in own_state(loss, agent).items() if key not in kept}
-        there = {key: value for key, value in saved["losses"][name].items() if "." in key}  # those of networks
+        there = saved["losses"][name]
         ours, theirs = ({key.partition(".")[0] for key in state} for state in (here, there))
+        networks = {key.partition(".")[0] for key in there if "." in key}  # the others may be what that loss kept
         unmatched.anew.extend(sorted(ours - theirs))
-        unmatched.left.extend(sorted(theirs - ours - {child for child, _ in loss.named_children()}))
+        unmatched.left.extend(sorted(networks - ours - {child for child, _ in loss.named_children()}))
         wanted = {key: value for key, value in here.items() if key.partition(".")[0] in theirs}
         parts[f"{name} loss"] = wanted, {key: there[key] for key in wanted if key in there}
     _check_parts(parts, saved, agent)
@@ -165,8 +166,9 @@ Parts = dict[str, tuple[dict[str, Tensor], dict[str, Tensor]]]
 
 
 def _networks(saved: dict[str, Any], agent: Agent) -> Parts:
-    older = {f"actor.{name}": agent.actor.get_buffer(name) for name in ("min_std", "max_std")}  # they do not say
-    return {"networks": (agent.state_dict(), older | saved["agent"])}
+    """Return the agent's part; where an older checkpoint does not say the deviation's bounds, with the agent's own."""
+    bounds = {f"actor.{name}": agent.actor.get_buffer(name) for name in ("min_std", "max_std")}
+    return {"networks": (agent.state_dict(), bounds | saved["agent"])}
 
 
 def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:

@@ -166,7 +166,7 @@ def cores() -> Iterator[Diagnosis]:
     found = f"{available}, load {load:.1f}"
     yield Diagnosis("cores", Verdict.note if busy else Verdict.fine, found, remedy if busy else "")
     threads = os.environ.get("OMP_NUM_THREADS")
-    outside = (threads or "").partition(",")[0].strip()  # of "4,2", which is 4 outside and 2 within each
+    outside = (threads or "").partition(",")[0].strip()  # of "4,2"; without `machine`, which imports torch
     too_many = outside.isdecimal() and int(outside) > available
     found = f"OMP_NUM_THREADS={threads}" if threads else "as many as cores"
     remedy = f"OMP_NUM_THREADS={available}: more threads than cores wait for each other" if too_many else ""

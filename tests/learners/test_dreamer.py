@@ -458,10 +458,11 @@ class CriticOfItsOwn(ReconstructionLoss):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.critic = torch.nn.Linear(self.world_model.size.features, 1)
+        self.scale = torch.nn.Parameter(torch.rand(()))
 
     def represent(self, posterior, features, embedding, tensordict):
         losses = super().represent(posterior, features, embedding, tensordict)
-        return losses | {"loss_own": self.critic(features).square().mean()}
+        return losses | {"loss_own": self.scale * self.critic(features).square().mean()}
 
 
 def test_a_loss_s_own_network_is_saved_under_whatever_name(monkeypatch):
@@ -471,6 +472,9 @@ def test_a_loss_s_own_network_is_saved_under_whatever_name(monkeypatch):
     learner.load_state_dict(copy.deepcopy(saved.state_dict()))
     here, there = (of.losses["world_model"].critic.weight for of in (learner, saved))
     assert torch.equal(here, there)
+    begun = learner_of(seed=2, **CONFIG | {"world_model": "own"})
+    assert begun.adopt(copy.deepcopy(saved.state_dict())) == ([], [])
+    assert torch.equal(begun.losses["world_model"].scale, saved.losses["world_model"].scale)
 
 
 def test_a_loss_that_is_no_scalar_is_refused_by_name():
