@@ -14,10 +14,11 @@ symlogs on windows that the run never trains on, the same ones for all variants.
 run's own, which stands still and goes on from the latents stored, and the probe alone learns.
 With `--flown` it is probed in what the agent flies now, sampling, in 64 worlds of which half begin on a line: from the
 latents with which it acts, 52 worlds for the probe and 12 to measure; so any run can be compared, whatever its replay.
-`share` is `probe` by their variance,
-`trained` the error of the last batch, `seconds` the process's time in updates. The checkpoint must hold a replay, so no
-best/, and the run must have been given the state: `loss=privileged` or `informed`, or `loss.actor=asymmetric_ppo`;
-but for `--flown`.
+`share` is `probe` by their variance, `trained` the error of the last batch, `seconds` the process's time in updates.
+A probe that learns beside the model is late where the state is told in a tangled way: so in each last row the model
+stands still, the probe learns on for 2,000 updates, and `linear` is the share that the best linear map does not tell.
+The checkpoint must hold a replay, so no best/, and the run must have been given the state: `loss=privileged` or
+`informed`, or `loss.actor=asymmetric_ppo`; but for `--flown`.
 """
 
 import argparse
@@ -57,7 +58,8 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
 WORLDS, MEASURED, STEPS, MINIBATCH = 64, 12, 704, 512  # with --flown: worlds, those held out, steps, records an update
-COLUMNS = ["variant", "updates", "seconds", "probe", "share", "error", "image_error", "reward_error", "kl"]
+SETTLE, SETTLE_BATCHES, RIDGE = 2_000, 200, 1e-2  # updates of the probe on a model that stands still, on these batches
+COLUMNS = ["variant", "updates", "seconds", "probe", "share", "linear", "error", "image_error", "reward_error", "kl"]
 
 
 def main() -> None:
@@ -131,6 +133,50 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
                 "updates": number, "seconds": seconds, "probe": probed, "share": probed / variance.item(),
                 "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
+    batches = [replay.sample() for _ in range(SETTLE_BATCHES)]
+    for batch in () if as_trained else batches:
+        batch.pop(CONTEXT, None)
+    with torch.no_grad(), context:
+        learned = torch.cat([latents_of(loss(batch)).flatten(0, 1) for batch in batches])
+        measured = latents_of(loss(test)).flatten(0, 1)
+    shown = torch.cat([batch[PRIVILEGED].flatten(0, 1) for batch in batches])
+    yield {
+        "benchmark": "seeing", "track": config.track, "env_steps": counters["env_steps"],
+        "trained_updates": counters["updates"], "variant": f"{variant}, standing still", "updates": updates,
+        **settle(probe, learned, shown, measured, test[PRIVILEGED].flatten(0, 1), SETTLE),
+    }  # fmt: skip
+
+
+def settle(
+    probe: "Probe", learned: Tensor, shown: Tensor, measured: Tensor, state: Tensor, updates: int
+) -> dict[str, float]:
+    """Let the probe learn of latents that stand still, and return what it and a linear map do not tell of others.
+
+    Args:
+        probe: To train.
+        learned: Latents to learn from, `(M, F)`.
+        shown: Their state, `(M, P)`.
+        measured: Others, `(N, F)`.
+        state: Theirs, `(N, P)`.
+        updates: Of the probe.
+    """
+    for _ in range(updates):
+        drawn = torch.randint(len(learned), (MINIBATCH,))
+        probe.learn(learned[drawn], shown[drawn])
+    with torch.no_grad():
+        error, variance = probe.error(measured, state).item(), symlog(state).var(0).mean().item()
+    linear = linear_error(learned, shown, measured, state)
+    return {"probe": error, "share": error / variance, "linear": linear / variance}
+
+
+@torch.no_grad()
+def linear_error(learned: Tensor, learned_state: Tensor, measured: Tensor, measured_state: Tensor) -> float:
+    """Return the mean squared error of symlogs of the best linear map from latents `(M, F)` to the state `(M, P)`."""
+    ones, identity = learned.new_ones(len(learned), 1), torch.eye(learned.shape[-1] + 1)
+    latents = torch.cat((learned, ones), 1)
+    weights = torch.linalg.solve(latents.T @ latents + RIDGE * identity, latents.T @ symlog(learned_state))
+    told = torch.cat((measured, ones[:1].expand(len(measured), 1)), 1) @ weights
+    return (told - symlog(measured_state)).square().mean().item()
 
 
 def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[str, Any]]:
@@ -142,17 +188,12 @@ def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[s
     measured = features[:MEASURED].flatten(0, 1), state[:MEASURED].flatten(0, 1)
     torch.manual_seed(0)
     probe = Probe(features.shape[-1], state.shape[-1])
-    variance = symlog(measured[1]).var(0).mean()
-    for number in range(1, updates + 1):
-        drawn = torch.randint(len(learned[0]), (MINIBATCH,))
-        probe.learn(*(part[drawn] for part in learned))
-        if number % every == 0:
-            error = probe.error(*measured).item()
-            yield {
-                "benchmark": "seeing", "track": config.track, "run": RunDirectory.of(checkpoint).path.name,
-                "env_steps": counters["env_steps"], "trained_updates": counters["updates"], "variant": "as it flies",
-                "updates": number, "probe": error, "share": error / variance.item(),
-            }  # fmt: skip
+    for number in range(every, updates + 1, every):
+        yield {
+            "benchmark": "seeing", "track": config.track, "run": RunDirectory.of(checkpoint).path.name,
+            "env_steps": counters["env_steps"], "trained_updates": counters["updates"], "variant": "as it flies",
+            "updates": number, **settle(probe, *learned, *measured, every),
+        }  # fmt: skip
 
 
 @torch.no_grad()

@@ -245,6 +245,7 @@ def load_shares(folder: Path) -> None:
 
 CONFIGS = {
     "asymmetric_ppo": ASYMMETRIC,
+    "latent_ppo": replace(ASYMMETRIC, actor="latent_ppo"),
     "ppo": LossConfig(actor="ppo", world_model="privileged", ppo=replace(PPO, updates=3, minibatch=10**6)),
     # A scale that is of the last returns alone, and an entropy that moves the actor.
     "reinforce": LossConfig(actor="reinforce", world_model="privileged", return_decay=0.0, entropy_scale=0.3),

@@ -18,6 +18,8 @@ from dreamer_racing.losses.config import HORIZON, ActorPPOConfig, LossConfig
 from dreamer_racing.losses.critic import CriticLoss, replay_return
 from dreamer_racing.losses.flown_ppo_actor import FlownPPOActorLoss
 from dreamer_racing.losses.imagination import Imagination, imagine, lambda_return
+from dreamer_racing.losses.latent_ppo_actor import LatentPPOActorLoss
+from dreamer_racing.losses.own_critic_actor import OwnCriticActorLoss
 from dreamer_racing.losses.ppo_actor import PPOActorLoss
 from dreamer_racing.losses.representation import (
     DecoderFreeLoss,
@@ -44,6 +46,7 @@ ACTOR_LOSSES: dict[str, type[ActorLoss]] = {
     "dynamics": DynamicsActorLoss,
     "ppo": PPOActorLoss,
     "flown_ppo": FlownPPOActorLoss,
+    "latent_ppo": LatentPPOActorLoss,
     "asymmetric_ppo": AsymmetricPPOActorLoss,
 }
 CRITIC_LOSSES: dict[str, type[CriticLoss]] = {"two_hot": CriticLoss}
@@ -118,7 +121,9 @@ __all__ = [
     "FlownPPOActorLoss",
     "Imagination",
     "InformedLoss",
+    "LatentPPOActorLoss",
     "LossConfig",
+    "OwnCriticActorLoss",
     "PPOActorLoss",
     "PrivilegedLoss",
     "ReconstructionLoss",

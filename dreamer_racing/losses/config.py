@@ -20,8 +20,8 @@ class ActorPPOConfig:
 
     Attributes:
         updates: ``actor=ppo``: K, learner updates whose imagined rollouts are kept before the actor learns from them.
-        flown: ``actor=flown_ppo``, ``asymmetric_ppo``: steps, summed over environments, that are flown before the actor
-            learns from them.
+        flown: ``actor=flown_ppo``, ``latent_ppo``, ``asymmetric_ppo``: steps, summed over environments, that are
+            flown before the actor learns from them.
         epochs: Times that every step is trained on.
         minibatch: M, steps of a gradient step.
         clip_epsilon: ε of the clipped ratio. Reference: Schulman et al. 2017.
@@ -32,7 +32,7 @@ class ActorPPOConfig:
             1.5 times more, and the next improvement is made at a lower one, 1.5 times less, and at a higher one; None:
             it stays. Reference: Schulman et al. 2017, Section 4, who steer the weight of a KL penalty so.
         learning_rate: Of Adam; the largest, where there is a ``kl_target``.
-        critic_learning_rate: ``actor=asymmetric_ppo``: of the critic that sees the simulator's state.
+        critic_learning_rate: ``actor=latent_ppo``, ``asymmetric_ppo``: of the critic that learns from what is flown.
         gradient_clip: Largest norm of the gradient, of the actor or that critic.
     """
 
@@ -56,7 +56,7 @@ class LossConfig:
     Attributes:
         world_model: ``reconstruction``, ``informed``, ``privileged``, ``decoder_free``, ``reward_only``, or
             ``module:Class`` of your own, as for the other two.
-        actor: ``reinforce``, ``dynamics``, ``ppo``, ``flown_ppo`` or ``asymmetric_ppo``.
+        actor: ``reinforce``, ``dynamics``, ``ppo``, ``flown_ppo``, ``latent_ppo`` or ``asymmetric_ppo``.
         critic: ``two_hot``.
         discount: γ.
         lambda_: λ of the returns.
@@ -81,7 +81,7 @@ class LossConfig:
         slow_critic_scale: Weight of the regularisation towards the slow critic.
         replay_value_scale: Weight of the critic's loss on replayed returns; 0 turns it off.
         replay_value_gradient: Whether that loss also trains the world model's representation, as in the reference.
-        ppo: Numbers of ``actor=ppo``, ``actor=flown_ppo`` and ``actor=asymmetric_ppo``.
+        ppo: Numbers of ``actor=ppo``, ``flown_ppo``, ``latent_ppo`` and ``asymmetric_ppo``.
 
     Reference: danijar/dreamerv3, ``configs.yaml``.
     """

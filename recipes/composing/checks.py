@@ -36,10 +36,10 @@ from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import (
     ActorLoss,
     ActorPPOConfig,
-    AsymmetricPPOActorLoss,
     DecoderFreeLoss,
     FlownPPOActorLoss,
     LossConfig,
+    OwnCriticActorLoss,
     PPOActorLoss,
     PrivilegedLoss,
     ReconstructionLoss,
@@ -53,6 +53,7 @@ from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.schedule import RampClock
 
+PPO_ACTORS = "loss.actor=ppo, flown_ppo, latent_ppo or asymmetric_ppo"
 RACE_ONLY = (
     "env.control_rate",
     "env.start_beyond_gate",
@@ -102,11 +103,11 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
-        ("loss.ppo", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
-        ("schedule.kl_target", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
+        ("loss.ppo", _is(actor, ClippedActorLoss), PPO_ACTORS),
+        ("schedule.kl_target", _is(actor, ClippedActorLoss), PPO_ACTORS),
         ("loss.ppo.updates", _is(actor, PPOActorLoss), "loss.actor=ppo"),
-        ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo or asymmetric_ppo"),
-        ("loss.ppo.critic_learning_rate", _is(actor, AsymmetricPPOActorLoss), "loss.actor=asymmetric_ppo"),
+        ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo, latent_ppo or asymmetric_ppo"),
+        ("loss.ppo.critic_learning_rate", _is(actor, OwnCriticActorLoss), "loss.actor=latent_ppo or asymmetric_ppo"),
         ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
         ("loss.image_share", images, "loss=reconstruction or informed, from images"),
         ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
@@ -115,7 +116,7 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
         ("loss.drift_scale", drift, "records that keep latents, replay.context=true, as they are, model.sampled=false"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
-        ("schedule.wait_for_model", _is(actor, ClippedActorLoss), "loss.actor=ppo, flown_ppo or asymmetric_ppo"),
+        ("schedule.wait_for_model", _is(actor, ClippedActorLoss), PPO_ACTORS),
         ("schedule.wait_every", waits, "schedule.wait_for_model, of an actor that steps alone"),
     ):
         for leaf in given:

@@ -99,7 +99,7 @@ def check_captured(config: DreamerConfig) -> None:
         raise ValueError(
             f"model.cuda_graph=true: loss.actor={config.loss.actor} exchanges imagined returns between "
             f"{parallel.count()} processes in the midst of an update. Set model.cuda_graph=false, or choose "
-            "loss.actor=asymmetric_ppo, which imagines nothing."
+            "loss.actor=latent_ppo or asymmetric_ppo, which imagine nothing."
         )
 
 

@@ -437,17 +437,20 @@ def test_state_of_an_actor_that_learned_otherwise_is_refused_before_anything_cha
     assert_refused(saved, learner, r"loss.actor that it was trained with, or begin a run with its weights \(init_from=")
 
 
-@pytest.mark.parametrize("first", ["reinforce", "ppo", "flown_ppo", "asymmetric_ppo"])
-@pytest.mark.parametrize("second", ["reinforce", "ppo", "flown_ppo", "asymmetric_ppo"])
+OWN_CRITICS = {"latent_ppo": "latent_critic", "asymmetric_ppo": "state_critic"}
+
+
+@pytest.mark.parametrize("first", ["reinforce", "ppo", "flown_ppo", *OWN_CRITICS])
+@pytest.mark.parametrize("second", ["reinforce", "ppo", "flown_ppo", *OWN_CRITICS])
 def test_weights_are_taken_over_whatever_the_actor_learned_by(first, second):
     interface = Interface(privileged_dim=7)
     saved, learner = (
         make_dreamer("debug", interface, LossConfig(actor=kind), seed=seed) for seed, kind in ((0, first), (1, second))
     )
-    of_one = [kind for kind in (first, second) if kind == "asymmetric_ppo"] if first != second else []
+    begins, is_left = ([OWN_CRITICS[kind]] if kind in OWN_CRITICS else [] for kind in (second, first))
     unmatched = learner.adopt(copy.deepcopy(saved.state_dict()))
-    assert unmatched.anew == (["state_critic"] if of_one == [second] else [])
-    assert unmatched.left == (["state_critic"] if of_one == [first] else [])
+    assert unmatched.anew == ([] if first == second else begins)
+    assert unmatched.left == ([] if first == second else is_left)
     flew = dict(saved.agent.named_parameters())
     assert all(torch.equal(value, flew[name]) for name, value in learner.agent.named_parameters())
 

@@ -76,7 +76,7 @@ def test_a_gradient_that_is_no_number_leaves_weights_and_moments_as_they_were(mo
         torch.testing.assert_close(after, before, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("actor", ["asymmetric_ppo", "flown_ppo"])
+@pytest.mark.parametrize("actor", ["asymmetric_ppo", "latent_ppo", "flown_ppo"])
 def test_a_masked_improvement_waits_for_nothing(monkeypatch: pytest.MonkeyPatch, actor: str) -> None:
     monkeypatch.setattr(clipped_actor, "masks_steps", lambda device: True)
     learner = asymmetric.make_learner(actor=actor, ppo=replace(PPO, flown=N * T, kl_target=0.01, kl_stop=0.02))

@@ -76,7 +76,7 @@ def test_world_model_loss_trains_all_of_the_world_model_and_nothing_else(name):
     assert untouched(learner.agent.critic)
 
 
-FLOWN = {"flown_ppo", "asymmetric_ppo"}  # which learn from rollouts: see their tests
+FLOWN = {"flown_ppo", "latent_ppo", "asymmetric_ppo"}  # which learn from rollouts: see their tests
 
 
 @pytest.mark.parametrize("name", sorted(ACTOR_LOSSES.keys() - FLOWN))

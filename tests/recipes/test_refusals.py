@@ -159,8 +159,11 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.actor=reinforce", "loss.ppo.epochs=2"], "loss.ppo.epochs=2 is for loss.actor=ppo, flown_ppo"),
         (["loss.actor=reinforce", "schedule.kl_target={to: 0.01}"], "schedule.kl_target.to=0.01 is for loss.actor=ppo"),
         (["loss.actor=asymmetric_ppo", "loss.ppo.updates=2"], "loss.ppo.updates=2 is for loss.actor=ppo"),
-        (["loss.actor=ppo", "loss.ppo.flown=200"], "loss.ppo.flown=200 is for loss.actor=flown_ppo or"),
-        (["loss.actor=flown_ppo", "loss.ppo.critic_learning_rate=1"], "is for loss.actor=asymmetric_ppo, which is not"),
+        (["loss.actor=ppo", "loss.ppo.flown=200"], "loss.ppo.flown=200 is for loss.actor=flown_ppo, la"),
+        (
+            ["loss.actor=flown_ppo", "loss.ppo.critic_learning_rate=1"],
+            "is for loss.actor=latent_ppo or asymmet",
+        ),
         (["loss=reconstruction", "loss.privileged_scale=3"], "privileged_scale=3.* is for loss=privileged or informed"),
         (["loss=privileged", "loss.image_scale=3"], "image_scale=3.* is for loss=reconstruction or informed"),
         (["loss=decoder_free", "loss.image_share=0.5"], "image_share=0.5 is for loss=reconstruction or informed"),
@@ -171,7 +174,7 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
         (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for records that keep latents, replay.con"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
-        (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=ppo, flown_ppo or asymmetric_ppo"),
+        (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=ppo, flown_ppo, latent_ppo or asym"),
         (
             ["schedule.wait_every=9"],
             "wait_every=9 is for schedule.wait_for_model, of an actor that steps alone, which is not chosen",
