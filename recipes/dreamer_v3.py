@@ -227,7 +227,7 @@ def resolve(config: DictConfig) -> DictConfig:
         config.model.cuda_graph = captures(config, device)
         if config.model.cuda_graph:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
-    if config.tuned == "race":
+    if config.tuned in ("race", "images"):
         if changed := changed_from_tuned(config):
             print(f"  but as asked for: {', '.join(changed)}")
         minutes = config.total_env_steps / RACE_SPEED / 60

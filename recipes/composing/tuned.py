@@ -17,19 +17,44 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
     Returns:
         Each as ``setting=value (there)``, as the command line takes both.
     """
-    numbers = numbers_of("tuned", config.tuned)
-    for taken in numbers.pop("defaults"):
-        ((group, name),) = taken.items()
-        group = group.rpartition("/")[2]
-        if group != "model":  # the size's own numbers follow from model.size
-            numbers[group] = {**numbers_of(group, name), **numbers.get(group, {})}
-            numbers[group].pop("defaults", None)
+    numbers = tuned_numbers(config.tuned)
     numbers.pop("tuned")
     return [
         f"{name}={said(value)} ({said(there)})"
         for name, there in flatten(numbers)
         if plain(value := OmegaConf.select(config, name)) != there
     ]
+
+
+def tuned_numbers(tuned: str) -> dict[str, Any]:
+    """Return what a file of the group `tuned` has, over what the files of other groups have that it takes."""
+    groups, own = layers_of(tuned)
+    groups.pop("model", None)  # the size's own numbers follow from model.size
+    taken = {group: numbers_of(group, name) for group, name in groups.items()}
+    for numbers in taken.values():
+        numbers.pop("defaults", None)
+    return merged(taken, own)
+
+
+def layers_of(tuned: str) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return which files of other groups a file of the group `tuned` takes, by group, and its own numbers.
+
+    Those of a file of its own group that it takes are among them, where it has no others.
+    """
+    groups: dict[str, str] = {}
+    own = numbers_of("tuned", tuned)
+    for taken in own.pop("defaults"):
+        if isinstance(taken, str):
+            below, numbers = layers_of(taken)
+            groups, own = below | groups, merged(numbers, own)
+        else:
+            groups |= {group.rpartition("/")[2]: name for group, name in taken.items()}
+    return groups, own
+
+
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return nested settings, those above where both have them."""
+    return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.merge(below, above)))
 
 
 def numbers_of(group: str, name: str) -> dict[str, Any]:

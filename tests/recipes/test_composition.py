@@ -11,6 +11,8 @@ from omegaconf import OmegaConf
 from torchrl.envs.transforms import Transform
 
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.figures.runs import flatten
+from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import RampClock
@@ -186,6 +188,22 @@ def test_settings_that_race_yield_to_the_command_line() -> None:
     assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
     changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
+
+
+def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
+    """All else is as in `tuned=race`, and so are other settings that are asked for."""
+    images, race = (compose("dreamer_v3", f"tuned={name}") for name in ("images", "race"))
+    assert (images.loss.world_model, images.loss.actor) == ("reconstruction", "latent_ppo")
+    assert (images.env.start_on_line, images.env.start_at_gate, images.schedule.start_on_line.to) == (0, 0.5, None)
+    assert not find_loss(WorldModelLoss, images.loss.world_model).reads_privileged
+    assert not find_loss(ActorLoss, images.loss.actor).reads_privileged
+    changed = set(flatten(OmegaConf.to_container(images))) ^ set(flatten(OmegaConf.to_container(race)))
+    assert {name for name, _ in changed} == {
+        "tuned", "total_env_steps", "env.start_on_line", "env.start_at_gate", "model.replay_ratio",
+        "loss.world_model", "loss.actor", "loss.image_scale", "loss.image_share", "loss.free_nats",
+        "loss.privileged_scale", "schedule.start_on_line.to",
+    }  # fmt: skip
+    assert compose("dreamer_v3", "tuned=images", "loss=informed").loss.world_model == "informed"
 
 
 @pytest.mark.parametrize(
@@ -377,6 +395,15 @@ def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
             build("init_from=nowhere", f"run_dir={tmp_path}")
         assert "init_from=nowhere" in capsys.readouterr().err
     assert (tmp_path / "log.txt").exists()
+
+
+def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = recipe_module("dreamer_v3")
+    recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu"))
+    assert "as asked for" not in (told := capsys.readouterr().out) and "length: 2,500,000 env_steps" in told
+    recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
+    assert "env.control_rate=50" in line and "(25)" in line and "loss.image_scale=1.0 (0.003)" in line
 
 
 def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> None:
