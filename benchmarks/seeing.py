@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+import torch.nn.functional as F
 from learning_signal import restore, restore_replay
 from measuring import print_table, write_json
 from omegaconf import OmegaConf
@@ -46,9 +47,10 @@ from composing.learners import size_of
 from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
+from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.dreamer_optimizer import make_optimizer
-from dreamer_racing.losses import WorldModelLoss, find_loss, make_losses
+from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss, make_losses
 from dreamer_racing.modules import Agent, ModelSize, join_features, symlog
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.interface import PRIVILEGED, Interface
@@ -66,13 +68,13 @@ def main() -> None:
     """Measure every variant."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
-    parser.add_argument("--variant", nargs="+", default=[""])
-    parser.add_argument("--updates", type=int, default=600)
+    parser.add_argument("--variant", nargs="+", default=[""], help="overrides of a fresh model, each in quotes")
+    parser.add_argument("--updates", type=int, default=600, help="of the model, default 600; of the probe with --flown")
     parser.add_argument("--every", type=int, default=150, help="updates between two measurements")
     own = parser.add_mutually_exclusive_group()
     own.add_argument("--as-trained", action="store_true", help="probe the run's own model instead of fresh ones")
     own.add_argument("--flown", action="store_true", help="the same, in what its agent flies now")
-    parser.add_argument("--json")
+    parser.add_argument("--json", help="file that all rows are written to")
     arguments = parser.parse_args()
     if (arguments.as_trained or arguments.flown) and arguments.variant != [""]:
         parser.error("--as-trained and --flown are of the run as it is: leave --variant out")
@@ -95,12 +97,16 @@ def main() -> None:
 def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained: bool) -> Iterator[dict[str, Any]]:
     """Yield a record for each measurement of a variant."""
     trained = config_of(checkpoint)
+    readers = find_loss(WorldModelLoss, trained.loss.world_model), find_loss(ActorLoss, trained.loss.actor)
+    if not any(reader.reads_privileged for reader in readers):
+        chosen = f"loss.world_model={trained.loss.world_model} loss.actor={trained.loss.actor}"
+        raise SystemExit(f"{checkpoint}: neither of {chosen} reads the state, so its replay has none: use --flown.")
     learner, counters = restore(trained, checkpoint)
     config, size = varied(trained, variant)
     replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
     test = replay.held_out(HELD_OUT, LENGTH, RECENT)  # the same windows for every variant
-    if test is None or PRIVILEGED not in test.keys(include_nested=True):
-        raise SystemExit("The run must hold out worlds, and its loss or actor must read the state.")
+    if test is None:
+        raise SystemExit(f"{checkpoint}: the run holds out no worlds (replay.held_out=0): use --flown.")
     if as_trained:
         loss, optimizer = learner.losses["world_model"].requires_grad_(False), None
     else:
@@ -109,6 +115,7 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
     torch.manual_seed(0)
     probe = Probe(size.features, test[PRIVILEGED].shape[-1])
     variance = symlog(test[PRIVILEGED]).var((0, 1)).mean()
+    name = "as trained" if as_trained else variant
     context, seconds = autocast(torch.device("cpu"), bool(config.model.mixed_precision)), 0.0
     for number in range(1, updates + 1):
         batch = replay.sample()
@@ -129,54 +136,65 @@ def measure(checkpoint: Path, variant: str, updates: int, every: int, as_trained
             probed = probe.error(latents_of(seen), test[PRIVILEGED]).item()
             yield {
                 "benchmark": "seeing", "track": config.track, "env_steps": counters["env_steps"],
-                "trained_updates": counters["updates"], "variant": "as trained" if as_trained else variant,
+                "trained_updates": counters["updates"], "variant": name,
                 "updates": number, "seconds": seconds, "probe": probed, "share": probed / variance.item(),
                 "kl": seen["kl"].item(), **errors(seen), "trained": errors(metrics).get("error"),
             }  # fmt: skip
-    batches = [replay.sample() for _ in range(SETTLE_BATCHES)]
-    for batch in () if as_trained else batches:
-        batch.pop(CONTEXT, None)
     with torch.no_grad(), context:
-        learned = torch.cat([latents_of(loss(batch)).flatten(0, 1) for batch in batches])
-        measured = latents_of(loss(test)).flatten(0, 1)
-    shown = torch.cat([batch[PRIVILEGED].flatten(0, 1) for batch in batches])
+        settled = standing_still(probe, loss, replay, test, keeps_context=as_trained)
     yield {
         "benchmark": "seeing", "track": config.track, "env_steps": counters["env_steps"],
-        "trained_updates": counters["updates"], "variant": f"{variant}, standing still", "updates": updates,
-        **settle(probe, learned, shown, measured, test[PRIVILEGED].flatten(0, 1), SETTLE),
+        "trained_updates": counters["updates"], "variant": f"{name}, standing still", "updates": updates, **settled,
     }  # fmt: skip
 
 
-def settle(
-    probe: "Probe", learned: Tensor, shown: Tensor, measured: Tensor, state: Tensor, updates: int
+def standing_still(
+    probe: "Probe", loss: LossModule, replay: StreamReplay, test: TensorDictBase, keeps_context: bool
 ) -> dict[str, float]:
-    """Let the probe learn of latents that stand still, and return what it and a linear map do not tell of others.
+    """Let the model stand still and the probe learn on; return what it and a linear map do not tell of other windows.
 
     Args:
         probe: To train.
-        learned: Latents to learn from, `(M, F)`.
-        shown: Their state, `(M, P)`.
-        measured: Others, `(N, F)`.
-        state: Theirs, `(N, P)`.
-        updates: Of the probe.
+        loss: Of the model.
+        replay: To draw windows from.
+        test: Windows held out.
+        keeps_context: Whether windows begin with the latents stored.
     """
+    batches = []
+    for _ in range(SETTLE_BATCHES):
+        batch = replay.sample()
+        if not keeps_context:
+            batch.pop(CONTEXT, None)
+        batches.append((latents_of(loss(batch)).flatten(0, 1), batch[PRIVILEGED].flatten(0, 1)))
+    learned = tuple(torch.cat(parts) for parts in zip(*batches, strict=True))
+    measured = latents_of(loss(test)).flatten(0, 1), test[PRIVILEGED].flatten(0, 1)
+    with torch.enable_grad(), torch.autocast("cpu", enabled=False):
+        return settle(probe, learned, measured, SETTLE) | {"linear": linear_share(learned, measured)}
+
+
+Shown = tuple[Tensor, ...]
+"""Latents `(M, F)` and the state at them `(M, P)`."""
+
+
+def settle(probe: "Probe", learned: Shown, measured: Shown, updates: int) -> dict[str, float]:
+    """Let the probe learn of latents that stand still; return its error on others, and that by their variance."""
     for _ in range(updates):
-        drawn = torch.randint(len(learned), (MINIBATCH,))
-        probe.learn(learned[drawn], shown[drawn])
+        drawn = torch.randint(len(learned[0]), (MINIBATCH,))
+        probe.learn(*(part[drawn] for part in learned))
     with torch.no_grad():
-        error, variance = probe.error(measured, state).item(), symlog(state).var(0).mean().item()
-    linear = linear_error(learned, shown, measured, state)
-    return {"probe": error, "share": error / variance, "linear": linear / variance}
+        error = probe.error(*measured).item()
+    return {"probe": error, "share": error / symlog(measured[1]).var(0).mean().item()}
 
 
 @torch.no_grad()
-def linear_error(learned: Tensor, learned_state: Tensor, measured: Tensor, measured_state: Tensor) -> float:
-    """Return the mean squared error of symlogs of the best linear map from latents `(M, F)` to the state `(M, P)`."""
-    ones, identity = learned.new_ones(len(learned), 1), torch.eye(learned.shape[-1] + 1)
-    latents = torch.cat((learned, ones), 1)
-    weights = torch.linalg.solve(latents.T @ latents + RIDGE * identity, latents.T @ symlog(learned_state))
-    told = torch.cat((measured, ones[:1].expand(len(measured), 1)), 1) @ weights
-    return (told - symlog(measured_state)).square().mean().item()
+def linear_share(learned: Shown, measured: Shown) -> float:
+    """Return the share of the variance of the state's symlogs that the best linear map of the latents does not tell."""
+    # In float64: the probabilities of a latent sum to 1, as the constant does, so that the system is singular.
+    latents, others = (F.pad(part[0].double(), (0, 1), value=1.0) for part in (learned, measured))
+    state, told = (symlog(part[1]).double() for part in (learned, measured))
+    normal = latents.T @ latents + RIDGE * torch.eye(latents.shape[-1], dtype=torch.float64)
+    error = (others @ torch.linalg.solve(normal, latents.T @ state) - told).square().mean()
+    return (error / told.var(0).mean()).item()
 
 
 def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[str, Any]]:
@@ -187,12 +205,12 @@ def probe_flights(checkpoint: Path, updates: int, every: int) -> Iterator[dict[s
     learned = features[MEASURED:].flatten(0, 1), state[MEASURED:].flatten(0, 1)
     measured = features[:MEASURED].flatten(0, 1), state[:MEASURED].flatten(0, 1)
     torch.manual_seed(0)
-    probe = Probe(features.shape[-1], state.shape[-1])
+    probe, linear = Probe(features.shape[-1], state.shape[-1]), linear_share(learned, measured)
     for number in range(every, updates + 1, every):
         yield {
             "benchmark": "seeing", "track": config.track, "run": RunDirectory.of(checkpoint).path.name,
             "env_steps": counters["env_steps"], "trained_updates": counters["updates"], "variant": "as it flies",
-            "updates": number, **settle(probe, *learned, *measured, every),
+            "updates": number, **settle(probe, learned, measured, every), "linear": linear,
         }  # fmt: skip
 
 

@@ -63,6 +63,11 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   training the actor waits for it, and what the model learns leaves the policy where it was; averaged weights fly
   evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
+IMAGES_SETTINGS = """settings: tuned=images, which race Circle from images alone, on a CPU:
+  the world model reconstructs images, at a small weight; no network sees the simulator's state, in training neither
+  half of the training episodes begin at rest, half before a gate; a missed gate ends one
+  the actor learns by PPO from what it flew, in the model's latents, and so does its critic; nothing is imagined
+  recipes/config/tuned/images.yaml has what is not as in race.yaml, docs/experiments.md, entry 42, how far it comes"""
 SUITE_SETTINGS = """settings: tuned=suite, which learn a task from images on a CPU (tuned=none: as model=cpu_small):
   a small DreamerV3 that trains on 128 records for each action, and averaged weights fly evaluations
   recipes/config/tuned/suite.yaml has every number"""
@@ -227,9 +232,11 @@ def resolve(config: DictConfig) -> DictConfig:
         config.model.cuda_graph = captures(config, device)
         if config.model.cuda_graph:
             print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
+    if config.tuned == "images":
+        print(IMAGES_SETTINGS)
     if config.tuned in ("race", "images"):
         if changed := changed_from_tuned(config):
-            print(f"  but as asked for: {', '.join(changed)}")
+            print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
         minutes = config.total_env_steps / RACE_SPEED / 60
         time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
         print(f"length: {config.total_env_steps:,} env_steps, {time} at one core's {RACE_SPEED} a second")

@@ -129,6 +129,14 @@ def test_every_page_is_in_the_navigation_of_the_site(site_links):
     assert sorted(nav) == sorted(site_links.place_of(page) for page in PAGES)
 
 
+def test_the_api_names_every_loss():
+    named = set(
+        re.findall(r"^::: dreamer_racing\.losses\.(\w+)$", (ROOT / "docs/api/losses.md").read_text("utf-8"), re.M)
+    )
+    there = {path.stem for path in (ROOT / "dreamer_racing" / "losses").glob("*.py")} - {"__init__", "contract"}
+    assert there <= named, f"docs/api/losses.md lacks {sorted(there - named)}"
+
+
 def test_the_api_names_modules_that_are_there():
     for page in (ROOT / "docs" / "api").glob("*.md"):
         named = re.findall(r"^::: (.+)$", page.read_text(encoding="utf-8"), re.M)

@@ -319,7 +319,8 @@ def test_updates_of_two_shares_are_those_of_the_whole(tmp_path: Path) -> None:
             near = {"rtol": 1e-5, "atol": 1e-5} if key in begun else {"rtol": 1e-3, "atol": 1e-4}  # else a metric
             assert torch.allclose(first[key], value, **near), f"{name}: {key} {first[key]} is not {value}"
             assert torch.equal(first[key], second[key]), f"{name}: {key} differs between the processes"
-        for part in ("world_model.world_model.rssm", "critic.critic", "actor.actor"):
+        own = {"asymmetric_ppo": ["actor.state_critic"], "latent_ppo": ["actor.latent_critic"]}.get(name, [])
+        for part in ("world_model.world_model.rssm", "critic.critic", "actor.actor", *own):
             moved = (whole[key] - value for key, value in begun.items() if key.startswith(part))
             assert max(float(distance.abs().max()) for distance in moved) > 1e-4, f"{name}: {part} stands still"
 

@@ -62,8 +62,8 @@ class AsymmetricPPOActorLoss(OwnCriticActorLoss):
     def _steps(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         return {**super()._steps(rollout), "privileged": symlog(rollout[PRIVILEGED])}
 
-    def _seen(self) -> Tensor:
+    def _kept_inputs(self) -> Tensor:
         return self.privileged
 
-    def _sees(self, acted: TensorDictBase) -> Tensor:
+    def _inputs_of(self, acted: TensorDictBase) -> Tensor:
         return symlog(acted[PRIVILEGED])

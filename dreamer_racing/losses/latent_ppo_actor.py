@@ -1,7 +1,7 @@
 """PPO on flown rollouts with a critic of the latents: an extension, not part of DreamerV3.
 
 For training without the simulator's state: ``AsymmetricPPOActorLoss`` needs it, and what ``FlownPPOActorLoss`` learns
-its values by, imagination, takes as much time as the world model's update (docs/experiments.md, entry 42).
+its values by, imagination, takes a quarter of an update's time (docs/experiments.md, entry 42).
 
 Shape legend: N environments, S steps kept of each environment, F features.
 """
@@ -37,8 +37,8 @@ class LatentPPOActorLoss(OwnCriticActorLoss):
         """The critic of the latents."""
         return self.latent_critic
 
-    def _seen(self) -> Tensor:
+    def _kept_inputs(self) -> Tensor:
         return self.features
 
-    def _sees(self, acted: TensorDictBase) -> Tensor:
-        return join_features(acted["belief"], acted["state"])
+    def _inputs_of(self, acted: TensorDictBase) -> Tensor:
+        return join_features(acted["next", "belief"], acted["next", "state"])

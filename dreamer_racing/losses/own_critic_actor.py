@@ -23,7 +23,8 @@ class OwnCriticActorLoss(FlownPPOActorLoss):
     The critic is a two-hot regression of the λ-returns, in as many epochs of minibatches as the actor makes, after the
     advantages were computed. The learner does not call ``forward``: nothing is imagined, whose time the world model
     gets. Where time ran out, and behind the last step kept, the value of the step itself stands for what comes, as in
-    ``FlownPPOActorLoss``. What the critic sees is a subclass's: ``LatentPPOActorLoss``, ``AsymmetricPPOActorLoss``.
+    ``FlownPPOActorLoss``. What the critic sees is a subclass's, which makes it by ``_make_critic`` once it is
+    initialised itself: ``LatentPPOActorLoss``, ``AsymmetricPPOActorLoss``.
 
     Args:
         args, kwargs: Of ``FlownPPOActorLoss``.
@@ -36,15 +37,18 @@ class OwnCriticActorLoss(FlownPPOActorLoss):
     @property
     @abstractmethod
     def own_critic(self) -> TwoHotHead:
-        """The critic, of what ``_seen`` and ``_sees`` return."""
+        """The critic, of what ``_kept_inputs`` and ``_inputs_of`` return."""
 
     @abstractmethod
-    def _seen(self) -> Tensor:
+    def _kept_inputs(self) -> Tensor:
         """Return what the critic sees of the steps kept, ``(S, N, X)``."""
 
     @abstractmethod
-    def _sees(self, acted: TensorDictBase) -> Tensor:
-        """Return what it sees of records ``[N]`` that a policy has acted on, ``(N, X)``."""
+    def _inputs_of(self, acted: TensorDictBase) -> Tensor:
+        """Return what it sees of records ``[N]`` that a policy has acted on, ``(N, X)``.
+
+        The latents by which it acted are under ``"next"``; those beside the observation are of the step before.
+        """
 
     def value_function(self) -> Callable[[TensorDictBase], Tensor]:
         """Return what the loss's own critic expects."""
@@ -52,11 +56,11 @@ class OwnCriticActorLoss(FlownPPOActorLoss):
 
     @torch.no_grad()
     def _value_of_records(self, acted: TensorDictBase) -> Tensor:
-        return self.own_critic.mean(self._sees(acted).to(self.flown.device))
+        return self.own_critic.mean(self._inputs_of(acted).to(self.flown.device))
 
     @torch.no_grad()
     def _value(self) -> Tensor:
-        return self.own_critic.mean(self._seen())
+        return self.own_critic.mean(self._kept_inputs())
 
     def _make_critic(self, features: int) -> TwoHotHead:
         """Make a critic of X numbers, and let the loss's optimiser train it."""
@@ -72,7 +76,7 @@ class OwnCriticActorLoss(FlownPPOActorLoss):
             ``ppo/critic_loss``, ``ppo/explained_variance`` (of the returns, by the values before), ``entropy`` of the
             policy that flew, nats, and ``gradient_norm/own_critic``.
         """
-        seen, target = self._seen().flatten(0, 1), returns.flatten(0, 1)
+        seen, target = self._kept_inputs().flatten(0, 1), returns.flatten(0, 1)
         steps = [
             self._regress(seen[chosen], target[chosen])
             for _ in range(self.ppo.epochs)

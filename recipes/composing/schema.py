@@ -230,8 +230,9 @@ class DreamerConfig(ReplayRunConfig):
     algorithm: str = "dreamer_v3"
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
     init_from: str | None = None
-    # none: DreamerV3 as published; race: what races on a CPU; gpu: the same for a GPU, unmeasured; suite: what learns
-    # the Control Suite on a CPU; auto: race or suite from images on a CPU by cpu_small, else none
+    # none: DreamerV3 as published; race: what races on a CPU; images: the same, but no network sees the simulator's
+    # state in training; gpu: race for a GPU, unmeasured; suite: what learns the Control Suite on a CPU; auto: race or
+    # suite from images on a CPU by cpu_small, else none
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)

@@ -38,13 +38,18 @@ def test_values_are_those_of_the_latents_at_which_the_action_was_chosen():
 
 
 def test_evaluations_ask_the_critic_that_teaches_the_actor():
+    """At the latents that the policy made of what it saw, not those that it remembered."""
     learner = make_learner()
-    loss, size = actor_loss(learner), learner.agent.world_model.size
-    torch.nn.init.normal_(loss.latent_critic.mlp.output.weight)
-    acted = TensorDict({"belief": torch.randn(3, size.belief), "state": torch.rand(3, size.state)}, [3])
+    critic, size = actor_loss(learner).latent_critic, learner.agent.world_model.size
+    torch.nn.init.normal_(critic.mlp.output.weight)
+    remembered = TensorDict({"belief": torch.randn(3, size.belief), "state": torch.rand(3, size.state)}, [3])
+    seen = make_batch()[:3, 0].select(*learner.agent.world_model.encoder.keys, "is_init", "previous_action")
+    with torch.no_grad():
+        acted = learner.evaluation_policy()(remembered.clone().update(seen))
     value = learner.value_function()(acted)
     assert value.shape == (3, 1) and not value.requires_grad
-    assert torch.equal(value, loss.latent_critic.mean(join_features(acted["belief"], acted["state"])))
+    assert torch.equal(value, critic.mean(join_features(acted["next", "belief"], acted["next", "state"])))
+    assert not torch.allclose(value, critic.mean(join_features(remembered["belief"], remembered["state"])))
 
 
 def test_an_improvement_moves_actor_and_latent_critic_and_nothing_else():

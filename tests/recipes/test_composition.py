@@ -400,7 +400,9 @@ def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
 def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytest.CaptureFixture[str]) -> None:
     recipe = recipe_module("dreamer_v3")
     recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu"))
-    assert "as asked for" not in (told := capsys.readouterr().out) and "length: 2,500,000 env_steps" in told
+    told = capsys.readouterr().out
+    assert "settings: tuned=images, which race Circle from images alone" in told
+    assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
     recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
     assert "env.control_rate=50" in line and "(25)" in line and "loss.image_scale=1.0 (0.003)" in line
