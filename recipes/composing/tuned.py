@@ -39,7 +39,7 @@ def tuned_numbers(tuned: str) -> dict[str, Any]:
 def layers_of(tuned: str) -> tuple[dict[str, str], dict[str, Any]]:
     """Return which files of other groups a file of the group `tuned` takes, by group, and its own numbers.
 
-    Those of a file of its own group that it takes are among them, where it has no others.
+    If it takes another file of its own group, that one's are among them, and give way to its own.
     """
     groups: dict[str, str] = {}
     own = numbers_of("tuned", tuned)
