@@ -21,9 +21,9 @@ class OwnCriticActorLoss(FlownPPOActorLoss):
     """Keep what the collector's policy flew, and weigh it by a critic that learns from the same steps.
 
     The critic is a two-hot regression of the λ-returns, in as many epochs of minibatches as the actor makes, after the
-    advantages were computed. The learner does not call ``forward``: nothing is imagined, whose time the world model
-    gets. Where time ran out, and behind the last step kept, the value of the step itself stands for what comes, as in
-    ``FlownPPOActorLoss``. What the critic sees is a subclass's, which makes it by ``_make_critic`` once it is
+    advantages were computed. The learner does not call ``forward``: nothing is imagined, and the time is the world
+    model's. Where time ran out, and behind the last step kept, the value of the step itself stands for what comes, as
+    in ``FlownPPOActorLoss``. What the critic sees is a subclass's, which makes it by ``_make_critic`` once it is
     initialised itself: ``LatentPPOActorLoss``, ``AsymmetricPPOActorLoss``.
 
     Args:
