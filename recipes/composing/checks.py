@@ -270,6 +270,10 @@ def check_dreamer(config: DreamerConfig) -> None:
     check_schedule(config)
     check_imagination(config)
     check_image_size(config.env.image_size, config.model.size)
+    if config.tuned == "images" and not config.env.from_pixels:
+        raise ValueError(
+            "tuned=images is for agents that see images, and env.from_pixels=false shows them the state: leave one out."
+        )
     model = config.model
     prefilled = config.prefill // config.env.num_envs
     if prefilled < model.batch_length:

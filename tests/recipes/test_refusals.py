@@ -91,6 +91,7 @@ REFUSED = [
         ["loss.continuation=false", "loss=privileged", "loss.actor=asymmetric_ppo"],
         ["loss.continuation=false, and loss.actor=asymmetric_ppo imagines nothing"],
     ),
+    (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
     (["env=dmc", "loss.actor=asymmetric_ppo"], ["loss.actor=asymmetric_ppo: read", "loss.actor=reinforce"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["loss.ppo.updates=0"], ["loss.ppo.updates=0: must be at least 1"]),
