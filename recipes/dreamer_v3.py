@@ -64,7 +64,7 @@ RACE_SETTINGS = """settings: tuned=race, which race from images on a CPU (tuned=
   evaluations and exports
   recipes/config/tuned/race.yaml has every number, docs/experiments.md what each is good for"""
 IMAGES_SETTINGS = """settings: tuned=images, which race Circle from images alone, on a CPU:
-  the world model reconstructs images, at a small weight; no network sees the simulator's state, in training neither
+  the world model reconstructs images, at a small weight; no network sees the simulator's state, not even in training
   half of the training episodes begin at rest, half before a gate; a missed gate ends one
   the actor learns by PPO from what it flew, in the model's latents, and so does its critic; nothing is imagined
   recipes/config/tuned/images.yaml has what is not as in race.yaml, docs/experiments.md, entry 42, how far it comes"""

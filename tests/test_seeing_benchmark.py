@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-
-import seeing
-
 from dreamer_racing.modules.heads import symexp
+from tests.running_recipes import module_of
+
+seeing = module_of("benchmarks", "seeing")
 
 
 def shown(number: int, tangled: bool) -> tuple[torch.Tensor, torch.Tensor]:
