@@ -16,6 +16,7 @@ Workers, in the order in which `renderer="auto"` tries them:
 Shapes: M frames. Images are uint8 RGB (M, height, width, 3), first row at the top.
 """
 
+import atexit
 import logging
 import weakref
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from concurrent.futures import Future
 from itertools import zip_longest
 from queue import SimpleQueue
 from threading import Thread
+from threading import enumerate as enumerate_threads
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import mujoco
@@ -45,6 +47,8 @@ T = TypeVar("T")
 
 RENDERERS = ("egl", "osmesa", "warp")
 HYBRID = "warp_cuda"
+EXIT_PATIENCE = 10.0
+"""How long the end of the process waits for a frame that is being drawn, s [choice]."""
 
 
 class NoseMount:
@@ -96,7 +100,7 @@ class Worker(Protocol):
         ...
 
 
-class RenderThread:
+class RenderThread(Thread):
     """A thread that does what it is given, in order, until it is ended.
 
     Unlike an executor's, `end` takes no lock that could be held already: the garbage collector may call it anywhere.
@@ -106,12 +110,18 @@ class RenderThread:
     """
 
     def __init__(self, name: str) -> None:
+        super().__init__(name=name, daemon=True)
         self._tasks: SimpleQueue[Task | None] = SimpleQueue()
-        self._thread = Thread(target=_serve, args=(self._tasks,), name=name, daemon=True)
-        self._thread.start()
+        self.start()
 
     def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
-        """Have a function called, and return what will have its result."""
+        """Have a function called, and return what will have its result.
+
+        Raises:
+            RuntimeError: the thread has ended, as all do when the interpreter exits.
+        """
+        if not self.is_alive():
+            raise RuntimeError("Nothing can be drawn any more: the interpreter exits.")
         future: Future[T] = Future()
         self._tasks.put(Task(future, function, arguments))
         return future
@@ -122,9 +132,11 @@ class RenderThread:
             self._tasks.put(Task(None, last, ()))
         self._tasks.put(None)
 
-    def join(self) -> None:
-        """Wait for the end."""
-        self._thread.join()
+    def run(self) -> None:
+        """Do what comes."""
+        while (task := self._tasks.get()) is not None:
+            _do(task)
+            del task  # or the next wait would keep what it refers to
 
 
 class Task(NamedTuple):
@@ -135,20 +147,31 @@ class Task(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def _serve(tasks: SimpleQueue[Task | None]) -> None:
-    """Do what comes."""
-    while (task := tasks.get()) is not None:
-        try:
-            result = task.function(*task.arguments)
-        except BaseException as error:
-            if task.future is None:
-                logger.warning("A renderer could not be freed.", exc_info=error)
-            else:
-                task.future.set_exception(error)
+def _do(task: Task) -> None:
+    try:
+        result = task.function(*task.arguments)
+    except BaseException as error:
+        if task.future is None:
+            logger.warning("A renderer could not be freed.", exc_info=error)
         else:
-            if task.future is not None:
-                task.future.set_result(result)
-        del task  # or the next wait would keep what it refers to
+            task.future.set_exception(error)
+    else:
+        if task.future is not None:
+            task.future.set_result(result)
+
+
+@atexit.register
+def _end_all() -> None:
+    """End the threads while the interpreter still works.
+
+    It ends a thread that asks for its lock later on the spot, and where that is amid C++, as when a tensor is let go,
+    the process aborts.
+    """
+    threads = [thread for thread in enumerate_threads() if isinstance(thread, RenderThread)]
+    for thread in threads:
+        thread.end(None)
+    for thread in threads:
+        thread.join(EXIT_PATIENCE)
 
 
 class Renderer:
