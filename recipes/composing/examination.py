@@ -19,6 +19,7 @@ from typing import NamedTuple
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from dreamer_racing.caches import ensure_caches, warp_cache, why_not_writable
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES
 
 DISTRIBUTION = "dreamer_racing"
@@ -84,6 +85,7 @@ def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
     yield from cores()
     yield memory(capacity * RECORD_BYTES + NETWORKS_BYTES)
     yield disk((keep + 1) * capacity * RECORD_BYTES / SMALLER_ON_DISK, run_dir)
+    yield caches()
     yield from renderers(probes)
 
 
@@ -190,11 +192,21 @@ def memory(needed: float) -> Diagnosis:
 
 
 def disk(needed: float, run_dir: Path) -> Diagnosis:
-    """Look whether checkpoints fit."""
-    place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.exists())
+    """Look whether checkpoints can be written, and fit."""
+    place = next(folder for folder in (run_dir.absolute(), *run_dir.absolute().parents) if folder.is_dir())
+    if reason := why_not_writable(place):
+        return Diagnosis("disk", Verdict.wrong, f"{place} takes no files ({reason})", "choose another run_dir=")
     free = shutil.disk_usage(place).free
     found = f"{free / 1e9:.1f} GB free at {run_dir}, checkpoints of such a run take about {needed / 1e9:.1f}"
     return Diagnosis("disk", *_enough(found, free >= needed, "lower checkpoint.keep= or choose another run_dir="))
+
+
+def caches() -> Diagnosis:
+    """Look whether what is compiled can be kept for the next program."""
+    if reason := ensure_caches():
+        remedy = "WARP_CACHE_PATH=FOLDER, or a HOME that can be written to; until then every program compiles anew"
+        return Diagnosis("caches", Verdict.note, reason, remedy)
+    return Diagnosis("caches", Verdict.fine, str(warp_cache()))
 
 
 def _enough(found: str, enough: bool, remedy: str) -> tuple[Verdict, str, str]:

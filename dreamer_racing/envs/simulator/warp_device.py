@@ -12,10 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dreamer_racing.caches import ensure_caches
+
 
 @cache
 def load_warp() -> Any:
-    """Return the package `warp`, initialised so that it reports errors only: no CUDA is no news."""
+    """Return the package `warp`, initialised so that it reports errors only: no CUDA is no news.
+
+    Raises:
+        CacheError: it finds no folder for what it compiles.
+    """
+    ensure_caches()
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
