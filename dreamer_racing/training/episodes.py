@@ -18,7 +18,7 @@ class EpisodeTracker:
     """Finds the finished episodes in a collector's rollouts, carrying unfinished ones from rollout to rollout.
 
     Its returns are exact; TorchRL's ``RewardSum`` and ``StepCounter`` sum in float32, in every step of the environment,
-    and are off by some 1e-6 (``benchmarks/episode_sums.py``).
+    and are off by some 1e-6.
 
     Args:
         num_envs: N.

@@ -28,7 +28,7 @@ RECORD_BYTES = 13_570
 NETWORKS_BYTES = 1.5e9
 """What a default run takes beside its replay: networks, optimiser, batch, libraries."""
 SMALLER_ON_DISK = 7
-"""How much smaller a replay of a race is in a checkpoint (`benchmarks/saving.py`)."""
+"""How much smaller a replay of a race is in a checkpoint."""
 PROBE = """
 import sys, time
 import numpy as np
