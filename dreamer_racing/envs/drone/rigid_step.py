@@ -1,7 +1,7 @@
 """One physics step of N drones: controller and motors give a wrench, MuJoCo moves the rigid bodies.
 
-This is the statement of the physics in torch, an operation at a time: what `simulator.fused_flight` is tested against,
-and what `benchmarks/integrators.py` varies. The simulators fly the fused kernels.
+This is the statement of the physics in torch, an operation at a time: what `simulator.fused_flight` is tested against.
+The simulators fly the fused kernels.
 
 Shapes: N drones. SI units, attitude wxyz, `qpos` (N, 7) is position and attitude, `qvel` (N, 6) is the velocity in the
 world and the body rates in the body frame, as MuJoCo has them for a free joint.
@@ -21,7 +21,7 @@ class RigidStep:
 
     The force is held in the direction it has in the step's middle. Beyond that, MuJoCo's Euler step is of first order:
     v' = v + h·a(x, v), then x' = x + h·v'. Over two seconds of racing that strays by 7 cm. Two corrections make it
-    second order (`benchmarks/integrators.py` has the figures): the torque is turned into the one that does with the
+    second order (docs/simulation.md has the figures): the torque is turned into the one that does with the
     rates of the step's beginning what the given one does with those of its middle, and half of the overshoot
     h·(v' − v) is taken back from the pose. RK4 needs neither.
 
@@ -31,7 +31,6 @@ class RigidStep:
         qvel: (N, 6) likewise.
         qfrc_applied: (N, 6) likewise: force in the world frame, torque in the body frame.
         integrate: makes one physics step with the present `qfrc_applied`.
-        corrected: whether to correct the integrator; None for what it needs.
     """
 
     def __init__(
@@ -41,14 +40,13 @@ class RigidStep:
         qvel: Tensor,
         qfrc_applied: Tensor,
         integrate: Callable[[], None],
-        corrected: bool | None = None,
     ) -> None:
         self.quadrotor = quadrotor
         self.position, self.attitude = qpos[:, :3], qpos[:, 3:]
         self.linear_velocity, self.body_rates = qvel[:, :3], qvel[:, 3:]
         self._qvel, self._integrate = qvel, integrate
         self._force, self._torque = qfrc_applied[:, :3], qfrc_applied[:, 3:]
-        self._corrected = quadrotor.parameters.integrator != "RK4" if corrected is None else corrected
+        self._corrected = quadrotor.parameters.integrator != "RK4"
         self._half_step = 0.5 * quadrotor.parameters.physics_dt
 
     def step(self, physics_step: int) -> None:
