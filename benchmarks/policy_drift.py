@@ -10,21 +10,12 @@ weights are measured. The checkpoint must hold a replay with context, so no best
 """
 
 import argparse
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
-from learning_signal import restore, restore_replay
 from measuring import print_table, write_json
-
-sys.path.append(str(Path(__file__).parents[1] / "recipes"))
-
-from composing.saved import trained_config
-from composing.schema import DreamerConfig
-
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from trained import restore, restore_replay
 
 BATCHES = 12
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
@@ -37,27 +28,22 @@ def main() -> None:
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    records = [record for path in arguments.checkpoints for record in measure(latest_checkpoint(path))]
+    records = [record for path in arguments.checkpoints for record in measure(path)]
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
 
 @torch.no_grad()
-def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
+def measure(path: str) -> Iterator[dict[str, Any]]:
     """Yield a record for windows of the newest records and one for those of all.
 
     Raises:
-        ValueError: the checkpoint is of another algorithm, or its replay keeps no latents.
+        SystemExit: The replay keeps no latents.
     """
-    run = RunDirectory.of(checkpoint)
-    config = trained_config(run.path)
-    if not isinstance(config, DreamerConfig):
-        raise ValueError(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
-    if not config.replay.context:
-        raise ValueError(f"{checkpoint}: its records keep no latents; those of replay.context=true do.")
-    config.device, config.replay.device = "cpu", "auto"  # wherever it was trained
-    learner, counters = restore(config, checkpoint)
-    replay = restore_replay(config, checkpoint, learner, config.model.batch_size, config.model.batch_length)
+    trained = restore(path)
+    if not trained.config.replay.context:
+        raise SystemExit(f"{trained.checkpoint}: its records keep no latents; those of replay.context=true do.")
+    learner, replay = trained.learner, restore_replay(trained)
     torch.manual_seed(0)
     moved, recent = [], []
     for _ in range(BATCHES):
@@ -73,9 +59,8 @@ def measure(checkpoint: Path) -> Iterator[dict[str, Any]]:
         if len(values):
             quantiles = values.quantile(torch.tensor(QUANTILES)).tolist()
             yield {
-                "benchmark": "policy_drift", "run": run.path.name, "track": config.track, "seed": config.seed,
-                **counters, "of": name, "records": len(values), "mean": values.mean().item(),
-                **dict(zip(COLUMNS[5:], quantiles, strict=True)),
+                "benchmark": "policy_drift", **trained.where, "of": name, "records": len(values),
+                "mean": values.mean().item(), **dict(zip(COLUMNS[5:], quantiles, strict=True)),
             }  # fmt: skip
 
 

@@ -1,0 +1,105 @@
+"""Trained dreamer_v3 agents and their replay, brought back on a CPU for what is measured of them."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import torch
+from tensordict import TensorDict
+
+sys.path.append(str(Path(__file__).parents[1] / "recipes"))
+
+from composing.arena import Environment, make_env, worlds_of
+from composing.building import make_curriculum, make_run_replay
+from composing.learners import size_of
+from composing.restoring import restore_learner
+from composing.saved import trained_config
+from composing.schema import DreamerConfig
+
+from dreamer_racing.experience.replay import StreamReplay
+from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.modules.interface import PRIVILEGED
+from dreamer_racing.training.checkpoint import load_components
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+
+__all__ = ["DreamerConfig", "Trained", "fly", "make_env", "restore", "restore_replay", "size_of", "worlds_of"]
+
+
+class Trained(NamedTuple):
+    """A run's settings for a CPU, its learner with the trained weights (not the averaged ones), and where it was."""
+
+    config: DreamerConfig
+    learner: DreamerLearner
+    checkpoint: Path
+    where: dict[str, Any]
+
+
+def restore(path: str) -> Trained:
+    """Bring back the latest checkpoint of a run directory, or a checkpoint.
+
+    Raises:
+        SystemExit: It is of another algorithm.
+    """
+    checkpoint = latest_checkpoint(path)
+    run = RunDirectory.of(checkpoint)
+    config = trained_config(run.path)
+    if not isinstance(config, DreamerConfig):
+        raise SystemExit(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
+    config.device, config.replay.device = "cpu", "auto"
+    learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
+    where = {"run": run.path.name, "track": config.track, "actor": config.loss.actor, "seed": config.seed, **counters}
+    return Trained(config, cast(DreamerLearner, learner), checkpoint, where)
+
+
+def restore_replay(trained: Trained, config: DreamerConfig | None = None) -> StreamReplay:
+    """Bring back the replay of a checkpoint that holds one (not `best/`), sampled as the run, or `config`, does."""
+    config = config or trained.config
+    settings, curriculum = config.replay, make_curriculum(config)
+    env = make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # for what it shows
+    replay = make_run_replay(
+        config,
+        env,
+        curriculum,
+        config.model.batch_size,
+        config.model.batch_length,
+        latents=trained.learner.latent_format if settings.context else None,
+        recent_share=settings.recent_share,
+        recent_records=settings.recent_records,
+        held_out=settings.held_out,
+    )
+    env.close()
+    load_components(trained.checkpoint, {"replay": replay} | ({"curriculum": curriculum} if curriculum else {}))
+    return replay
+
+
+@torch.no_grad()
+def fly(learner: DreamerLearner, env: Environment, steps: int) -> TensorDict:
+    """Fly the stochastic policy for K steps of N worlds; return what came of it, batch ``[K, N]``.
+
+    ``belief`` and ``state`` are the latents with which it acted, ``reward`` and ``done`` what the step led to, and
+    ``vector``, if the worlds tell it, the simulator's state that it acted in.
+    """
+    num_envs, policy, size = env.batch_size[0], learner.policy(), learner.size
+    observation = env.reset()
+    memory = {
+        "belief": torch.zeros(num_envs, size.belief),
+        "state": torch.zeros(num_envs, size.latents * size.classes),
+        "previous_action": torch.zeros(num_envs, 4),
+    }
+    begins, records = torch.ones(num_envs, 1, dtype=torch.bool), []
+    for _ in range(steps):
+        acted = policy(observation.clone(recurse=False).update({**memory, "is_init": begins}))
+        memory = {name: acted["next", name] for name in memory}
+        after = env.step(acted.select("action"))["next"]
+        record = {name: memory[name] for name in ("belief", "state")}
+        record |= {name: after[name] for name in ("reward", "done")}
+        if PRIVILEGED in observation.keys(True):
+            record["vector"] = observation[PRIVILEGED]
+        records.append(TensorDict(record, [num_envs]).clone())
+        begins, observation = after["done"].clone(), after.select(*env.observation_spec.keys()).clone()
+        if begins.any():
+            first = env.reset(TensorDict({"_reset": begins}, [num_envs]))
+            observation = torch.where(begins[:, 0], first.select(*observation.keys()), observation)
+    env.close()
+    return cast(TensorDict, torch.stack(records))
