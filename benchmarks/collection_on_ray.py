@@ -9,7 +9,7 @@ cluster on this machine. `env_steps_per_s` is the median of `--rounds`; `least` 
 `times` is the multiple of the single process. `overhead` is the share of wall-clock time in which no worker flew:
 rollouts on their way, and requests. `weights_age` is how many env_steps the oldest weights were old at the end of what
 was flown with them, at most, and `stated` what workers.weight_interval promises. Keep the machine idle meanwhile; more
-workers than cores gain nothing. `python benchmarks/pipeline.py --check` compares its forecast with the result.
+workers than cores gain nothing.
 """
 
 import argparse

@@ -1,7 +1,6 @@
 """What every benchmark does: say where it was measured, print a table, write flat JSON."""
 
 import json
-import resource
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,9 +31,3 @@ def write_json(records: Sequence[dict[str, Any]], path: str | None) -> None:
         where = {**provenance(), "commit": COMMIT}
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps([{**record, **where} for record in records], indent=1) + "\n")
-
-
-def cpu_seconds() -> float:
-    """Return what all ended child processes have used, user and system."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime

@@ -1,8 +1,7 @@
-"""Environment steps per second: the worlds alone, through TorchRL, and what others reach in the same run.
+"""Environment steps per second: the worlds alone, and through TorchRL.
 
     python benchmarks/simulation.py --json results/simulation.json         # this machine's CPU
     python benchmarks/simulation.py --device cuda --json results/simulation_cuda.json
-    python benchmarks/simulation.py --peers --json results/simulation_peers.json
     python benchmarks/simulation.py --page results/simulation*.json     # no measuring: writes docs/benchmarks.md
 
 Every row is a process of its own. `images` is `none` (state only, `vector`), a renderer of the CPU backend, `warp_cuda`
@@ -80,7 +79,6 @@ def main() -> None:
     parser.add_argument("--num-envs", nargs="*", type=int, help="N to try")
     parser.add_argument("--actor", help="size of the DreamerV3 policy; default: cpu_small, on cuda size12m")
     parser.add_argument("--seconds", type=float, help="least time of a measurement; default: 1.5, on cuda 0.5")
-    parser.add_argument("--peers", action="store_true", help="measure the peers that are installed instead")
     parser.add_argument(
         "--page", nargs="*", metavar="JSON", help="write the table of docs/benchmarks.md from these results"
     )
@@ -91,7 +89,7 @@ def main() -> None:
         write_page(arguments.page)
         return
     records = []
-    for job, *details in peer_jobs(arguments) if arguments.peers else jobs(arguments):
+    for job, *details in jobs(arguments):
         # a process of its own: PyOpenGL is bound to one platform for the life of a process
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
             try:
@@ -295,82 +293,6 @@ def peak_gib(device: torch.device | None) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-# --- peers ---
-
-
-def peer_jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
-    """The peers, and ours in the same run."""
-    yield measure, "none", 512, arguments.track, {"preset": arguments.preset}, "cpu_small", arguments.seconds
-    yield measure, "egl", 256, arguments.track, {"preset": arguments.preset}, "cpu_small", arguments.seconds
-    for name, peer in (
-        ("dm_control, state", dm_control),
-        ("dm_control, EGL", dm_control),
-        ("Gymnasium SyncVectorEnv, state", sync_vector),
-        ("Gymnasium SyncVectorEnv, pixels", sync_vector),
-        ("Crazyflow, state", crazyflow),
-    ):
-        yield peer, name, arguments.track, arguments.preset, arguments.seconds
-
-
-def peer_record(name: str, num_envs: int, steps_per_s: float) -> dict[str, Any]:
-    """A record of a peer that steps its worlds in its own loop."""
-    record = {"benchmark": "simulation", "images": name, "num_envs": num_envs, "worlds": steps_per_s}
-    return {**record, "memory_gib": peak_gib(None)}
-
-
-def dm_control(name: str, track: str, preset: str, seconds: float) -> dict[str, Any]:
-    """The same race as one dm_control task, stepped in Python."""
-    from dreamer_racing.envs.dm_control_env import load
-
-    env = load(track, preset, random=0, from_pixels=name.endswith("EGL"))
-    action = env.action_spec().generate_value() * 0.0
-
-    def steps() -> None:
-        for _ in range(ROLLOUT):
-            if env.step(action).last():
-                env.reset()
-
-    env.reset()
-    return peer_record(name, 1, speed(steps, ROLLOUT, seconds))
-
-
-def sync_vector(name: str, track: str, preset: str, seconds: float, num_envs: int = 8) -> dict[str, Any]:
-    """Eight of our single Gymnasium environments in Gymnasium's own vector environment."""
-    import gymnasium
-
-    from dreamer_racing.envs.gym_env import DroneRaceGymEnv
-
-    torch.set_num_threads(1)
-    observation = "pixels" if name.endswith("pixels") else "state"
-    make = [lambda: DroneRaceGymEnv(track, preset=preset, observation=observation) for _ in range(num_envs)]
-    env = gymnasium.vector.SyncVectorEnv(make)
-    env.reset(seed=0)
-
-    def steps() -> None:
-        for _ in range(ROLLOUT):
-            env.step(env.action_space.sample())
-
-    return peer_record(name, num_envs, speed(steps, ROLLOUT * num_envs, seconds))
-
-
-def crazyflow(name: str, track: str, preset: str, seconds: float, num_envs: int = 512) -> dict[str, Any]:
-    """Crazyflow's vectorised simulation at 500 Hz and 50 Hz control: no race, no images."""
-    import numpy as np
-    from crazyflow.sim import Sim  # type: ignore[import-not-found]  # an optional peer
-
-    sim = Sim(n_worlds=num_envs, n_drones=1, control="attitude", freq=500, attitude_freq=50)
-    sim.reset()
-    command = np.zeros((num_envs, 1, 4), np.float32)
-
-    def steps() -> None:
-        for _ in range(ROLLOUT):
-            sim.attitude_control(command)
-            sim.step(sim.freq // sim.control_freq)
-        np.asarray(sim.data.states.pos)  # wait for it
-
-    return peer_record(name, num_envs, speed(steps, ROLLOUT * num_envs, seconds))
-
-
 # --- docs/benchmarks.md ---
 
 
@@ -380,7 +302,7 @@ def write_page(paths: list[str]) -> None:
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for record in records:
         if "device" not in record:
-            continue  # a peer
+            continue  # a peer that was measured once
         key = (record["images"], record["device"], record["machine"])
         if key not in best or record["collector"] > best[key]["collector"]:
             best[key] = record

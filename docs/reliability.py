@@ -3,7 +3,7 @@
     python docs/reliability.py            # write the column
     python docs/reliability.py --check    # exit with status 1 if it is not up to date
 
-The numbers are those of results/faults.json and results/fuzz.json, which benchmarks/faults.py and benchmarks/fuzz.py
+The numbers are those of results/faults.json and results/fuzz.json, which faults.py and fuzz.py in tests/robustness
 write, each with the commit that was attacked; what is in neither is not measured. Everything else of the page is
 written by hand: a row that an attack is to fill is named in `ATTACKS` by its first cell.
 """

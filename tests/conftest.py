@@ -12,9 +12,6 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-# For `forked`, and for good: its processes look there, too. Last, so that no benchmark stands in for another module.
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests come first, so that no worker is left with a long one at the end."""

@@ -15,8 +15,9 @@ from types import ModuleType
 from typing import Self
 
 import hydra
-from forked import recipe, started  # noqa: F401 - for tests, beside the rest
 from omegaconf import DictConfig, OmegaConf
+
+from tests.forked import recipe, started  # noqa: F401 - for tests, beside the rest
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"

@@ -189,8 +189,10 @@ def test_every_attack_of_the_benchmarks_is_in_a_row_and_what_was_not_measured_sa
     assert "damage: 2 of 3 survived (abc); checkpoints: not measured |" in filled
     assert "kill at rename: not measured; kill at fsync: 2 of 2 survived, among 9 (d) |" in filled
     attacks = {kind for kinds in reliability.ATTACKS.values() for kind in kinds}
-    faults, fuzz = ((ROOT / "benchmarks" / f"{name}.py").read_text(encoding="utf-8") for name in ("faults", "fuzz"))
-    named = set(re.findall(r'(?:_verdict|arena\.kills)\(\s*f?"([^"]+)"', faults))
+    faults, fuzz = (
+        (ROOT / "tests" / "robustness" / f"{name}.py").read_text(encoding="utf-8") for name in ("faults", "fuzz")
+    )
+    named = set(re.findall(r'(?:_verdict|self\.kills)\(\s*f?"([^"]+)"', faults))
     named = named - {"kill at {function}"} | {f"kill at {name}" for name in ("open", "rename", "fsync")}
     kinds = set(re.findall(r'^    "(\w+)": \w+,$', fuzz, re.MULTILINE))
     assert len(named) > 8 and len(kinds) == 5 and attacks == named | kinds

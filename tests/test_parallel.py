@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from forked import Forked
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -25,6 +24,7 @@ from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.stored_latents import LatentFormat
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
+from tests.forked import Forked
 from tests.learners.test_dreamer import make_batch
 
 SIZE = replace(get_size("debug"), sampled=False)  # nothing is drawn: an update is a function of its batch

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from forked import SERVER
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
@@ -35,6 +34,7 @@ from dreamer_racing.training.checkpoint import (
 from dreamer_racing.training.checksums import CHECKSUMS, HAS_CHECKSUMS, write_checksums
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.signals import GracefulExit
+from tests.forked import SERVER
 
 
 class Run:

@@ -1,6 +1,6 @@
 """What a training run survives: kills, signals, damaged files, a full disk, a reward that is not finite, a clock.
 
-    OMP_NUM_THREADS=1 python benchmarks/faults.py --kills 50 --json results/faults.json
+    OMP_NUM_THREADS=1 python tests/robustness/faults.py --kills 50 --json results/faults.json
 
 Every case is a short training by `recipes/dreamer_v3.py` in processes of its own, disturbed in one way and continued
 to its end: by the same command as long as it has no checkpoint, then by `resume=`. It *survived* if the last checkpoint
@@ -28,6 +28,7 @@ The exit status is 1 if any case was not survived, and the last lines say which.
 import argparse
 import contextlib
 import csv
+import json
 import os
 import random
 import shutil
@@ -42,13 +43,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from forked import recipe
-from measuring import print_table, write_json
 
-from dreamer_racing.training.checksums import CHECKSUMS
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
-RECIPE = Path(__file__).parents[1] / "recipes" / "dreamer_v3.py"
+from dreamer_racing.machine import provenance  # noqa: E402
+from dreamer_racing.training.checksums import CHECKSUMS  # noqa: E402
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint  # noqa: E402
+from tests.forked import recipe  # noqa: E402
+
+RECIPE = ROOT / "recipes" / "dreamer_v3.py"
 SETTINGS = [
     "track=circle", "tuned=none", "model=debug", "model.batch_size=2", "model.batch_length=8", "model.replay_ratio=1",
     "env.num_envs=4", "env.episode_steps=40", "prefill=64", "replay.capacity=600",
@@ -132,36 +136,20 @@ def main() -> None:
     parser.add_argument("--sigterms", type=int, default=10, help="at random times")
     parser.add_argument("--most", type=int, help="of the cases of the other kinds, spread evenly; all if left out")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", help="written after each case")
+    parser.add_argument("--json", type=Path, help="written after each case")
     arguments = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"  # of every process to come, so that all compute the same
-    draw, most = random.Random(arguments.seed), arguments.most
+    where, cases = provenance(), []
     with tempfile.TemporaryDirectory() as folder:
         arena = Arena(Path(folder))
-        ways: dict[str, Callable[[], Iterator[Case]]] = {
-            "kill": lambda: arena.kills("kill", arguments.kills, draw),
-            "by_clock": lambda: arena.kills(
-                "kill by the clock", max(1, arguments.kills // 5), draw, "checkpoint.minutes=1e-6"
-            ),
-            "early": lambda: arena.early_kills(most),
-            "open": lambda: arena.kills_at_calls("open", most, draw),
-            "rename": lambda: arena.kills_at_calls("rename", most, draw),
-            "fsync": lambda: arena.kills_at_calls("fsync", most, draw),
-            "sigterm": lambda: arena.terminations(arguments.sigterms, draw),
-            "damage": lambda: arena.damages(most),
-            "disk": arena.full_disks,
-            "clock": arena.clocks,
-            "not_finite": arena.not_finite,
-        }
-        cases: list[Case] = []
         for kind in arguments.faults:
-            for case in ways[kind]():
-                cases.append({"benchmark": "faults", **case})
-                write_json(cases, arguments.json)
-    all_cases = Counter(case["fault"] for case in cases)
+            for case in arena.cases(kind, arguments):
+                cases.append({"benchmark": "faults", **case, **where})
+                if arguments.json:
+                    arguments.json.write_text(json.dumps(cases, indent=1) + "\n")
     survived = Counter(case["fault"] for case in cases if case["survived"])
-    counts = [{"fault": kind, "cases": number, "survived": survived[kind]} for kind, number in all_cases.items()]
-    print_table(counts, ["fault", "cases", "survived"])
+    for fault, number in Counter(case["fault"] for case in cases).items():
+        print(f"{fault}: {survived[fault]} of {number} survived")
     if failed := [f"{case['fault']}, {case['where']}: {case['differs']}" for case in cases if not case["survived"]]:
         raise SystemExit("not survived:\n" + "\n".join(failed))
 
@@ -183,6 +171,26 @@ class Arena:
         if latest_checkpoint(RunDirectory(self._whole).best.path).name != latest_checkpoint(self._whole).name:
             raise SystemExit("the undisturbed run replaces no best at its end: another seed in SETTINGS is needed")
         print(f"an undisturbed run takes {self._seconds:.0f} s", flush=True)
+
+    def cases(self, kind: str, asked: argparse.Namespace) -> Iterator[Case]:
+        """Yield the cases of one of the `KINDS`, as many as is asked."""
+        draw, most = random.Random(asked.seed), asked.most
+        ways: dict[str, Callable[[], Iterator[Case]]] = {
+            "kill": lambda: self.kills("kill", asked.kills, draw),
+            "by_clock": lambda: self.kills(
+                "kill by the clock", max(1, asked.kills // 5), draw, "checkpoint.minutes=1e-6"
+            ),
+            "early": lambda: self.early_kills(most),
+            "open": lambda: self.kills_at_calls("open", most, draw),
+            "rename": lambda: self.kills_at_calls("rename", most, draw),
+            "fsync": lambda: self.kills_at_calls("fsync", most, draw),
+            "sigterm": lambda: self.terminations(asked.sigterms, draw),
+            "damage": lambda: self.damages(most),
+            "disk": self.full_disks,
+            "clock": self.clocks,
+            "not_finite": self.not_finite,
+        }
+        return ways[kind]()
 
     def kills(self, fault: str, number: int, draw: random.Random, *settings: str) -> Iterator[Case]:
         """Kill so often at random times, go on after each; a run that comes to its end gives way to another."""

@@ -1,6 +1,6 @@
 """Processes that begin with what takes a recipe most of its first seconds, imported once for all of them.
 
-Benchmarks and tests run recipes in them.
+Tests run recipes in them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Input that nobody means: 100,000 cases at tracks, actions, contracts, overrides and checkpoints.
 
-    OMP_NUM_THREADS=1 python benchmarks/fuzz.py --json results/fuzz.json
+    OMP_NUM_THREADS=1 python tests/robustness/fuzz.py --json results/fuzz.json
 
 Each kind of input has a process of its own. A case is either taken or refused by the errors that are promised for it;
 everything else fails it: another error, more than 10 s, a process that dies. An audit hook fails what starts a process,
@@ -38,21 +38,24 @@ import hydra
 import torch
 import yaml
 from hydra.errors import HydraException
-from measuring import print_table, write_json
 from omegaconf import OmegaConf
 from torchrl.envs import InitTracker, TransformedEnv
 
-from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.tracks import Track, TrackError, load_track
-from dreamer_racing.envs.worlds import RaceWorlds
-from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.export.onnx_actor import OnnxActor, read_contract
-from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints
-from dreamer_racing.training.checksums import write_checksums
-from dreamer_racing.training.directory import latest_checkpoint
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
-ROOT = Path(__file__).parents[1]
+from dreamer_racing.envs import DroneRacingEnv  # noqa: E402
+from dreamer_racing.envs.race.gates import CrashCause  # noqa: E402
+from dreamer_racing.envs.tracks import Track, TrackError, load_track  # noqa: E402
+from dreamer_racing.envs.worlds import RaceWorlds  # noqa: E402
+from dreamer_racing.experience.replay import make_replay  # noqa: E402
+from dreamer_racing.export.onnx_actor import OnnxActor, read_contract  # noqa: E402
+from dreamer_racing.machine import provenance  # noqa: E402
+from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints  # noqa: E402
+from dreamer_racing.training.checksums import write_checksums  # noqa: E402
+from dreamer_racing.training.directory import latest_checkpoint  # noqa: E402
+from tests.forked import Forked  # noqa: E402
+
 TRACKS = ROOT / "dreamer_racing" / "envs" / "tracks"
 AGENT = ROOT / "agents" / "kidney"
 CASES = {"tracks": 40_000, "actions": 40_960, "contracts": 16_000, "overrides": 2_000, "checkpoints": 2_000}
@@ -371,38 +374,36 @@ def attack(kind: str, cases: int, seed: int) -> dict[str, Any]:
     return {"kind": kind, "cases": sum(counts.values()), **counts, "failures": failures[:20]}
 
 
+def in_a_process(kind: str, share: float, seed: int) -> dict[str, Any]:
+    """Attack in a process of its own; what dies there, or hangs where no signal reaches it, has failed."""
+    attacking = Forked(_print_attack, kind, round(share * CASES[kind]), seed, cwd=ROOT)
+    record = {"benchmark": "fuzz", "kind": kind, "cases": 0, "taken": 0, "refused": 0, "failed": 1}
+    try:
+        done = attacking.communicate(HOUR)
+        return record | json.loads(done.stdout.splitlines()[-1])
+    except (subprocess.TimeoutExpired, IndexError, ValueError) as error:
+        said = getattr(error, "stderr", None) or done.stderr
+        return record | {"failures": [f"{error!r}: {said[-1500:]}"]}
+
+
+def _print_attack(kind: str, cases: int, seed: int) -> None:
+    print(json.dumps({"failed": 0, **attack(kind, cases, seed)}))
+
+
 def main() -> None:
-    """Attack by every kind, each in a process of its own."""
+    """Attack by every kind."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--share", type=float, default=1.0, help="of the cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--json")
+    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    if arguments.child:
-        (kind,) = arguments.kinds
-        print(json.dumps(attack(kind, round(arguments.share * CASES[kind]), arguments.seed)))
-        return
-    records = []
-    for kind in arguments.kinds:
-        command = [sys.executable, __file__, "--child", "--kinds", kind]
-        command += ["--share", str(arguments.share), "--seed", str(arguments.seed)]
-        try:
-            done = subprocess.run(command, text=True, capture_output=True, check=True, timeout=HOUR)
-            found = json.loads(done.stdout.splitlines()[-1])
-        except subprocess.SubprocessError as error:  # it died, or hung where no signal reaches it
-            found = {
-                "kind": kind,
-                "cases": 0,
-                "failed": 1,
-                "failures": [f"{error}: {str(getattr(error, 'stderr', ''))[-1500:]}"],
-            }
-        records.append({"benchmark": "fuzz", "taken": 0, "refused": 0, "failed": 0, **found})
-    print_table(records, ("kind", "cases", "taken", "refused", "failed"))
+    records = [in_a_process(kind, arguments.share, arguments.seed) | provenance() for kind in arguments.kinds]
     for record in records:
+        print("{kind}: {cases} cases, {taken} taken, {refused} refused, {failed} failed".format(**record))
         print("\n".join(record["failures"]))
-    write_json(records, arguments.json)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(records, indent=1) + "\n")
     if any(record["failed"] for record in records):
         raise SystemExit(1)
 
