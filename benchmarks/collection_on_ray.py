@@ -166,7 +166,7 @@ def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
     """Collect as the recipe does, with or without workers."""
     env = make_own_env(config)
     learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
-    collector, rollouts = make_rollouts(config, env, learner)
+    rollouts = make_rollouts(config, env, learner)
     for _ in range(WARM_UP):
         next(rollouts)
     flown, age, rounds, taken = 0.0, 0, 0, 0.0
@@ -177,7 +177,7 @@ def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
         if isinstance(rollouts, RayRollouts):
             flown, age = flown + rollouts.seconds, max(age, rollouts.weights_age)
     rollouts.close()
-    collector.shutdown()
+    rollouts.collector.shutdown()
     env.close(raise_if_closed=False)
     if config.collector is not CollectorKind.ray:
         return found(config, rounds, taken)

@@ -9,15 +9,14 @@
 Everything of a run lands in its run directory: checkpoints/, metrics.csv, tensorboard/, videos/, plots/, config.yaml.
 """
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import ClassVar, cast
+from typing import Any, cast
 
 from composing.building import (
-    assemble,
-    claimed,
+    adapt_rewards,
     make_curriculum,
+    make_run_evaluator,
     make_sequence_replay,
+    make_tracker,
     resolve_common,
     seed_generators,
 )
@@ -26,30 +25,25 @@ from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, choose_mixed_precision
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, clock_times, make_agent, scheduled_numbers
+from composing.learners import begin_with, make_learner, make_schedule
 from composing.schema import CollectorKind, DreamerConfig, register
 from composing.sharing import imagines, share_of
 from composing.tuned import changed_from_tuned
 from composing.workers import make_own_env, make_rollouts, place_worlds, resolve_workers
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
 from torch import Tensor
 from torch import device as Device
 
 from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics, world_model_metrics
+from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.dreamer_optimizer import make_optimizer
-from dreamer_racing.learners.learner import seeded
-from dreamer_racing.losses import make_losses
+from dreamer_racing.learners.saved_dreamer import LossState
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.model_lag import ModelLag
-from dreamer_racing.training.pass_share import PassShare
-from dreamer_racing.training.replay_ratio import UpdatesOwed
-from dreamer_racing.training.run import ReplayRun
-from dreamer_racing.training.schedule import RampClock
-from dreamer_racing.training.signals import GracefulExit
+from dreamer_racing.training.session import Session
 
 NUM_ENVS = 32
 SHORT_WINDOW = 16  # records, on a CUDA device
@@ -71,7 +65,7 @@ IMAGES_SETTINGS = """settings: tuned=images, which race Circle from images alone
 SUITE_SETTINGS = """settings: tuned=suite, which learn a task from images on a CPU (tuned=none: as model=cpu_small):
   a small DreamerV3 that trains on 128 records for each action, and averaged weights fly evaluations
   recipes/config/tuned/suite.yaml has every number"""
-LAG_ERRORS = ("privileged_error", "image_error", "loss_vector", "reward_error")  # what tells, best first
+REMEDY = "model.learning_rate (of an improvement loss.ppo.learning_rate), or model.mixed_precision=false"
 RACE_SPEED = 450  # env_steps/s of tuned=race on one core with bfloat16 and AMX, two runs side by side (entry 20)
 FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
 HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, from the newest records of a world
@@ -79,116 +73,10 @@ HELD_OUT_WINDOWS, HELD_OUT_RECORDS = 32, 2_000  # windows measured at a time, fr
 register()
 
 
-@dataclass(kw_only=True)
-class DreamerRun(ReplayRun):
-    """A run that also measures its world model, and may collect ahead of learning."""
-
-    config: DreamerConfig
-    learner: DreamerLearner
-    lag: ModelLag
-    passes: PassShare
-
-    remedy: ClassVar[str] = (
-        "model.learning_rate (of an improvement loss.ppo.learning_rate), or model.mixed_precision=false"
-    )
-
-    def take_in(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Take note of the gates passed, and of how they were flown, too."""
-        episodes = super().take_in(rollout)
-        self.learner.watch(rollout)
-        if len(episodes) and "gates_passed" in episodes:
-            share = self.passes.update(episodes, self.counters["env_steps"])
-            self.metrics.push({"episode/pass_share": share, "episode/hardest_gate": float(self.passes.hardest_gate)})
-        return episodes
-
-    def measure(self) -> None:
-        """Say what is scheduled, and measure the world model on records never trained on, too."""
-        super().measure()
-        numbers = scheduled_numbers(self.config, self.times())
-        self.metrics.push({f"schedule/{name}": number for name, number in numbers.items() if number is not None})
-        names = ("learning_rate/world_model", "learning_rate/behavior")
-        rates = (group["lr"] for group in self.learner.optimizer.param_groups)
-        self.metrics.push(dict(zip(names, rates, strict=True)))
-        self.metrics.push(self.held_out())
-
-    def held_out(self) -> dict[str, Tensor]:
-        """What the world model makes of the newest records that it is never trained on; nothing, if there are none."""
-        length = SEEN + self.config.model.imagination_horizon
-        windows = self.replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
-        if windows is None or not self.counters["updates"]:
-            return {}
-        self.wait()
-        with self.clock.timed("measure"):
-            return held_out_metrics(self.learner, windows)
-
-    def look_at_lag(self) -> None:
-        """Every so many env_steps, whatever is logged: see whether the model still knows where its policy flies."""
-        periods = self.counters["env_steps"] // self.config.schedule.wait_every
-        if self.lag.limit is None or periods == self.lag.periods:
-            return
-        self.lag.periods = periods
-        length = self.config.model.batch_length
-        if self.config.replay.context:  # begins warm: the newest rollout alone
-            length = min(length, self.config.rollout_steps)
-        windows = self.replay.newest(length)
-        if windows is None or not self.counters["updates"]:
-            return
-        self.wait()
-        with self.clock.timed("measure"):
-            error = lag_error(parallel.averaged(world_model_metrics(self.learner, windows)))
-        if error is not None:
-            waited, ratio = self.lag.waits, self.lag.measured(error)
-            if self.lag.waits is not waited:
-                reason = f"the model errs {ratio:.2f} times as much on the newest records as in training"
-                limit = f"schedule.wait_for_model={self.lag.limit:g}"
-                self.say(f"the actor {'waits' if self.lag.waits else 'goes on'}: {reason} ({limit})")
-            self.metrics.push({"lag/error": error, "lag/ratio": ratio, "lag/actor_waits": float(self.lag.waits)})
-
-    def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
-        """Put what is scheduled where it belongs by now, and make the updates that are due."""
-        self.look_at_lag()  # before the newest records are learned from
-        self.keep_to_schedule()
-        super().learn(rollout, stop)
-
-    def times(self) -> dict[RampClock, float]:
-        """What the clocks of schedules say by now."""
-        return clock_times(self.config, self.counters["env_steps"], self.passes)
-
-    def keep_to_schedule(self) -> None:
-        """Set everything that is scheduled to its value at this share of the run."""
-        self.learner.actor_waits = self.lag.waits
-        times = self.times()
-        self.learner.adjust(**scheduled_numbers(self.config, times))
-        ramp = self.config.schedule.start_on_line
-        if ramp.to is not None:
-            share = ramp.at(self.config.env.start_on_line, times)
-            cast(DroneRacingEnv, self.env).worlds.start_on_line = share
-
-    def after_update(self, batch: TensorDictBase, metrics: dict[str, Tensor]) -> None:
-        """Take note of the model's error; let later windows go on from what the model makes of these records now."""
-        if self.lag.limit is not None and (error := lag_error(metrics)) is not None:
-            self.lag.trained(error)
-        if self.config.replay.context:
-            latents = self.learner.latents
-            assert latents is not None, "the update left them"
-            self.replay.refresh(batch["index"], latents["belief"], latents["state"])
-
-    def save(self) -> Path:
-        """Save everything, if the processes' networks are still the same."""
-        self.learner.check_finite()  # first: weights that are no numbers are never the same
-        parallel.check_same(self.learner.weights)
-        return super().save()
-
-
-def lag_error(metrics: dict[str, Tensor]) -> Tensor | None:
-    """The error by which a model is seen to lag; None if none of them was measured."""
-    return next((metrics[name] for name in LAG_ERRORS if name in metrics), None)
-
-
 @recipe("dreamer_v3")
 def main(config: DictConfig) -> None:
     """Compose the configuration, build the run, train."""
-    launch(config, resolve, build, tune)
+    launch(config, resolve, train, tune, remedy=REMEDY)
 
 
 def tune(config: DictConfig) -> str:
@@ -284,29 +172,112 @@ def captures(config: DictConfig, device: Device) -> bool:
     return device.type == "cuda" and config.collector is not CollectorKind.overlapped and alone
 
 
-def build(config: DreamerConfig, overrides: list[str]) -> DreamerRun:
-    """Make all parts of the run, restored from a checkpoint if it continues one."""
+def train(config: DreamerConfig, session: Session) -> None:
+    """Collect, replay, update, evaluate, save."""
     check_dreamer(config)
-    own = share_of(config)
-    with claimed(config) as lock:
-        env = make_own_env(own)
-        with seeded(config.seed):
-            agent = make_agent(own, Interface.of(env))
-            losses = make_losses(agent, own.loss, own.model.imagination_horizon)
-        learner = DreamerLearner(agent, losses, make_optimizer(agent, losses, own.model), own.model)
-        if config.init_from and not config.resume:
-            print(begin_with(learner, config, env))
-        seed_generators(own.seed)
-        curriculum = make_curriculum(config)
-        collector, rollouts = make_rollouts(own, env, learner)
-        latents = learner.latent_format if config.replay.context else None
-        parts = {
-            "replay": make_sequence_replay(own, env, curriculum, latents),
-            "owed": UpdatesOwed(config.replay_ratio),
-            "lag": ModelLag(config.schedule.wait_for_model if steps_alone(config.loss.actor) else None),
-            "passes": PassShare(env.track.num_gates if isinstance(env, DroneRacingEnv) else 0),
-        }
-        return assemble(DreamerRun, config, overrides, lock, env, learner, collector, curriculum, rollouts, **parts)
+    own = share_of(config)  # of several processes
+    env = make_own_env(own)
+    learner = cast(DreamerLearner, make_learner(own, Interface.of(env), own.device, config.seed))
+    if config.init_from and not config.resume:
+        print(begin_with(learner, config, env))
+    seed_generators(own.seed)
+    curriculum = make_curriculum(config)
+    rollouts = make_rollouts(own, env, learner)
+    replay = make_sequence_replay(own, env, curriculum, learner.latent_format if config.replay.context else None)
+    ratio = config.make_replay_ratio()
+    schedule = make_schedule(config, env.track.num_gates if isinstance(env, DroneRacingEnv) else 0)
+    limit = config.schedule.wait_for_model if steps_alone(config.loss.actor) else None
+    lag = ModelLag(limit, config.schedule.wait_every)
+    session.track(
+        learner=learner,
+        env=env,
+        rollouts=rollouts,
+        evaluator=make_run_evaluator(config, session.directory.path, learner),
+        tracker=make_tracker(config),
+        replay=replay,
+        ratio=ratio,
+        schedule=schedule,
+        lag=lag,
+        **parts_of(curriculum, learner),
+        best=("schedule",),
+    )
+    if config.resume and curriculum:
+        env.body_rate_weight = curriculum.body_rate_weight  # workers' worlds begin anew
+
+    for rollout in session.rollouts():
+        # Replay what was collected; a resumed run first makes the updates that are due, from what it has.
+        if rollout is not None:
+            replay.extend(rollout)
+            learner.watch(rollout)
+            episodes = session.log_episodes(rollout)
+            session.log(adapt_rewards(env, curriculum, episodes))
+            session.log(schedule.observe(episodes, session.env_steps))
+
+        # Move what is scheduled; the actor waits while the model does not know the newest records.
+        if lag.due(session.env_steps) and session.counters["updates"]:
+            session.log(measure_lag(session, lag, learner, replay, config))
+        numbers = schedule.at(session.env_steps)
+        if (share := numbers.pop("start_on_line", None)) is not None:
+            cast(DroneRacingEnv, env).worlds.start_on_line = share
+        learner.adjust(**numbers)
+        learner.actor_waits = lag.waits
+
+        # Update world model, actor and critic on the replay.
+        for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
+            with session.timed("sample"):
+                batch = replay.sample()
+            metrics = learner.update(batch, session.timed)
+            session.log(metrics)
+            lag.trained(metrics)
+            if config.replay.context:  # later windows go on from what the model makes of these records now
+                replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
+
+        # Evaluate, log and save.
+        if session.due("evaluate"):
+            session.evaluate()
+        if session.due("log"):
+            session.write_row(
+                {f"schedule/{name}": value for name, value in numbers.items()}
+                | {
+                    f"learning_rate/{name}": group["lr"]
+                    for name, group in zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
+                }
+                | measure_held_out(session, learner, replay, config)
+            )
+        session.save_if_due()
+
+
+def parts_of(curriculum: BodyRateCurriculum | None, learner: DreamerLearner) -> dict[str, Any]:
+    """Return the parts of a checkpoint that not every run has."""
+    parts: dict[str, Any] = {} if curriculum is None else {"curriculum": curriculum}
+    if not parallel.is_first():  # what this process's worlds flew; of the first it is the learner's
+        parts["actor_loss"] = LossState(learner.losses["actor"], learner.agent)
+    return parts
+
+
+def measure_lag(
+    session: Session, lag: ModelLag, learner: DreamerLearner, replay: StreamReplay, config: DreamerConfig
+) -> dict[str, Tensor | float]:
+    """Measure whether the model knows the records of the newest flights, before they are learned from."""
+    length = config.model.batch_length
+    if config.replay.context:  # begins warm: the newest rollout alone
+        length = min(length, config.rollout_steps)
+    if (windows := replay.newest(length)) is None:
+        return {}
+    with session.undisturbed():
+        return lag.measured(parallel.averaged(world_model_metrics(learner, windows)))
+
+
+def measure_held_out(
+    session: Session, learner: DreamerLearner, replay: StreamReplay, config: DreamerConfig
+) -> dict[str, Tensor]:
+    """Measure the world model on the newest records that it is never trained on; nothing, if there are none."""
+    length = SEEN + config.model.imagination_horizon
+    windows = replay.held_out(HELD_OUT_WINDOWS, length, HELD_OUT_RECORDS)
+    if windows is None or not session.counters["updates"]:
+        return {}
+    with session.undisturbed():
+        return held_out_metrics(learner, windows)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
-from composing.arena import make_report, track_as_begun, worlds_of
+from composing.arena import make_evaluator, track_as_begun, worlds_of
 from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import Restored, fresh_directory, heading, restore
@@ -102,7 +102,7 @@ def refuse_races(config: EvaluateConfig, track: Track) -> None:
 
 def make_nominal_report(config: EvaluateConfig, restored: Restored, directory: Path) -> EvaluationReport:
     """Make the races that the policy is to fly as it was trained to."""
-    report = make_report(
+    report = make_evaluator(
         restored.trained,
         directory,
         restored.flyer,

@@ -7,50 +7,39 @@
 Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import cast
 
 from composing.arena import make_env
-from composing.building import assemble, claimed, make_collector, make_curriculum, resolve_baseline, seed_generators
+from composing.building import (
+    adapt_rewards,
+    make_collector,
+    make_curriculum,
+    make_run_evaluator,
+    make_tracker,
+    resolve_baseline,
+    seed_generators,
+)
 from composing.checks import check_ppo
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.schema import PPORunConfig, register
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
 
+from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.learners import PPOLearner
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.run import Run
-from dreamer_racing.training.signals import GracefulExit
+from dreamer_racing.training.session import Session
 
 NUM_ENVS = {"pixels": 64, "state": 1024}
 
 register()
 
 
-@dataclass(kw_only=True)
-class PPORun(Run):
-    """A run that learns from every rollout once, and forgets it."""
-
-    config: PPORunConfig
-    learner: PPOLearner
-
-    remedy: ClassVar[str] = "ppo.learning_rate"
-
-    def learn(self, rollout: TensorDictBase | None, stop: GracefulExit) -> None:
-        """Make the epochs of a rollout."""
-        if rollout is None:
-            return
-        self.metrics.push(self.learner.update(rollout, self.clock.timed))
-        self.counters["updates"] = self.learner.updates
-
-
 @recipe("ppo")
 def main(config: DictConfig) -> None:
-    """Compose the configuration, build the run, train."""
-    launch(config, resolve, build)
+    """Compose the configuration, and train."""
+    launch(config, resolve, train, remedy="ppo.learning_rate")
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -58,15 +47,34 @@ def resolve(config: DictConfig) -> DictConfig:
     return resolve_baseline(config, NUM_ENVS)
 
 
-def build(config: PPORunConfig, overrides: list[str]) -> PPORun:
-    """Make all parts of the run, restored from a checkpoint if it continues one."""
+def train(config: PPORunConfig, session: Session) -> None:
+    """Collect, update, evaluate, save."""
     check_ppo(config)
-    with claimed(config) as lock:
-        env = make_env(config)
-        learner = make_learner(config, Interface.of(env), config.device)
-        seed_generators(config.seed)
-        collector = make_collector(config, env, learner.policy())
-        return assemble(PPORun, config, overrides, lock, env, learner, collector, make_curriculum(config))
+    env = make_env(config)
+    learner = cast(PPOLearner, make_learner(config, Interface.of(env), config.device))
+    seed_generators(config.seed)
+    rollouts = Rollouts(make_collector(config, env, learner.policy()))
+    curriculum = make_curriculum(config)
+    session.track(
+        learner=learner,
+        env=env,
+        rollouts=rollouts,
+        evaluator=make_run_evaluator(config, session.directory.path, learner),
+        tracker=make_tracker(config),
+        **({"curriculum": curriculum} if curriculum else {}),
+    )
+
+    for rollout in session.rollouts():
+        if rollout is not None:
+            # Every rollout is learned from in some epochs, and forgotten.
+            session.log(adapt_rewards(env, curriculum, session.log_episodes(rollout)))
+            session.log(learner.update(rollout, session.timed))
+            session.counters["updates"] = learner.updates
+        if session.due("evaluate"):
+            session.evaluate()
+        if session.due("log"):
+            session.write_row()
+        session.save_if_due()
 
 
 if __name__ == "__main__":

@@ -7,16 +7,16 @@
 Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import cast
 
 from composing.arena import make_env
 from composing.building import (
-    assemble,
-    claimed,
+    adapt_rewards,
     make_collector,
     make_curriculum,
+    make_run_evaluator,
     make_run_replay,
+    make_tracker,
     resolve_baseline,
     seed_generators,
 )
@@ -27,10 +27,10 @@ from composing.learners import make_learner
 from composing.schema import SACRunConfig, register
 from omegaconf import DictConfig
 
+from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.learners import SACLearner
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.replay_ratio import UpdatesOwed
-from dreamer_racing.training.run import ReplayRun
+from dreamer_racing.training.session import Session
 
 NUM_ENVS = {"pixels": 64, "state": 256}
 TRANSITION = 2  # records of a window: what was seen before an action, and after it
@@ -38,20 +38,10 @@ TRANSITION = 2  # records of a window: what was seen before an action, and after
 register()
 
 
-@dataclass(kw_only=True)
-class SACRun(ReplayRun):
-    """A run with a replay of transitions."""
-
-    config: SACRunConfig
-    learner: SACLearner
-
-    remedy: ClassVar[str] = "sac.learning_rate"
-
-
 @recipe("sac")
 def main(config: DictConfig) -> None:
-    """Compose the configuration, build the run, train."""
-    launch(config, resolve, build)
+    """Compose the configuration, and train."""
+    launch(config, resolve, train, remedy="sac.learning_rate")
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -59,28 +49,40 @@ def resolve(config: DictConfig) -> DictConfig:
     return resolve_baseline(config, NUM_ENVS)
 
 
-def build(config: SACRunConfig, overrides: list[str]) -> SACRun:
-    """Make all parts of the run, restored from a checkpoint if it continues one."""
+def train(config: SACRunConfig, session: Session) -> None:
+    """Collect, replay, update, evaluate, save."""
     check_sac(config)
-    with claimed(config) as lock:
-        env = make_env(config)
-        learner = make_learner(config, Interface.of(env), config.device)
-        seed_generators(config.seed)
-        collector = make_collector(config, env, learner.policy())
-        curriculum = make_curriculum(config)
-        replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
-        return assemble(
-            SACRun,
-            config,
-            overrides,
-            lock,
-            env,
-            learner,
-            collector,
-            curriculum,
-            replay=replay,
-            owed=UpdatesOwed(config.replay_ratio),
-        )
+    env = make_env(config)
+    learner = cast(SACLearner, make_learner(config, Interface.of(env), config.device))
+    seed_generators(config.seed)
+    rollouts = Rollouts(make_collector(config, env, learner.policy()))
+    curriculum = make_curriculum(config)
+    replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
+    ratio = config.make_replay_ratio()
+    session.track(
+        learner=learner,
+        env=env,
+        rollouts=rollouts,
+        evaluator=make_run_evaluator(config, session.directory.path, learner),
+        tracker=make_tracker(config),
+        replay=replay,
+        ratio=ratio,
+        **({"curriculum": curriculum} if curriculum else {}),
+    )
+
+    for rollout in session.rollouts():
+        if rollout is not None:
+            replay.extend(rollout)
+            session.log(adapt_rewards(env, curriculum, session.log_episodes(rollout)))
+        for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
+            with session.timed("sample"):
+                batch = replay.sample()
+            session.log(learner.update(batch, session.timed))
+        if session.due("evaluate"):
+            session.evaluate()
+        if session.due("log"):
+            session.write_row()
+        session.save_if_due()
 
 
 if __name__ == "__main__":

@@ -12,11 +12,12 @@ import sys
 import time
 from pathlib import Path
 from types import ModuleType
-from typing import Self
+from typing import Any, Self
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from dreamer_racing.training.session import Session
 from tests.forked import recipe, started  # noqa: F401 - for tests, beside the rest
 
 ROOT = Path(__file__).parents[1]
@@ -64,12 +65,29 @@ def compose(recipe_name: str, *overrides: str) -> DictConfig:
         return hydra.compose(recipe_name, overrides=list(overrides))
 
 
+def open_session(*overrides: str, name: str = "dreamer_v3") -> tuple[Any, Session]:
+    """The configuration of a run as its recipe resolves it, and a session for it."""
+    config = OmegaConf.to_object(recipe_module(name).resolve(compose(name, *overrides)))
+    return config, recipe_module("composing.building").open_session(config, list(overrides))
+
+
+def prepared(*overrides: str, name: str = "dreamer_v3") -> Session:
+    """The session of a run whose parts are all made or restored, and whose loop has not begun."""
+    config, session = open_session(*overrides, name=name)
+    session.rollouts = lambda: iter(())
+    try:
+        recipe_module(name).train(config, session)
+    except BaseException:
+        session.close()
+        raise
+    del session.rollouts
+    return session
+
+
 def build(*overrides: str) -> None:
-    """Resolve and build a run as `recipes/dreamer_v3.py` does, in this process."""
-    dreamer, command_line = recipe_module("dreamer_v3"), recipe_module("composing.command_line")
-    with command_line.plain_errors():
-        config = dreamer.resolve(compose("dreamer_v3", "model=debug", "env.from_pixels=false", *overrides))
-        dreamer.build(OmegaConf.to_object(config), list(overrides)).close()
+    """Resolve a configuration and make all parts of a run, as `recipes/dreamer_v3.py` does, in this process."""
+    with recipe_module("composing.command_line").plain_errors():
+        prepared("model=debug", "env.from_pixels=false", *overrides).close()
 
 
 def free_port() -> int:

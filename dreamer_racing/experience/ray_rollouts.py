@@ -84,7 +84,7 @@ class RayRollouts(Rollouts):
         patience: float = 600.0,
         leaves: bool = True,
     ) -> None:
-        self._collector, self._policy, self._env, self._settings = collector, policy, env, settings
+        self.collector, self._policy, self._env, self._settings = collector, policy, env, settings
         self._workers = list(collector.remote_collectors)
         self._frames = collector.frames_per_batch * len(self._workers)
         check_interval(weight_interval, self._frames)
@@ -126,7 +126,7 @@ class RayRollouts(Rollouts):
     def close(self) -> None:
         """End the workers."""
         self._asked = []
-        self._collector.shutdown()
+        self.collector.shutdown()
         if self._leaves:
             ray_cluster.leave()
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from tensordict import TensorDictBase
 
@@ -27,7 +28,8 @@ class Rollouts(Iterator[TensorDictBase]):
     has_worlds = True
     stopping: Callable[[], bool] = staticmethod(lambda: False)
 
-    def __init__(self, collector: Iterable[TensorDictBase]) -> None:
+    def __init__(self, collector: Any) -> None:
+        self.collector = collector
         self._rollouts = iter(collector)
 
     def __next__(self) -> TensorDictBase:

@@ -9,7 +9,7 @@ from typing import Any
 from dreamer_racing.training.metrics import PendingMetrics
 
 
-class Schedule:
+class Periods:
     """Says when something that happens every so many env_steps is due.
 
     Args:
@@ -19,8 +19,8 @@ class Schedule:
         latest: env_steps at the latest of each kind; saved with the run.
 
     Example:
-        >>> schedule = Schedule(log=100)
-        >>> [env_steps for env_steps in (90, 110, 190, 210) if schedule.due("log", env_steps)]
+        >>> periods = Periods(log=100)
+        >>> [env_steps for env_steps in (90, 110, 190, 210) if periods.due("log", env_steps)]
         [110, 210]
     """
 
@@ -59,31 +59,21 @@ class Interval:
 
 
 class Journal:
-    """A schedule and the metrics under way, as one part of a checkpoint: with it a resumed run writes the same rows.
+    """Periods and the metrics under way, as one part of a checkpoint: with it a resumed run writes the same rows.
 
     Args:
-        schedule: of the run.
+        periods: of the run.
         pending: metrics that are in no row yet.
-
-    Attributes:
-        restored: whether it came from a checkpoint; those of older versions have none.
     """
 
-    def __init__(self, schedule: Schedule, pending: PendingMetrics) -> None:
-        self.schedule, self.pending = schedule, pending
-        self.restored = False
-
-    def begin_at(self, env_steps: int) -> None:
-        """Go on from a checkpoint without a journal: everything before it was done, and nothing is under way."""
-        self.schedule.latest = dict.fromkeys(self.schedule.latest, env_steps)
-        self.pending.written = env_steps
+    def __init__(self, periods: Periods, pending: PendingMetrics) -> None:
+        self.periods, self.pending = periods, pending
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that a checkpoint needs."""
-        return {"latest": dict(self.schedule.latest), **self.pending.state_dict()}
+        return {"latest": dict(self.periods.latest), **self.pending.state_dict()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.schedule.latest |= state_dict["latest"]
+        self.periods.latest |= state_dict["latest"]
         self.pending.load_state_dict(state_dict)
-        self.restored = True

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
+
+from tensordict import TensorDictBase
+
+from dreamer_racing.training.gate_pass_rate import GatePassRate
 
 
 class RampClock(Enum):
     """What a ramp goes by, a number from 0 to 1."""
 
     run = "run"  # share of the run's env_steps
-    passes = "passes"  # best share of flights that pass the hardest gate, `PassShare.best`
-    known = "known"  # the same, and on by itself once that gate is known, `PassShare.known`
+    passes = "passes"  # best share of flights that pass the hardest gate, `GatePassRate.best`
+    known = "known"  # the same, and on by itself once that gate is known, `GatePassRate.known`
 
 
 @dataclass
@@ -65,3 +70,51 @@ class Ramp:
         if progress <= self.begin:
             return value
         return value + (self.to - value) * (progress - self.begin) / (self.end - self.begin)
+
+
+class Schedule:
+    """Moves hyperparameters over a run: each from its own value along its ramp.
+
+    Args:
+        ramps: value and ramp of each, by name.
+        total_env_steps: of the run.
+        num_gates: of the track; 0: there is no race, and no ramp goes by its gates.
+
+    Example:
+        >>> schedule = Schedule({"discount": (0.98, Ramp(to=0.99, begin=0.5))}, total_env_steps=1000)
+        >>> schedule.at(750)
+        {'discount': 0.985}
+    """
+
+    def __init__(self, ramps: Mapping[str, tuple[float, Ramp]], total_env_steps: int, num_gates: int = 0) -> None:
+        self.ramps, self.total_env_steps = dict(ramps), total_env_steps
+        self.pass_rate = GatePassRate(num_gates)
+
+    def observe(self, episodes: TensorDictBase, env_steps: int) -> dict[str, float]:
+        """Take note of the gates that finished episodes passed, by which some ramps go; return metrics.
+
+        Args:
+            episodes: Batch ``[E]`` of ``EpisodeTracker.update``.
+            env_steps: Made so far.
+        """
+        if not len(episodes) or "gates_passed" not in episodes:
+            return {}
+        share = self.pass_rate.update(episodes, env_steps)
+        return {"episode/pass_share": share, "episode/hardest_gate": float(self.pass_rate.hardest_gate)}
+
+    def at(self, env_steps: int) -> dict[str, float]:
+        """Return all hyperparameters after so many env_steps, by name."""
+        times = {
+            RampClock.run: env_steps / self.total_env_steps,
+            RampClock.passes: self.pass_rate.best,
+            RampClock.known: self.pass_rate.known(env_steps, self.total_env_steps),
+        }
+        return {name: ramp.at(value, times) for name, (value, ramp) in self.ramps.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
+        return self.pass_rate.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.pass_rate.load_state_dict(state_dict)

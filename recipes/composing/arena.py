@@ -16,7 +16,7 @@ from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, lo
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Evaluable
 from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
-from dreamer_racing.training.run import Report
+from dreamer_racing.training.session import Evaluator
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv
@@ -126,7 +126,7 @@ def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int |
     )
 
 
-def make_report(
+def make_evaluator(
     config: RunConfig,
     directory: Path,
     learner: Evaluable,
@@ -134,7 +134,7 @@ def make_report(
     video_steps: int,
     start_noise: float = 0.0,
     **options: Any,
-) -> Report:
+) -> Evaluator:
     """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
     if is_race(config):
         worlds = {**worlds_of(config), "start_noise": start_noise}

@@ -3,21 +3,22 @@
 import math
 import random
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from composing.arena import (
     Environment,
     crash_causes,
     describe_file,
-    make_report,
+    make_evaluator,
     reward_terms,
     scene_name,
     worlds_device,
@@ -25,20 +26,16 @@ from composing.arena import (
 from composing.checks import refuse_to_replace
 from composing.command_line import CONFIG_DIR, new_run_dir
 from composing.devices import choose_device
-from composing.saved import flat_settings, saved_config
+from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME
 from dreamer_racing.envs.tracks import TrackError
-from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
-from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
-from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Learner, Policy
-from dreamer_racing.learners.saved_dreamer import LossState
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
@@ -47,24 +44,10 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpoints
-from dreamer_racing.training.clock import RunClock
 from dreamer_racing.training.directory import RunDirectory, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.following import LockHeldByFirst, NoReport, UnwrittenMetrics
-from dreamer_racing.training.journal import Journal, Schedule
-from dreamer_racing.training.lock import RunLock
-from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
-from dreamer_racing.training.replay_ratio import UpdatesOwed
-from dreamer_racing.training.run import Report, Run
-
-R = TypeVar("R", bound=Run)
-OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
-"""Parts of a run that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
-
-
-OF_WORLDS = ("env", "collector")
-"""Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
+from dreamer_racing.training.following import LockHeldByFirst, NoReport
+from dreamer_racing.training.session import Evaluator, Session
 
 
 def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
@@ -260,27 +243,6 @@ def make_sequence_replay(
     )
 
 
-@contextmanager
-def claimed(config: RunConfig) -> Iterator[RunLock | LockHeldByFirst]:
-    """Take a run directory before anything large is made; of several processes the first one does.
-
-    The run keeps it after the block; if the block fails, the next one gets it, and a folder that was made for it goes.
-
-    Raises:
-        ValueError: it holds another run, or is in use by a live one.
-    """
-    assert config.run_dir is not None, "resolve_common() names it"
-    directory = Path(config.run_dir)
-    lock = RunDirectory(directory).claim() if parallel.is_first() else LockHeldByFirst(directory)
-    try:
-        if parallel.is_first():
-            refuse_to_replace(config)
-        yield lock
-    except BaseException:
-        lock.abandon()
-        raise
-
-
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
     """Keep what a run is started with, beside it and beside its best checkpoint."""
     for place in (directory, directory.best):
@@ -290,12 +252,27 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
 
 
-def make_run_report(config: RunConfig, directory: Path, learner: Learner) -> Report:
+def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
     """Make the evaluation of a run during training, if this is the process that makes it."""
     if not parallel.is_first():
         return NoReport()
     asked = config.evaluation
-    return make_report(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
+    return make_evaluator(config, directory, learner, asked.episodes, asked.video_steps, asked.start_noise)
+
+
+def make_tracker(config: RunConfig) -> EpisodeTracker:
+    """Make what finds the finished episodes of this process's worlds."""
+    return EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
+
+
+def adapt_rewards(
+    env: Environment, curriculum: BodyRateCurriculum | None, episodes: TensorDictBase
+) -> dict[str, float]:
+    """Let the curriculum, if there is one, set the body-rate penalty of what comes; return metrics."""
+    if curriculum is None:
+        return {}
+    env.body_rate_weight = curriculum.update(episodes["return"])
+    return {"curriculum/body_rate_weight": env.body_rate_weight}
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
@@ -308,102 +285,24 @@ def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | 
     return loggers
 
 
-def make_metrics(config: RunConfig, directory: RunDirectory, pending: PendingMetrics) -> MetricsLog | UnwrittenMetrics:
-    """Make the metrics of a run, which go on from what is pending, if this is the process that writes them."""
-    if not parallel.is_first():
-        return UnwrittenMetrics()
-    resumed = pending.written if config.resume else None
-    return MetricsLog(directory.path, make_run_loggers(config, directory, resumed), resumed, pending)
+def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
+    """Take a run directory, before anything large is made, for a session in it.
 
-
-def tell_how_far(env: Environment, curriculum: BodyRateCurriculum | None, rollouts: Rollouts, env_steps: int) -> None:
-    """Tell the worlds of a resumed run how far it is: they may have begun anew."""
-    if curriculum:
-        env.body_rate_weight = curriculum.body_rate_weight
-    rollouts.begin_at(env_steps)
-
-
-def go_on_owing(owed: UpdatesOwed | None, config: RunConfig, env_steps: int) -> None:
-    """Let a resumed run owe updates from here on by its replay ratio, and say so if that is another than before."""
-    if owed is None:
-        return
-    trained = OmegaConf.to_object(saved_config(config.algorithm, Path(str(config.run_dir))))
-    if owed.go_on(env_steps, cast(ReplayRunConfig, trained).replay_ratio):
-        ratio = owed.ratio
-        print(f"updates: from here on by {ratio.setting}={ratio.ratio:g}, {ratio.records} records each")
-
-
-def assemble(
-    kind: type[R],
-    config: RunConfig,
-    overrides: list[str],
-    lock: RunLock | LockHeldByFirst,
-    env: Environment,
-    learner: Learner,
-    collector: Collector,
-    curriculum: BodyRateCurriculum | None,
-    rollouts: Rollouts | None = None,
-    **own: Any,
-) -> R:
-    """Put a run together in its directory, restored from a checkpoint if it continues one.
-
-    Args:
-        kind: the recipe's class of runs.
-        config: resolved.
-        overrides: from which it was composed.
-        lock: of its directory.
-        env: to train in.
-        learner: what learns.
-        collector: what flies.
-        curriculum: of rewards, if there is one.
-        rollouts: what it flies; None for one rollout after the other.
-        own: further fields of ``kind``; a ``replay`` is saved with the run.
+    Raises:
+        ValueError: it holds another run, or is in use by a live one.
     """
-    directory, rollouts = RunDirectory(lock.directory), rollouts or Rollouts(collector)
-    tracker = EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
-    counters = {"env_steps": 0, "updates": 0, "episodes": 0}
-    parts = {"learner": learner, "counters": counters, "env": env, "tracker": tracker}
-    parts |= {"collector": CollectorState(collector)} | ({"curriculum": curriculum} if curriculum else {})
-    parts |= {name: own[name] for name in ("replay", "owed", "lag", "passes") if name in own}
-    if not rollouts.has_worlds:
-        del parts["env"], parts["collector"]
-    if not parallel.is_first() and isinstance(learner, DreamerLearner):
-        parts["actor_loss"] = LossState(learner.losses["actor"], learner.agent)
-    periods = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
-    parts["journal"] = journal = Journal(Schedule(**periods), PendingMetrics())
-    checkpoints = RunCheckpoints(directory.path, parts, config.checkpoint.keep, OF_EACH_PROCESS)
-    clock = RunClock(counters, alone=parallel.count() == 1)
-    if config.resume:
-        clock.total = checkpoints.load(config.resume, may_lack=("owed", "lag", "passes", "journal", *OF_WORLDS))
-        print(f"resumed {config.resume} at {counters['env_steps']:,} env_steps, {counters['updates']:,} updates")
-        tell_how_far(env, curriculum, rollouts, counters["env_steps"])
-        go_on_owing(own.get("owed"), config, counters["env_steps"])
-        if not journal.restored:
-            journal.begin_at(counters["env_steps"])
-            print("its checkpoint is of an older version, without averages: the next row of metrics.csv begins here")
-    flown: dict[str, Any] = {name: parts[name] for name in ("learner", "counters", "passes") if name in parts}
-    best = BestCheckpoint(directory.path, flown, counters["env_steps"])
-    parallel.together(lambda: None)  # all have read what is written anew now
-    if parallel.is_first():
-        directory.set_aside_after(counters["env_steps"])
-        write_configuration(directory, config, overrides, counters["env_steps"])
-    print(f"run directory: {directory.path}")
-    return kind(
-        config=config,
-        directory=directory,
-        env=env,
-        collector=collector,
-        rollouts=rollouts,
-        tracker=tracker,
-        curriculum=curriculum,
-        learner=learner,
-        report=make_run_report(config, directory.path, learner),
-        metrics=make_metrics(config, directory, journal.pending),
-        schedule=journal.schedule,
-        checkpoints=checkpoints,
-        best=best,
-        counters=counters,
-        clock=clock,
-        lock=lock,
-        **own,
+    assert config.run_dir is not None, "resolve_common() names it"
+    directory = RunDirectory(Path(config.run_dir))
+    lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
+    try:
+        if parallel.is_first():
+            refuse_to_replace(config)
+    except BaseException:
+        lock.abandon()
+        raise
+    return Session(
+        config,
+        lock,
+        lambda env_steps: write_configuration(directory, config, overrides, env_steps),
+        lambda resumed: make_run_loggers(config, directory, resumed),
     )

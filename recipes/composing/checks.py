@@ -225,10 +225,10 @@ def check_replay(config: ReplayRunConfig) -> None:
             f"total_env_steps={config.total_env_steps} must be above prefill={config.prefill}, the steps before the "
             "first update: raise the one, or lower the other."
         )
-    replay = config.replay_ratio
+    replay, group = config.make_replay_ratio(), "sac" if isinstance(config, SACRunConfig) else "model"
     if not replay.updates(config.total_env_steps):
         raise ValueError(
-            f"{replay.setting}={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
+            f"{group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={config.total_env_steps:,} less "
             f"prefill={config.prefill:,} asks for no whole update of {replay.records} records. "
             "Raise total_env_steps or the ratio, or lower the prefill."
         )

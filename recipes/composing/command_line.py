@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -22,18 +22,20 @@ HEAD_START = 10.0  # s that the first of several processes has to say an error; 
 
 
 @contextmanager
-def plain_errors() -> Iterator[None]:
+def plain_errors(applies: Callable[[], bool] = lambda: True) -> Iterator[None]:
     """Turn errors that a person can mend into one paragraph on stderr and exit status 2.
 
-    Wrap set-up only: the same error types inside training are defects, and keep their tracebacks.
+    Args:
+        applies: whether it does by now; during set-up only, since the same error types inside training are defects,
+            and keep their tracebacks.
     """
     try:
         yield
-    except MissingMandatoryValue as error:
-        say_error(f"{error.full_key}= is missing, and there is no default.")
-        raise SystemExit(2) from error
-    except (ValueError, OSError, RendererUnavailableError) as error:
-        say_error(error)
+    except (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError) as error:
+        if not applies():
+            raise
+        missing = isinstance(error, MissingMandatoryValue)
+        say_error(f"{error.full_key}= is missing, and there is no default." if missing else error)
         raise SystemExit(2) from error
 
 

@@ -4,16 +4,18 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from composing.building import open_session
 from composing.checks import check_overrides, check_read
 from composing.command_line import (
     agent_path,
@@ -39,80 +41,110 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint
-from dreamer_racing.training.run import train
 from dreamer_racing.training.schedule import Ramp, RampClock
+from dreamer_racing.training.session import Session
 
 TRAINED_ON = ("track", "task", "decoys", "env.control_rate", "env.camera_tilt")
 """What a run that is resumed cannot change."""
 
 
 def launch(
-    config: DictConfig, resolve: Callable, build: Callable, tune: Callable[[DictConfig], str] | None = None
+    config: DictConfig,
+    resolve: Callable[[DictConfig], DictConfig],
+    train: Callable[[Any, Session], None],
+    tune: Callable[[DictConfig], str] | None = None,
+    *,
+    remedy: str,
 ) -> None:
-    """Compose the configuration of a recipe, build its run, train it to its end.
+    """Compose the configuration of a recipe, and train in a session.
 
     Args:
         config: as hydra composed it.
         resolve: replaces what the configuration leaves open.
-        build: makes the ``Run`` of a configuration and its overrides.
+        train: the recipe's loop, given configuration and session.
         tune: says which file of the group ``tuned`` is meant by ``tuned=auto``; None where there is no such group.
+        remedy: what to lower once a loss is not finite, e.g. "ppo.learning_rate".
     """
     start_logging()
     threading.excepthook = tell_of_thread
     sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
-    with plain_errors():
-        parallel.join()
-        if not parallel.is_first():
-            follow_quietly()
-        overrides = given = list(HydraConfig.get().overrides.task)
-        noted = None
-        if config.resume:
-            config, overrides = resumed_config(config.algorithm, config.resume, overrides)
-            noted = config.track_description
-        if tune and config.tuned == "auto":
-            overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
-            config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
-            config.track_description = noted
-        check_overrides(config, overrides)
-        if config.algorithm == "dreamer_v3":
-            check_read(config, given)
-        if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up there
-            print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
-            parallel.leave()
-            return
-        config = resolve(config)
-        if config.resume and (changed := changed_settings(config)):
-            print(f"resumed with other settings: {', '.join(changed)}")
-        run = build(OmegaConf.to_object(config), overrides)
-    if run.learner.device.type == "cpu" and not keep_freed_memory():
-        print("memory: freed blocks go back to the system, for this C library cannot keep them; updates are slower")
     try:
-        train(run)
-        print(what_next(run.config, run.directory))
+        with plain_errors():
+            parallel.join()
+            if not parallel.is_first():
+                follow_quietly()
+            config, overrides = compose_run(config, tune)
+            if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up
+                print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
+                return
+            config = resolve(config)
+            if config.resume and (changed := changed_settings(config)):
+                print(f"resumed with other settings: {', '.join(changed)}")
+            run = cast(RunConfig, OmegaConf.to_object(config))
+        with training_session(run, overrides, remedy) as session:
+            train(run, session)
+            print(what_next(run, session.directory))
+    finally:
+        parallel.leave()
+
+
+def compose_run(config: DictConfig, tune: Callable[[DictConfig], str] | None) -> tuple[DictConfig, list[str]]:
+    """Return the configuration of a run that is begun or continued, and the overrides that it is composed from."""
+    overrides = given = list(HydraConfig.get().overrides.task)
+    noted = None
+    if config.resume:
+        config, overrides = resumed_config(config.algorithm, config.resume, overrides)
+        noted = config.track_description
+    if tune and config.tuned == "auto":
+        overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
+        config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
+        config.track_description = noted
+    check_overrides(config, overrides)
+    if config.algorithm == "dreamer_v3":
+        check_read(config, given)
+    return config, overrides
+
+
+@contextmanager
+def training_session(config: RunConfig, overrides: list[str], remedy: str) -> Iterator[Session]:
+    """Open a session for a recipe's loop; say in plain words what keeps it from beginning, and what ends it early.
+
+    Args:
+        config: resolved.
+        overrides: from which it was composed.
+        remedy: as of `launch`.
+    """
+    with plain_errors():
+        session = open_session(config, overrides)
+    try:
+        with plain_errors(lambda: not session.began):
+            if config.device == "cpu" and not keep_freed_memory():
+                print(
+                    "memory: freed blocks go back to the system, for this C library cannot keep them; updates slow down"
+                )
+            yield session
     except KeyboardInterrupt as interrupt:
-        print(f"abandoned: {run.last_good}", file=sys.stderr)
+        if not session.began:
+            raise
+        print(f"abandoned: {session.last_good}", file=sys.stderr)
         raise SystemExit(128 + next(iter(interrupt.args), signal.SIGINT)) from interrupt
-    except RunCheckpointError as error:
-        raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
+    except (RunCheckpointError, WorkerError) as error:
+        raise SystemExit(f"error: {error} {session.last_good[0].upper()}{session.last_good[1:]}.") from error
     except NonFiniteLossError as error:
-        kept = run.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
+        kept = session.directory.nonfinite_batch.with_suffix(f".{parallel.rank()}.pt" if parallel.rank() else ".pt")
         raise SystemExit(
-            f"error: {error} Update {run.counters['updates']:,}, {run.counters['env_steps']:,} env_steps. "
-            f"{keep_batch(error, kept)}; {run.last_good}. Continue from there with a lower "
-            f"{run.remedy}."
+            f"error: {error} Update {session.counters['updates']:,}, {session.env_steps:,} env_steps. "
+            f"{keep_batch(error, kept)}; {session.last_good}. Continue from there with a lower {remedy}."
         ) from error
-    except WorkerError as error:
-        raise SystemExit(f"error: {error} {run.last_good[0].upper()}{run.last_good[1:]}.") from error
     except OSError as error:  # on the way a write may fail; what is left is a disk that is full at the end
-        raise SystemExit(f"error: {error}. The run is not finished: {run.last_good}.") from error
+        raise SystemExit(f"error: {error}. The run is not finished: {session.last_good}.") from error
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
-        raise SystemExit(f"error: {out_of_memory_advice(error)} {run.last_good}.") from error
+        raise SystemExit(f"error: {out_of_memory_advice(error)} {session.last_good}.") from error
     finally:
-        run.close()
-        parallel.leave()
+        session.close()
 
 
 def tell_of_thread(failure: threading.ExceptHookArgs) -> None:

@@ -21,32 +21,25 @@ from dreamer_racing.losses import WorldModelLoss, find_loss
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.pass_share import PassShare
-from dreamer_racing.training.schedule import RampClock
+from dreamer_racing.training.schedule import Schedule
 
 IN_CHECKPOINTS = ("min_std", "max_std")
 """Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
 
 
-def clock_times(config: DreamerConfig, env_steps: int, passes: PassShare) -> dict[RampClock, float]:
-    """What the clocks of schedules say after so many env_steps of a run."""
-    return {
-        RampClock.run: env_steps / config.total_env_steps,
-        RampClock.passes: passes.best,
-        RampClock.known: passes.known(env_steps, config.total_env_steps),
-    }
-
-
-def scheduled_numbers(config: DreamerConfig, times: dict[RampClock, float]) -> dict[str, float]:
-    """Arguments of `DreamerLearner.adjust` at what the clocks say."""
+def make_schedule(config: DreamerConfig, num_gates: int = 0) -> Schedule:
+    """Make the schedule of what `DreamerLearner.adjust` takes, by its names, and of `start_on_line`."""
     schedule, loss = config.schedule, config.loss
-    ramps = {name: getattr(schedule, name) for name in LOSS_RAMPS}
-    moved = [name for name, ramp in ramps.items() if ramp.to is not None or name in IN_CHECKPOINTS]
-    of_losses = {name: ramps[name].at(getattr(loss, name), times) for name in moved}
-    rates = {"rates": schedule.learning_rates, "world_model_rate": schedule.world_model_rate}
+    ramps = {"rates": (1.0, schedule.learning_rates), "world_model_rate": (1.0, schedule.world_model_rate)}
+    for name in LOSS_RAMPS:
+        ramp = getattr(schedule, name)
+        if ramp.to is not None or name in IN_CHECKPOINTS:
+            ramps[name] = (getattr(loss, name), ramp)
     if (kl_target := loss.ppo.kl_target) is not None and steps_alone(loss.actor):
-        of_losses["kl_target"] = schedule.kl_target.at(kl_target, times)
-    return {**{name: ramp.at(1.0, times) for name, ramp in rates.items()}, **of_losses}
+        ramps["kl_target"] = (kl_target, schedule.kl_target)
+    if schedule.start_on_line.to is not None:
+        ramps["start_on_line"] = (config.env.start_on_line, schedule.start_on_line)
+    return Schedule(ramps, config.total_env_steps, num_gates)
 
 
 def size_of(config: DreamerConfig) -> ModelSize:
@@ -93,8 +86,11 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
     return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic begin anew"
 
 
-def make_learner(config: RunConfig, interface: Interface, device: torch.device | str) -> Learner:
-    """Make the learner of a recipe's configuration."""
+def make_learner(
+    config: RunConfig, interface: Interface, device: torch.device | str, seed: int | None = None
+) -> Learner:
+    """Make the learner of a recipe's configuration, with initial weights by its seed or another one."""
+    seed = config.seed if seed is None else seed
     if isinstance(config, DreamerConfig):
         model = config.model
         return make_dreamer(
@@ -104,12 +100,12 @@ def make_learner(config: RunConfig, interface: Interface, device: torch.device |
             model,
             horizon=model.imagination_horizon,
             device=device,
-            seed=config.seed,
+            seed=seed,
         )
     if isinstance(config, PPORunConfig):
-        return PPOLearner(network_size(config.network), interface, config.ppo, device, config.seed)
+        return PPOLearner(network_size(config.network), interface, config.ppo, device, seed)
     if isinstance(config, SACRunConfig):
-        return SACLearner(network_size(config.network), interface, config.sac, device, config.seed)
+        return SACLearner(network_size(config.network), interface, config.sac, device, seed)
     raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
 
 

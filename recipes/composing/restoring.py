@@ -11,7 +11,7 @@ import torch
 from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
 from composing.command_line import agent_path, agents_that_ship
 from composing.devices import choose_device
-from composing.learners import IN_CHECKPOINTS, clock_times, make_learner, scheduled_numbers
+from composing.learners import IN_CHECKPOINTS, make_learner, make_schedule
 from composing.saved import trained_config
 from composing.schema import (
     DreamerConfig,
@@ -38,7 +38,6 @@ from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
-from dreamer_racing.training.pass_share import PassShare
 
 BEGUN = ".begun"
 """File by which a process claims a folder for what it is about to measure."""
@@ -221,14 +220,16 @@ def restore_learner(
     env.close()
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
-    passes = PassShare(0)  # takes the gates of what is restored
-    parts = {"learner": learner, "counters": counters, "passes": passes}
-    load_components(checkpoint, parts, map_location=device, may_lack=("passes",))
-    if isinstance(learner, DreamerLearner):
-        config = cast(DreamerConfig, config)
-        numbers = scheduled_numbers(config, clock_times(config, counters["env_steps"], passes))
-        # The networks bring theirs, which do not change if the run is made longer.
-        learner.adjust(**{name: number for name, number in numbers.items() if name not in IN_CHECKPOINTS})
+    parts = {"learner": learner, "counters": counters}
+    if not isinstance(config, DreamerConfig):
+        load_components(checkpoint, parts, map_location=device)
+        return learner, counters
+    schedule = make_schedule(config)  # takes the gates of what is restored
+    load_components(checkpoint, {**parts, "schedule": schedule}, map_location=device)
+    # The networks bring theirs, which do not change if the run is made longer.
+    left_out = (*IN_CHECKPOINTS, "start_on_line")
+    numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
+    cast(DreamerLearner, learner).adjust(**numbers)
     return learner, counters
 
 

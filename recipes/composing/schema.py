@@ -217,9 +217,8 @@ class ReplayRunConfig(RunConfig):
     prefill: int = setting(MISSING, NOT_NEGATIVE)  # env_steps collected before the first update
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
-    @property
-    def replay_ratio(self) -> ReplayRatio:
-        """How much the run trains."""
+    def make_replay_ratio(self) -> ReplayRatio:
+        """Make what says how much the run trains."""
         raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
 
 
@@ -246,12 +245,10 @@ class DreamerConfig(ReplayRunConfig):
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
 
-    @property
-    def replay_ratio(self) -> ReplayRatio:
-        """How much the run trains."""
+    def make_replay_ratio(self) -> ReplayRatio:
+        """Make what says how much the run trains."""
         model = self.model
-        records = model.batch_size * model.batch_length
-        return ReplayRatio(model.replay_ratio, records, self.prefill, "model.replay_ratio")
+        return ReplayRatio(model.replay_ratio, model.batch_size * model.batch_length, self.prefill)
 
     @property
     def weight_interval(self) -> int:
@@ -288,10 +285,9 @@ class SACRunConfig(ReplayRunConfig):
     network: NetworkConfig = field(default_factory=NetworkConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 
-    @property
-    def replay_ratio(self) -> ReplayRatio:
-        """How much the run trains."""
-        return ReplayRatio(self.sac.replay_ratio, self.sac.batch_size, self.prefill, "sac.replay_ratio")
+    def make_replay_ratio(self) -> ReplayRatio:
+        """Make what says how much the run trains."""
+        return ReplayRatio(self.sac.replay_ratio, self.sac.batch_size, self.prefill)
 
 
 RECIPES: dict[str, type[RunConfig]] = {

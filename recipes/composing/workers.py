@@ -6,7 +6,6 @@ from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torchrl.collectors import Collector
 from torchrl.envs import TensorDictPrimer, TransformedEnv
 
 from composing.arena import Environment, make_env, worlds_device
@@ -52,8 +51,8 @@ def make_own_env(config: DreamerConfig) -> Environment:
     return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
 
 
-def make_rollouts(config: DreamerConfig, env: Environment, learner: DreamerLearner) -> tuple[Collector, Rollouts]:
-    """Make the collector of a run, and the rollouts that come of it.
+def make_rollouts(config: DreamerConfig, env: Environment, learner: DreamerLearner) -> Rollouts:
+    """Make what is collected.
 
     Raises:
         ValueError: workers cannot be had; the message says what was found.
@@ -62,14 +61,12 @@ def make_rollouts(config: DreamerConfig, env: Environment, learner: DreamerLearn
     if config.collector is CollectorKind.ray:
         return make_workers(config, env, policy)
     if config.collector is CollectorKind.local:
-        collector = make_collector(config, env, policy)
-        return collector, Rollouts(collector)
+        return Rollouts(make_collector(config, env, policy))
     acting = acting_copy(policy)
-    collector = make_collector(config, env, acting)
-    return collector, OverlappedRollouts(collector, acting, policy)
+    return OverlappedRollouts(make_collector(config, env, acting), acting, policy)
 
 
-def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> tuple[Collector, RayRollouts]:
+def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> RayRollouts:
     """Start workers on a Ray cluster, each with its share of the worlds."""
     asked, workers, own = config.workers, cast(int, config.num_workers), share_of_worker(config)
     print(
@@ -91,7 +88,7 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
         frames=own.env.num_envs * config.rollout_steps,
         seed=config.seed,
     )
-    rollouts = RayRollouts(
+    return RayRollouts(
         collector,
         policy,
         env,
@@ -100,7 +97,6 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
         patience=asked.patience,
         leaves=joined,
     )
-    return collector, rollouts
 
 
 def share_of_worker(config: DreamerConfig) -> DreamerConfig:

@@ -14,9 +14,8 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.pass_share import PassShare
 from dreamer_racing.training.schedule import RampClock
-from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, recipe_module
+from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}={path.stem}")
@@ -53,10 +52,9 @@ def test_every_model_config_names_a_known_size() -> None:
 def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> None:
     schema, recipe = recipe_module("composing.schema"), recipe_module(name)
     config = OmegaConf.to_object(recipe.resolve(compose(name, "budget=smoke", "device=cpu", "env.from_pixels=false")))
-    assert type(config) is schema.RECIPES[name] and callable(recipe.build)
+    assert type(config) is schema.RECIPES[name] and callable(recipe.train)
     if isinstance(config, schema.ReplayRunConfig):
-        ratio = config.replay_ratio
-        assert OmegaConf.select(OmegaConf.structured(config), ratio.setting) == ratio.ratio
+        ratio = config.make_replay_ratio()
         assert ratio.updates(config.total_env_steps) > 0
     interface = Interface(pixels=False, vector_dim=21)
     learner = recipe_module("composing.learners").make_learner(config, interface, "cpu")
@@ -106,7 +104,7 @@ def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
     if config.env.suite == "race":
         made = []
         monkeypatch.setattr(arena, "EvaluationReport", lambda *arguments, **options: made.append(arguments[2]))
-        arena.make_report(OmegaConf.to_object(config), Path(), None, 1, 1)
+        arena.make_evaluator(OmegaConf.to_object(config), Path(), None, 1, 1)
         assert made[0]["device"] == expected
 
 
@@ -286,14 +284,10 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     recipe_module("composing.checks").check_dreamer(config)
-    learners, passes = recipe_module("composing.learners"), PassShare(1)
-    assert learners.scheduled_numbers(config, learners.clock_times(config, 100_000, passes))[
-        "min_std"
-    ] == pytest.approx(0.1)
-    passes.best = 0.6
-    assert learners.scheduled_numbers(config, learners.clock_times(config, 0, passes))["min_std"] == pytest.approx(
-        0.075
-    )
+    schedule = recipe_module("composing.learners").make_schedule(config, num_gates=1)
+    assert schedule.at(100_000)["min_std"] == pytest.approx(0.1)
+    schedule.pass_rate.best = 0.6
+    assert schedule.at(0)["min_std"] == pytest.approx(0.075)
 
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
@@ -302,7 +296,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    begin, end = (learners.scheduled_numbers(config, {RampClock.run: share}) for share in (0.0, 1.0))
+    begin, end = map(learners.make_schedule(config).at, (0, config.total_env_steps))
     assert begin == {"rates": 1.0, "world_model_rate": 1.0} | {name: getattr(config.loss, name) for name in names}
     assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5)
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
@@ -317,10 +311,8 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     found = []
     for actor in ("asymmetric_ppo", "reinforce"):
         resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
-        moved = recipe_module("composing.learners").scheduled_numbers(
-            OmegaConf.to_object(resolved), dict.fromkeys(RampClock, 0.0)
-        )
-        found.append(set(moved) - {"rates", "world_model_rate"})
+        moved = recipe_module("composing.learners").make_schedule(OmegaConf.to_object(resolved)).at(0)
+        found.append(set(moved) - {"rates", "world_model_rate", "start_on_line"})
     assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
 
 
@@ -332,12 +324,12 @@ def test_nothing_goes_by_gates_where_there_are_none():
 
 
 def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
-    """Two places compose a learner: a recipe's `build`, for all to read, and `make_learner`, for what restores one."""
+    """What trains and what restores a learner make it alike."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
     overrides += ["loss.actor=asymmetric_ppo", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
     recipe, learners = recipe_module("dreamer_v3"), recipe_module("composing.learners")
     config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides)))
-    run = recipe.build(config, overrides)
+    run = prepared(*overrides)
     made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
     begun = run.learner.state_dict()
     run.close()
@@ -356,7 +348,7 @@ def test_a_checkpoint_flies_as_it_did_after_its_run_was_made_longer(tmp_path: Pa
     overrides += ["schedule.max_std.to=0.2", "schedule.discount.to=0.9", f"run_dir={tmp_path / 'run'}"]
     recipe = recipe_module("dreamer_v3")
     config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides, "total_env_steps=1000")))
-    run = recipe.build(config, overrides)
+    run = prepared(*overrides, "total_env_steps=1000")
     run.counters["env_steps"] = 500
     run.learner.adjust(max_std=0.3)
     checkpoint = run.save()
@@ -371,11 +363,10 @@ def test_a_checkpoint_flies_as_it_did_after_its_run_was_made_longer(tmp_path: Pa
 def test_records_in_files_lie_in_the_run_directory_as_long_as_the_run_goes_on(tmp_path: Path) -> None:
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "env.num_envs=2"]
     overrides += ["replay.storage=memmap", "replay.capacity=1000", f"run_dir={tmp_path / 'run'}"]
-    recipe = recipe_module("dreamer_v3")
-    run = recipe.build(OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides))), overrides)
-    run.take_in(next(run.rollouts))
+    run = prepared(*overrides)
+    run.parts["replay"].extend(next(run.collected))
     files = sorted(path.name for path in (tmp_path / "run" / "replay" / "process-0").rglob("*.memmap"))
-    assert len(run.replay) and {"vector.memmap", "action.memmap", "reward.memmap"} & set(files)
+    assert len(run.parts["replay"]) and {"vector.memmap", "action.memmap", "reward.memmap"} & set(files)
     run.close()
     assert not (tmp_path / "run" / "replay" / "process-0").exists()
 

@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from dreamer_racing.export.shipped_agent import WEIGHTS
 from dreamer_racing.export.weights_file import read_weights
-from tests.running_recipes import ROOT, TINY, build, compose, recipe_module
+from tests.running_recipes import ROOT, TINY, build, prepared, recipe_module
 
 NUMBERS = ["env.from_pixels=false", "prefill=64"]
 AS_SHIPPED = ["tuned=race", "model=cpu_small", "prefill=4000", "total_env_steps=8000", "replay.capacity=20000"]
 
 
-def make(*overrides: str) -> Any:
-    dreamer = recipe_module("dreamer_v3")
-    config = dreamer.resolve(compose("dreamer_v3", *overrides))
-    return dreamer.build(OmegaConf.to_object(config), list(overrides))
-
-
 @pytest.fixture
 def trained(tmp_path: Path) -> Path:
     """A run with weights that no other begins with."""
-    run = make(*TINY, *NUMBERS, f"run_dir={tmp_path / 'first'}", "seed=7", "model.average_rate=0.1")
+    run = prepared(*TINY, *NUMBERS, f"run_dir={tmp_path / 'first'}", "seed=7", "model.average_rate=0.1")
     with torch.no_grad():
         for parameter in (*run.learner.agent.parameters(), *run.learner.averaged.parameters()):
             parameter.add_(0.125)
@@ -37,9 +29,9 @@ def trained(tmp_path: Path) -> Path:
 
 
 def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = make(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8",
+    run = prepared(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "track=figure8",
                "model.average_rate=0.1")  # fmt: skip
-    first = make(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "seed=7", "model.average_rate=0.1")
+    first = prepared(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "seed=7", "model.average_rate=0.1")
     assert "the averaged ones of" in capsys.readouterr().out
     for own, there in ((run.learner.agent, first.learner.agent), (run.learner.averaged, first.learner.averaged)):
         theirs = there.state_dict()
@@ -53,18 +45,22 @@ def test_all_weights_of_a_run_and_nothing_else(trained: Path, capsys: pytest.Cap
 def test_a_run_with_a_damaged_configuration_is_refused_by_name(trained: Path) -> None:
     (trained / "config.yaml").write_text("env: {")
     with pytest.raises(ValueError, match=r"first/config\.yaml is damaged"):
-        make(*TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model.average_rate=0.1")
+        prepared(
+            *TINY, *NUMBERS, f"run_dir={trained.parent / 'next'}", f"init_from={trained}", "model.average_rate=0.1"
+        )
 
 
 def test_a_resumed_run_goes_on_with_its_own_weights(trained: Path) -> None:
-    again = make(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "model.average_rate=0.1",
+    again = prepared(f"resume={trained}", *TINY, *NUMBERS, f"run_dir={trained}", "model.average_rate=0.1",
                  "init_from=nowhere")  # fmt: skip
     assert again.learner.updates == 11
     again.close()
 
 
 def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = make(*AS_SHIPPED, f"run_dir={tmp_path / 'run'}", "init_from=kidney", "track=circle", "env.preset=faithful")
+    run = prepared(
+        *AS_SHIPPED, f"run_dir={tmp_path / 'run'}", "init_from=kidney", "track=circle", "env.preset=faithful"
+    )
     weights = read_weights(ROOT / "agents" / "kidney" / WEIGHTS)
     for agent in (run.learner.agent, run.learner.averaged):
         encoder = agent.get_submodule("world_model.encoder").state_dict()
@@ -89,7 +85,7 @@ def test_what_does_not_fit_is_refused(
     overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit), recipe_module("composing.command_line").plain_errors():
-        make(*overrides, f"run_dir={tmp_path / 'run'}")
+        prepared(*overrides, f"run_dir={tmp_path / 'run'}")
     said = capsys.readouterr().err
     assert all(word in said for word in words), said
 

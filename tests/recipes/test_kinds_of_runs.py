@@ -18,8 +18,18 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
-from dreamer_racing.training.run import train
-from tests.running_recipes import AT_THE_END, SMALL, TINY, build, compose, recipe, recipe_module, rows, started
+from tests.running_recipes import (
+    AT_THE_END,
+    SMALL,
+    TINY,
+    build,
+    compose,
+    open_session,
+    recipe,
+    recipe_module,
+    rows,
+    started,
+)
 
 SLOW_DISK = """
 import pathlib, time
@@ -92,15 +102,14 @@ def test_a_run_that_cannot_be_saved_at_its_end_says_so(tmp_path: Path) -> None:
 
 FULL_FROM_412 = """
 import resource, signal
-from dreamer_racing.training import run
+from dreamer_racing.training.session import Session
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-take_in = run.Run.take_in
+log = Session.log_episodes
 def filling(self, rollout):
-    steps = self.counters["env_steps"] + rollout.numel()
-    full = 412 <= steps < {until}
+    full = 412 <= self.env_steps < {until}
     resource.setrlimit(resource.RLIMIT_FSIZE, (100 if full else resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    return take_in(self, rollout)
-run.Run.take_in = filling
+    return log(self, rollout)
+Session.log_episodes = filling
 """
 """No file can grow beyond 100 bytes from 412 env_steps on, until there is room again."""
 WITH_FILMS = [*SMALL, "prefill=200", "model.replay_ratio=1", "evaluation.video_steps=20", "logger=tensorboard"]
@@ -127,27 +136,6 @@ def test_a_run_outlives_a_disk_that_takes_nothing_at_all(until: int, tmp_path: P
     assert {step // 100 for step in steps} >= {4, 5, 6, 7, 8} and steps == sorted(set(steps)), "no row is missing"
     assert [row["env_steps"] for row in table if row["evaluation/return_mean"]] == ["224", "416", "608", "800"]
     assert env_steps_of(newest_sound(run_dir)) == 800 and (run_dir / "finished.json").exists()
-
-
-WITHOUT_A_JOURNAL = """
-from dreamer_racing.training.checkpoint import RunCheckpoints
-make = RunCheckpoints.__init__
-def older(self, run_dir, components, *rest, **named):
-    make(self, run_dir, {name: part for name, part in components.items() if name != "journal"}, *rest, **named)
-RunCheckpoints.__init__ = older
-"""
-
-
-def test_a_checkpoint_of_before_there_were_journals_is_resumed_and_says_so(tmp_path: Path) -> None:
-    options = ["env.from_pixels=false", "logger.every=64"]
-    done = recipe("dreamer_v3", *TINY, *options, "run_dir=run", cwd=tmp_path, before=WITHOUT_A_JOURNAL)
-    assert done.returncode == 0, done.stderr
-    before = [row["env_steps"] for row in rows(tmp_path / "run")]
-    done = recipe("dreamer_v3", "resume=run", "total_env_steps=280", cwd=tmp_path)
-    assert done.returncode == 0 and done.stdout.count("of an older version, without averages") == 1, done.stderr
-    assert [row["env_steps"] for row in rows(tmp_path / "run")] == [*before, "256", "288"]
-    done = recipe("dreamer_v3", "resume=run", "total_env_steps=300", cwd=tmp_path)
-    assert done.returncode == 0 and "older version" not in done.stdout, done.stderr
 
 
 def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
@@ -216,12 +204,13 @@ def test_what_is_learned_ahead_of_a_checkpoint_is_in_it(tmp_path: Path) -> None:
     dreamer = recipe_module("dreamer_v3")
     overrides = [*TINY, "env.from_pixels=false", "collector=overlapped", "total_env_steps=192", "checkpoint.every=96",
                  f"run_dir={tmp_path}"]  # fmt: skip
-    run = dreamer.build(OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *overrides))), overrides)
-    train(run)
-    run.close()
+    config, session = open_session(*overrides)
+    dreamer.train(config, session)
+    session.close()
     counters: dict[str, int] = {}
     load_components(tmp_path, {"counters": counters})
-    assert counters == run.counters and run.updates_due == 0
+    assert counters == session.counters
+    assert session.parts["ratio"].updates_due(session.env_steps, session.parts["learner"].updates) == 0
     assert env_steps_of(latest_checkpoint(tmp_path)) == 192 + 32
 
 
@@ -311,7 +300,7 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
     learner = recipe_module("composing.learners").make_learner(config, Interface.of(env), "cpu")
     env.close()
-    report = arena.make_report(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
+    report = arena.make_evaluator(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
     assert report._course.base.worlds.parameters.control_dt == 0.04
     assert report._course.base.worlds.race._sweep._miss_radius == 0
     assert report._course.base.worlds.num_envs == 3, "all begin at once, so that every agent meets the same starts"

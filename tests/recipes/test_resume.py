@@ -130,7 +130,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: P
     assert learner_updates(whole) - learner_updates(before) >= 100
     names = {name.split("/")[1].partition("-")[2] for name in whole}
     assert names == {
-        "learner", "replay", "owed", "counters", "env", "tracker", "collector", "curriculum", "lag", "passes",
+        "learner", "replay", "ratio", "counters", "env", "tracker", "collector", "curriculum", "lag", "schedule",
         "journal", "random_state",
     }  # fmt: skip
     assert_same(whole, resumed, "checkpoint")
@@ -152,44 +152,37 @@ def test_a_resumed_run_of_the_control_suite_is_evaluated_as_an_uninterrupted_one
 
 SAVED_BY_THE_CLOCK = """
 import itertools, os, signal
-from dreamer_racing.training import run
-rollouts = itertools.count()
+from dreamer_racing.training import session
+rollouts = itertools.count(1)
 def due(self):
     rollout = next(rollouts)
     if rollout == {killed}:
         os.kill(os.getpid(), signal.SIGKILL)
     return rollout == {saved}
-run.Interval.due = due
+session.Interval.due = due
 """
 """Saves behind a rollout as `checkpoint.minutes` does, and is killed behind a later one."""
 TERMINATED = """
 import os, signal
-from dreamer_racing.training import run
-learn = run.{kind}.learn
-def stopped(self, rollout, stop):
-    if rollout is None or self.counters["env_steps"] != {env_steps}:
-        return learn(self, rollout, stop)
-    draw, drawn = self.replay.sample, []
-    def sample():
-        drawn.append(0)
-        if len(drawn) == {updates}:
+from dreamer_racing.training.session import Session
+make = Session.updates
+def updates(self, due):
+    for number in make(self, due):
+        if self.env_steps == {env_steps} and number == {updates} - 1:
             os.kill(os.getpid(), signal.SIGTERM)
-        return draw()
-    self.replay.sample = sample
-    return learn(self, rollout, stop)
-run.{kind}.learn = stopped
+        yield number
+Session.updates = updates
 """
-"""Gets SIGTERM during one of the updates that a rollout owes."""
+"""Gets SIGTERM during one of the updates that are due after a rollout."""
 COLLECTED = """
 import os, signal
-from dreamer_racing.training import run
-take_in = run.Run.take_in
+from dreamer_racing.training.session import Session
+log = Session.log_episodes
 def stopped(self, rollout):
-    episodes = take_in(self, rollout)
-    if self.counters["env_steps"] == {env_steps}:
+    if self.env_steps == {env_steps}:
         os.kill(os.getpid(), signal.SIGTERM)
-    return episodes
-run.Run.take_in = stopped
+    return log(self, rollout)
+Session.log_episodes = stopped
 """
 """Gets SIGTERM once a rollout is collected, before anything is learned from it."""
 STOPS = {
@@ -203,9 +196,9 @@ STOPS = {
             "total_env_steps=900",
             "model.replay_ratio=2",
         ],
-        [TERMINATED.format(kind="ReplayRun", env_steps=800, updates=3)],  # owes updates, a row and a checkpoint
+        [TERMINATED.format(env_steps=800, updates=3)],  # with updates, a row and a checkpoint left to make
     ),
-    "sac": ([*BASELINE, *SMALL["sac"]], [TERMINATED.format(kind="ReplayRun", env_steps=1024, updates=1)]),
+    "sac": ([*BASELINE, *SMALL["sac"]], [TERMINATED.format(env_steps=1024, updates=1)]),
     "ppo": ([*BASELINE, *SMALL["ppo"]], [COLLECTED.format(env_steps=1024), COLLECTED.format(env_steps=1088)]),
 }
 """By recipe: settings, and at what it is terminated after it was killed."""

@@ -1,4 +1,4 @@
-"""An actor that has come to where its model errs waits for it."""
+"""The actor waits where the model lags behind, and only where it steps alone."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from dreamer_racing.training.model_lag import LOOKS
-from dreamer_racing.training.run import graceful_exit
-from tests.running_recipes import TINY, compose, recipe_module
+from tests.running_recipes import TINY, open_session, prepared, recipe_module
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.flown=32",
@@ -22,41 +20,36 @@ SETTINGS = [
 def test_the_actor_waits_while_the_newest_records_are_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dreamer, given = recipe_module("dreamer_v3"), [*SETTINGS, f"run_dir={tmp_path}"]
-    run = dreamer.build(OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *given))), given)
-    looked, error = [], 1e3
-    said: list[str] = []
-    run.say = said.append
+    dreamer = recipe_module("dreamer_v3")
+    config, session = open_session(*SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}")
+    looked, waited = [], []
 
     def measure(learner, windows):
-        newest = torch.stack([run.replay.records(world)["reward"][-8:] for world in range(run.replay.num_streams)])
+        replay = session.parts["replay"]
+        newest = torch.stack([replay.records(world)["reward"][-8:] for world in range(replay.num_streams)])
         assert torch.equal(windows["reward"], newest), "of all worlds, what the newest rollout brought"
         looked.append(learner.updates)
-        return {"privileged_error": torch.tensor(error)}
+        return {"privileged_error": torch.tensor(1e3 if session.env_steps <= 12 * 32 else 0.0)}
+
+    def watched(self, batch, timed, update=dreamer.DreamerLearner.update):
+        before = [parameter.clone() for parameter in self.agent.actor.parameters()]
+        if looked and looked[-1] == self.updates:  # the first update after a look
+            waited.append(self.actor_waits)
+        metrics = update(self, batch, timed)
+        if self.actor_waits:
+            assert all(map(torch.equal, before, self.agent.actor.parameters()))
+        assert self.actor_waits is session.parts["lag"].waits
+        return metrics
 
     monkeypatch.setattr(dreamer, "world_model_metrics", measure)
-    waited = []
-    with graceful_exit() as stop:
-        for number in range(12 + LOOKS):
-            error = 1e3 if number < 12 else 0.0
-            updates, before = run.learner.updates, [p.clone() for p in run.learner.agent.actor.parameters()]
-            run.take_in(next(run.rollouts))
-            run.learn(None, stop)
-            if looked and run.learner.updates > updates:
-                assert looked[-1] == updates, "before it learns from them"
-                waits = all(map(torch.equal, before, run.learner.agent.actor.parameters()))
-                assert waits is run.lag.waits
-                waited.append(waits)
+    monkeypatch.setattr(dreamer.DreamerLearner, "update", watched)
+    dreamer.train(config, session)
+    session.close()
     assert True in waited and waited[-1] is False and waited == sorted(waited, reverse=True)
-    assert len(said) == 2
-    assert said[0].startswith("the actor waits: the model errs ") and said[0].endswith("(schedule.wait_for_model=2)")
-    assert said[1].startswith("the actor goes on: ")
-    run.close()
 
 
 def test_an_actor_that_cannot_wait_is_not_watched(tmp_path: Path) -> None:
-    dreamer, given = recipe_module("dreamer_v3"), [*SETTINGS, "loss.actor=reinforce", f"run_dir={tmp_path}"]
-    given = [setting for setting in given if not setting.startswith(("loss.ppo", "schedule.wait_every"))]
-    run = dreamer.build(OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *given))), given)
-    assert run.config.schedule.wait_for_model == 2 and run.lag.limit is None
-    run.close()
+    given = [setting for setting in SETTINGS if not setting.startswith(("loss.ppo", "schedule.wait_every"))]
+    session = prepared(*given, "loss.actor=reinforce", f"run_dir={tmp_path}")
+    assert session.config.schedule.wait_for_model == 2 and session.parts["lag"].limit is None
+    session.close()

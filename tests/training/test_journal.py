@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import pytest
 
-from dreamer_racing.training.journal import Interval, Journal, Schedule
+from dreamer_racing.training.journal import Interval, Journal, Periods
 from dreamer_racing.training.metrics import PendingMetrics
 
 
 def test_something_is_due_once_a_period() -> None:
-    schedule = Schedule(log=100, never=0)
-    assert [steps for steps in range(0, 450, 30) if schedule.due("log", steps)] == [120, 210, 300, 420]
-    assert not schedule.due("never", 10_000) and not schedule.due("never", 10_000, last=True)
+    periods = Periods(log=100, never=0)
+    assert [steps for steps in range(0, 450, 30) if periods.due("log", steps)] == [120, 210, 300, 420]
+    assert not periods.due("never", 10_000) and not periods.due("never", 10_000, last=True)
 
 
 def test_at_the_end_what_has_been_since_the_latest_is_due() -> None:
-    schedule = Schedule(log=100)
-    assert schedule.due("log", 100, last=True) and not schedule.due("log", 100, last=True)
-    assert not schedule.due("log", 130) and schedule.due("log", 130, last=True)
+    periods = Periods(log=100)
+    assert periods.due("log", 100, last=True) and not periods.due("log", 100, last=True)
+    assert not periods.due("log", 130) and periods.due("log", 130, last=True)
 
 
 def test_what_was_due_when_a_run_was_saved_is_due_when_it_goes_on() -> None:
-    saved = Journal(Schedule(log=100, save=100), PendingMetrics())
-    assert saved.schedule.due("log", 130)
-    journal = Journal(Schedule(log=100, save=100), PendingMetrics())
+    saved = Journal(Periods(log=100, save=100), PendingMetrics())
+    assert saved.periods.due("log", 130)
+    journal = Journal(Periods(log=100, save=100), PendingMetrics())
     journal.load_state_dict(saved.state_dict())
-    assert journal.restored and not journal.schedule.due("log", 130) and journal.schedule.due("save", 130)
-
-
-def test_a_checkpoint_without_a_journal_has_everything_behind_it() -> None:
-    journal = Journal(Schedule(log=100), PendingMetrics())
-    journal.begin_at(130)
-    assert not journal.restored and journal.pending.written == 130
-    assert not journal.schedule.due("log", 190) and journal.schedule.due("log", 200)
+    assert not journal.periods.due("log", 130) and journal.periods.due("save", 130)
 
 
 def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:

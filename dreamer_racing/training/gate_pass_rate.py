@@ -14,11 +14,11 @@ KNOWN = 0.4
 """Share from which on a way through the hardest gate is known [choice]."""
 
 PACE = 3.0
-"""What `PassShare.known` gains over a whole run at least, once that gate is known [choice]: 0.4 in 200,000 of 1,500,000
-env_steps (experiments.md, 24)."""
+"""What `GatePassRate.known` gains over a whole run at least, once that gate is known [choice]: 0.4 in 200,000 of
+1,500,000 env_steps."""
 
 
-class PassShare:
+class GatePassRate:
     """The share of flights that pass the hardest gate of a track, of those that come from the gate before it.
 
     It is the hardest gate that tells when a whole lap is known: a mean over gates is high where most are passed and one
@@ -35,7 +35,7 @@ class PassShare:
 
     Example:
         >>> from tensordict import TensorDict
-        >>> passes = PassShare(num_gates=4)
+        >>> passes = GatePassRate(num_gates=4)
         >>> episodes = TensorDict(
         ...     {"gates_passed": torch.tensor([4]), "target_gate": torch.tensor([0]), "crash": torch.tensor([1])}, [1]
         ... )
@@ -119,5 +119,5 @@ class PassShare:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.best = state_dict["best"]
-        self.known_since = state_dict.get("known_since")  # missing before there was such a clock
+        self.known_since = state_dict["known_since"]
         self._passes, self._attempts = state_dict["passes"].clone(), state_dict["attempts"].clone()

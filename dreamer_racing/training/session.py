@@ -1,0 +1,413 @@
+"""A training session: what stands around the loop of a recipe.
+
+The recipe collects and learns in a loop of its own. The session holds the run directory, restores and saves all parts,
+counts, logs, evaluates, shows progress, and ends the loop at `total_env_steps` or on a signal.
+
+Several processes may train together (`parallel`): they go through the loop in step, each with worlds and replay of its
+own; counters and what is learnt from episodes are of all, and the first alone logs and evaluates.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.record.loggers import Logger
+
+from dreamer_racing import parallel
+from dreamer_racing.experience.collector_state import CollectorState
+from dreamer_racing.experience.rollouts import Rollouts, WorkerError
+from dreamer_racing.machine import KeptMemory
+from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
+from dreamer_racing.training.clock import RunClock
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
+from dreamer_racing.training.journal import Interval, Journal, Periods
+from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.media import log_evaluation
+from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
+from dreamer_racing.training.progress import Progress
+from dreamer_racing.training.signals import GracefulExit
+
+logger = logging.getLogger(__name__)
+
+OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
+"""Parts that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
+OF_WORLDS = ("env", "collector")
+"""Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
+
+
+class Evaluator(Protocol):
+    """Evaluates a learner's policy."""
+
+    on_episode: Callable[[int, int], None] | None
+    """Is told how many episodes have ended, and of how many."""
+    attempt: Callable[[str], AbstractContextManager]
+    """Stands around writes without which an evaluation counts all the same, by what they are of."""
+
+    def make(self, env_steps: int, stochastic: bool = False) -> dict[str, float]:
+        """Evaluate, write what there is to look at, return metrics."""
+        ...
+
+    def close(self) -> None:
+        """Free simulators."""
+        ...
+
+
+class Session:
+    """Everything of a training run but its algorithm.
+
+    Args:
+        config: of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
+            `media`), `evaluation` (`every`, `stochastic`) and `checkpoint` (`every`, `minutes`, `keep`).
+        lock: holds the run directory.
+        note_start: writes what the run is started with to its directory, at so many env_steps.
+        make_loggers: makes what takes metrics beside ``metrics.csv``, for a run that goes on behind its row at so many
+            env_steps, or a new one (None).
+
+    Attributes:
+        counters: `env_steps`, `updates` and `episodes` made so far.
+        clock: of the whole run.
+        began: whether the loop is under way; errors before that are for the person who started the run.
+        parts: what is saved, by name; see `track`.
+
+    Example:
+        >>> # session.track(learner=learner, env=env, rollouts=rollouts, evaluator=evaluator, tracker=tracker)
+        >>> # for rollout in session.rollouts():
+        >>> #     if rollout is not None:
+        >>> #         session.log_episodes(rollout)
+        >>> #         session.log(learner.update(rollout))
+        >>> #     if session.due("evaluate"):
+        >>> #         session.evaluate()
+        >>> #     if session.due("log"):
+        >>> #         session.write_row()
+        >>> #     session.save_if_due()
+    """
+
+    learner: Any
+    env: EnvBase
+    collected: Rollouts
+    evaluator: Evaluator
+    tracker: EpisodeTracker
+    metrics: MetricsLog | UnwrittenMetrics
+    checkpoints: RunCheckpoints
+    best: BestCheckpoint
+
+    def __init__(
+        self,
+        config: Any,
+        lock: RunLock | LockHeldByFirst,
+        note_start: Callable[[int], None],
+        make_loggers: Callable[[int | None], Sequence[Logger]] = lambda resumed: (),
+    ) -> None:
+        self.config = config
+        self.directory = RunDirectory(lock.directory)
+        self.counters = {"env_steps": 0, "updates": 0, "episodes": 0}
+        self.clock = RunClock(self.counters, alone=parallel.count() == 1)
+        self.began = False
+        self.parts: dict[str, Any] = {}
+        self.say: Callable[[str], None] = logger.info
+        self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
+        self._periods = Periods(log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every)
+        self._minutes = Interval(config.checkpoint.minutes)
+        self._memory = KeptMemory()
+        self._unsaved: dict[str, int] = {}  # since which env_steps what cannot be written
+        self._stack = ExitStack()  # signals and progress
+        self._stop = GracefulExit()
+        self._progress = Progress(0, shown=False)
+        self._due: dict[str, bool] = {}  # what was asked for after this rollout
+        self._saves = False  # after this rollout
+        self._another_follows = False  # a rollout that was under way comes before anything is evaluated or saved
+
+    @property
+    def env_steps(self) -> int:
+        """Control steps made so far, summed over environments."""
+        return self.counters["env_steps"]
+
+    @property
+    def at_end(self) -> bool:
+        """Whether all env_steps are made."""
+        return self.env_steps >= self.config.total_env_steps
+
+    @property
+    def stopping(self) -> bool:
+        """Whether a signal has come; where several processes train, all must ask equally often."""
+        return self._stop.requested
+
+    @property
+    def timed(self) -> Callable[[str], AbstractContextManager]:
+        """Context manager by the name of an activity, which counts the time spent inside."""
+        return self.clock.timed
+
+    def track(
+        self,
+        *,
+        learner: Any,
+        env: EnvBase,
+        rollouts: Rollouts,
+        evaluator: Evaluator,
+        tracker: EpisodeTracker,
+        best: Sequence[str] = (),
+        may_lack: Sequence[str] = (),
+        **parts: Any,
+    ) -> None:
+        """Take the parts of the run, all of which checkpoints hold; restore them if the run is resumed.
+
+        Args:
+            learner: as `Learner`.
+            env: to train in; where workers fly, it is closed with the session and not saved.
+            rollouts: what is collected.
+            evaluator: of the learner's policy.
+            tracker: finds the finished episodes in rollouts.
+            best: parts that are kept with the learner at the best evaluation.
+            may_lack: parts that checkpoints may lack.
+            parts: others by name, as `RunCheckpoints` takes them.
+        """
+        self.learner, self.env, self.collected = learner, env, rollouts
+        self.evaluator, self.tracker = evaluator, tracker
+        worlds = {"env": env, "collector": CollectorState(rollouts.collector)} if rollouts.has_worlds else {}
+        journal = Journal(self._periods, PendingMetrics())
+        self.parts = {"learner": learner, "counters": self.counters, **worlds, "tracker": tracker, **parts}
+        self.parts["journal"] = journal
+        path, resume = self.directory.path, self.config.resume
+        self.checkpoints = RunCheckpoints(path, self.parts, self.config.checkpoint.keep, OF_EACH_PROCESS)
+        if resume:
+            self.clock.total = self.checkpoints.load(resume, may_lack=(*may_lack, *OF_WORLDS))
+            updates = self.counters["updates"]
+            logger.info("resumed %s at %s env_steps, %s updates", resume, f"{self.env_steps:,}", f"{updates:,}")
+            rollouts.begin_at(self.env_steps)
+        kept = ("learner", "counters", *best)
+        self.best = BestCheckpoint(path, {name: self.parts[name] for name in kept}, self.env_steps)
+        parallel.together(lambda: None)  # all have read what is written anew now
+        self.metrics = UnwrittenMetrics()
+        if parallel.is_first():
+            self.directory.set_aside_after(self.env_steps)
+            self._note_start(self.env_steps)
+            resumed = journal.pending.written if resume else None
+            self.metrics = MetricsLog(path, self._make_loggers(resumed), resumed, journal.pending)
+        logger.info("run directory: %s", path)
+
+    def rollouts(self) -> Iterator[TensorDictBase | None]:
+        """Yield rollouts ``[N, T]`` until all env_steps are made or a signal came; then save everything.
+
+        A resumed run gets None at first: what it had left to do, updates, an evaluation or a row of metrics, comes
+        before anything is collected. A rollout that is under way where the run ends or is saved is delivered first.
+
+        Raises:
+            SystemExit: a signal came; everything is saved, and the status is the shell's for that signal.
+            KeyboardInterrupt: another came meanwhile, which is its argument; what is since the last checkpoint is lost.
+            WorkerError: what is collected elsewhere cannot be had; all that was delivered is saved.
+            RunCheckpointError: at its end the run could not be saved.
+            OSError: at its end metrics could not be written.
+        """
+        self._begin()
+        if self.env_steps:
+            self._count(None)
+            yield None
+        try:
+            while not (self.at_end or self.stopping):
+                with self.clock.timed("collect"):
+                    rollout = next(self.collected, None)
+                if rollout is None:  # only a stop ends them, if the next would not be there soon
+                    break
+                yield from self._deliver(rollout)
+        except WorkerError:
+            self.save()
+            raise
+        if (rollout := self.collected.drain()) is not None:
+            self._count(rollout)
+            yield rollout
+        self._end()
+
+    def _deliver(self, rollout: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yield a rollout, and after it the one under way where the run is to be saved, evaluated last or ended."""
+        self._count(rollout)
+        under_way = self.collected.drain() if self._saves or self.at_end else None
+        self._another_follows = under_way is not None
+        yield rollout
+        if under_way is not None:
+            self._count(under_way, saves=self._saves)
+            yield under_way
+
+    def _count(self, rollout: TensorDictBase | None, saves: bool = False) -> None:
+        """Account for a rollout that is about to be delivered, and see what is due after it."""
+        if rollout is not None:
+            self.counters["env_steps"] += rollout.numel() * parallel.count()
+            self._progress.advance(self.env_steps)
+        by_steps = self._periods.due("save", self.env_steps)
+        by_minutes = parallel.agreed(self._minutes.due())  # both take note
+        self._saves = saves or by_steps or by_minutes
+        self._due = {}
+        self._another_follows = False
+
+    def log_episodes(self, rollout: TensorDictBase) -> TensorDictBase:
+        """Log the episodes that ended in a rollout, of all processes.
+
+        Returns:
+            Those episodes, batch ``[E]`` of `EpisodeTracker.update`.
+        """
+        episodes = parallel.gathered_rows(self.tracker.update(rollout))
+        self.counters["episodes"] += len(episodes)
+        self.metrics.push(self.tracker.summary(episodes), len(episodes))
+        self.metrics.push(self.collected.metrics())
+        return episodes
+
+    def log(self, metrics: Mapping[str, Tensor | float]) -> None:
+        """Add metrics to the averages of the next row."""
+        self.metrics.push(metrics)
+
+    def updates(self, due: int) -> Iterator[int]:
+        """Yield the numbers of so many updates, and count them; after a signal a resumed run makes the rest."""
+        for number in range(due):
+            if self.stopping:
+                return
+            yield number
+            self.counters["updates"] += 1
+
+    def due(self, name: str) -> bool:
+        """Return whether it is time to ``evaluate`` or to ``log``, in the process that does it.
+
+        After an evaluation, metrics are logged too, so that its numbers stand where they were measured. Nothing is due
+        where a signal came: a resumed run has updates to make first.
+        """
+        if not self._due:
+            ready = not self.stopping and not self._another_follows
+            self._due = {
+                each: ready and self._periods.due(each, self.env_steps, self.at_end) for each in ("log", "evaluate")
+            }
+            if self._due["log"]:
+                self._memory.trim()
+        return parallel.is_first() and (self._due[name] or (name == "log" and self._due["evaluate"]))
+
+    def evaluate(self) -> None:
+        """Evaluate, without a trace in the random numbers of training, and keep the best."""
+        self.learner.check_finite()
+        self.collected.wait()
+        devices = [self.learner.device] if self.learner.device.type == "cuda" else []
+        with self.clock.timed("evaluate"), torch.random.fork_rng(devices=devices):
+            torch.manual_seed(self.config.seed)
+            metrics = self.evaluator.make(self.env_steps, self.config.evaluation.stochastic)
+            if self.config.logger.media:
+                with self.attempt("pictures for loggers"):
+                    log_evaluation(self.metrics.loggers, self.directory, self.env_steps)
+        self.log(metrics)
+        # Gates first, return where the gates are the same: a return lies far below a million.
+        score = 1e6 * metrics.get("evaluation/gates_per_episode", 0.0) + metrics["evaluation/return_mean"]
+        best = ""
+        with self.attempt("the best checkpoint"):
+            best = " (the best so far)" if self.best.offer(score, self.env_steps) else ""
+        names = {"gates": "gates_per_episode", "success": "success_rate", "return": "return_mean"}
+        shown = {label: metrics.get(f"evaluation/{name}") for label, name in names.items()}
+        numbers = ", ".join(f"{label} {value:.2f}" for label, value in shown.items() if value is not None)
+        self.say(f"evaluation at {self.env_steps:,} env_steps: {numbers}{best}")
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Stand around measurements that set the random numbers of this process back: nothing else draws meanwhile."""
+        self.collected.wait()
+        with self.clock.timed("measure"):
+            yield
+
+    def write_row(self, metrics: Mapping[str, Tensor | float] | None = None) -> None:
+        """Write the averages of what was logged since the latest row, and these metrics, and show them."""
+        self.log(self.clock.read())
+        self.log(metrics or {})
+        values = self.metrics.close_row(self.env_steps)
+        with self.attempt("metrics"):
+            self.metrics.flush()
+        self._progress.show(values, self._unsaved)
+
+    def save_if_due(self) -> None:
+        """Save everything if it is time to, by env_steps or by the clock."""
+        if self._saves and not self._another_follows and not self.stopping:
+            with self.attempt("checkpoint"):
+                self.save()
+
+    def save(self) -> Path:
+        """Save everything, unless the networks have just been spoilt, or differ between processes."""
+        with self.clock.timed("save"):
+            self.learner.check_finite()  # first: weights that are no numbers are never the same
+            parallel.check_same(getattr(self.learner, "weights", []))
+            return self.checkpoints.save(self.env_steps, self.clock.total)
+
+    @contextmanager
+    def attempt(self, what: str) -> Iterator[None]:
+        """Stand around a write that may fail, as on a full disk, without ending the run: it is said, at once and on.
+
+        Args:
+            what: is written.
+        """
+        try:
+            yield
+        except (OSError, RunCheckpointError) as error:
+            self._unsaved.setdefault(what, self.env_steps)
+            said = str(error).rstrip(".")
+            self.say(f"NOT SAVED: {what}: {said}. The run goes on, and tries again when the next is due.")
+        else:
+            self._unsaved.pop(what, None)
+
+    @property
+    def last_good(self) -> str:
+        """Which checkpoint is left when training breaks off."""
+        try:
+            return f"the last good checkpoint is {latest_checkpoint(self.directory.path)}"
+        except FileNotFoundError:
+            return "there is no checkpoint yet"
+
+    def close(self) -> None:
+        """End collection; free simulators and files, those of a replay in the run directory too."""
+        self._stack.close()
+        if self.parts:
+            self.collected.close()
+            if not self.collected.has_worlds:
+                self.env.close()  # which else belongs to the collector
+            self.collected.collector.shutdown()
+            shutil.rmtree(self.directory.replay, ignore_errors=True)
+            self.evaluator.close()
+            self.metrics.close()
+            self._lock.release()
+        else:
+            self._lock.abandon()
+
+    def _begin(self) -> None:
+        """Take signals and show progress from here on."""
+        self.began = True
+        self._stop = self._stack.enter_context(graceful_exit())
+        total, shown = self.config.total_env_steps, parallel.is_first()
+        self._progress = self._stack.enter_context(Progress(total, self.env_steps, shown=shown))
+        self._stop.say = self._progress.answer
+        self.say, self.evaluator.on_episode = self._progress.say, self._progress.evaluating
+        self.evaluator.attempt = self.attempt
+        self.collected.stopping = lambda: self._stop.signal_name is not None
+        if shown and self.directory.finished_env_steps() > self.env_steps:
+            self.directory.finished.unlink()  # it goes on from before its end, which is to be reached again
+
+    def _end(self) -> None:
+        """Save, and say how the run ended."""
+        saved = self.save()
+        if self.stopping:
+            at = f"at {self.env_steps:,} of {self.config.total_env_steps:,} env_steps"
+            self.say(f"{self._stop.signal_name} {at}: saved; continue with resume={self.directory.path}")
+        elif parallel.is_first():
+            self.metrics.flush()
+            self.directory.mark_finished(self.env_steps)
+        self.say(f"checkpoint: {saved}")
+        self._stack.close()
+        if self._stop.signal_name:
+            raise SystemExit(128 + signal.Signals[self._stop.signal_name])
+
+
+def graceful_exit() -> GracefulExit:
+    """Make the flag that a signal raises, in all processes together; one of them answers."""
+    answer = "saving; again: abandons what is since the last checkpoint" if parallel.is_first() else ""
+    return GracefulExit(answer, parallel.largest if parallel.count() > 1 else None)

@@ -1,0 +1,161 @@
+"""A session around a loop: what is collected ahead, evaluated, and saved, and in which order; signals; resumption."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from dreamer_racing.experience.rollouts import Rollouts, WorkerError
+from dreamer_racing.training.directory import RunDirectory, env_steps_of
+from dreamer_racing.training.episodes import EpisodeTracker
+from dreamer_racing.training.session import Session
+
+
+class OneAhead(Rollouts):
+    """Collects one rollout ahead, as `collector=overlapped` does, of worlds that are not saved."""
+
+    has_worlds = False
+
+    def __init__(self, steps: int, fails_after: int | None = None) -> None:
+        self.collector = SimpleNamespace(shutdown=lambda: None)
+        self._steps, self._under_way, self._left = steps, False, fails_after
+
+    def __next__(self) -> TensorDictBase:
+        if self._left is not None:
+            self._left -= 1
+            if self._left < 0:
+                raise WorkerError("lost")
+        self._under_way = True
+        reward, done = torch.zeros(1, self._steps, 1), torch.zeros(1, self._steps, 1, dtype=torch.bool)
+        return TensorDict({"next": {"reward": reward, "done": done}}, [1, self._steps])
+
+    def drain(self) -> TensorDictBase | None:
+        if not self._under_way:
+            return None
+        rollout, self._under_way = next(self), False
+        return rollout
+
+
+class Learner:
+    """Counts updates."""
+
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        self.updates = 0
+
+    def check_finite(self) -> None:
+        pass
+
+    def state_dict(self) -> dict[str, int]:
+        return {"updates": self.updates}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.updates = state["updates"]
+
+
+class Run:
+    """A loop as a recipe has it, with an update for each env_step.
+
+    Attributes:
+        events: what was evaluated after how many updates, and saved after how many env_steps.
+    """
+
+    def __init__(self, path: Path, total: int, rollout: int, save_every: int = 0, resume: bool = False, **ahead: Any):
+        self.config = SimpleNamespace(
+            total_env_steps=total,
+            seed=0,
+            resume=str(path) if resume else None,
+            logger=SimpleNamespace(every=0, media=False),
+            evaluation=SimpleNamespace(every=10 * total, stochastic=False),
+            checkpoint=SimpleNamespace(every=save_every, minutes=0.0, keep=99),
+        )
+        self.events: list[tuple[str, int]] = []
+        self.learner, self.on_update = Learner(), lambda updates: None
+        self.on_update: Callable[[int], None]
+        self.session = session = Session(self.config, RunDirectory(path).claim(), lambda env_steps: None)
+        report = SimpleNamespace(make=self._evaluate, close=lambda: None)
+        env = SimpleNamespace(close=lambda: None)
+        rollouts, tracker = OneAhead(rollout, **ahead), EpisodeTracker(1)
+        session.track(learner=self.learner, env=env, rollouts=rollouts, evaluator=report, tracker=tracker)
+        save = session.checkpoints.save
+
+        def saved(env_steps: int, *rest: Any) -> Path:
+            self.events.append(("saved", env_steps))
+            assert self.learner.updates == env_steps or session.stopping, "nothing is left to learn"
+            return save(env_steps, *rest)
+
+        session.checkpoints.save = saved
+
+    def _evaluate(self, env_steps: int, stochastic: bool) -> dict[str, float]:
+        self.events.append(("evaluated", self.learner.updates))
+        return {"evaluation/return_mean": 0.0}
+
+    def go(self) -> list[tuple[str, int]]:
+        session = self.session
+        try:
+            for rollout in session.rollouts():
+                if rollout is not None:
+                    session.log_episodes(rollout)
+                for _ in session.updates(session.env_steps - self.learner.updates):
+                    self.learner.updates += 1
+                    self.on_update(self.learner.updates)
+                if session.due("evaluate"):
+                    session.evaluate()
+                if session.due("log"):
+                    session.write_row()
+                session.save_if_due()
+        finally:
+            session.close()
+        return self.events
+
+
+@pytest.mark.parametrize("total", [40, 41, 48, 55])
+@pytest.mark.parametrize("rollout", [1, 7, 33])
+def test_a_run_ends_with_an_evaluation_of_all_that_it_made(total: int, rollout: int, tmp_path: Path) -> None:
+    run = Run(tmp_path, total, rollout, save_every=10)
+    events = run.go()
+    assert run.session.at_end and run.learner.updates == run.session.env_steps == run.session.counters["updates"]
+    assert [updates for event, updates in events if event == "evaluated"] == [run.learner.updates]
+    assert events.index(("evaluated", run.learner.updates)) >= len(events) - 3  # and the best, and a save, after it
+    assert RunDirectory(tmp_path).finished_env_steps() == run.session.env_steps
+
+
+def test_what_is_saved_has_the_rollout_under_way_and_its_updates(tmp_path: Path) -> None:
+    saved = [
+        env_steps for event, env_steps in Run(tmp_path, total=40, rollout=4, save_every=10).go() if event == "saved"
+    ]
+    assert saved[0] == 16  # due at 12, with the four that were under way
+
+
+def test_a_policy_with_updates_left_to_make_is_evaluated_once_a_resumed_run_has_made_them(tmp_path: Path) -> None:
+    run = Run(tmp_path, total=40, rollout=4)
+
+    def stop(updates: int) -> None:
+        if updates == 42:  # among the last ones, of the rollout that was under way at the end
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    run.on_update = stop
+    with pytest.raises(SystemExit) as ended:
+        run.go()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert run.session.at_end and run.learner.updates == 42 < run.session.env_steps == 44
+    assert run.events == [("saved", 44)] and not RunDirectory(tmp_path).finished.exists()
+    resumed = Run(tmp_path, total=40, rollout=4, resume=True)
+    assert (resumed.session.env_steps, resumed.learner.updates) == (44, 42)
+    assert resumed.go()[0] == ("evaluated", 44) and RunDirectory(tmp_path).finished.exists()
+
+
+def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) -> None:
+    run = Run(tmp_path, total=40, rollout=4, fails_after=3)
+    with pytest.raises(WorkerError):
+        run.go()
+    assert [env_steps_of(path) for path in (tmp_path / "checkpoints").glob("checkpoint-*")] == [12]
