@@ -169,7 +169,7 @@ class Arena:
         self._limit = 10 * self._seconds + 60
         self._whole = folder / "whole"
         if latest_checkpoint(RunDirectory(self._whole).best.path).name != latest_checkpoint(self._whole).name:
-            print("the undisturbed run replaces no best at its end, so no kill meets that: try another seed in SETTINGS")
+            print("the undisturbed run replaces no best at its end, so no kill meets that: try another seed")
         print(f"an undisturbed run takes {self._seconds:.0f} s", flush=True)
 
     def cases(self, kind: str, asked: argparse.Namespace) -> Iterator[Case]:
