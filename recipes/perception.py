@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
-from dreamer_racing.evaluation.lesions import LESIONS, LesionedPolicy
+from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy
 from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
@@ -41,7 +41,7 @@ register()
 
 @recipe("perception")
 def main(config: DictConfig) -> None:
-    """Restore the policy, fly it with and without decoys and lesions, report."""
+    """Restore the policy, fly it with and without decoys and with corrupted images, report."""
     start_logging()
     started = time.monotonic()
     with plain_errors():
@@ -53,10 +53,10 @@ def main(config: DictConfig) -> None:
         tracks = tracks_to_fly(restored.trained)
         directory = fresh_directory(settings.run_dir or restored.run_dir / "perception", RESULT)
     looked = fly_and_look(settings, restored, tracks)
-    lesions = {noise: fly_lesioned(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
+    corrupted = {noise: fly_corrupted(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
     provenance = restored.provenance(settings, time.monotonic() - started)
     with plain_disk_errors():
-        write(directory, looked, lesions, provenance, worlds_of(restored.trained)["camera"])
+        write(directory, looked, corrupted, provenance, worlds_of(restored.trained)["camera"])
     print(f"\nwritten to {directory}")
 
 
@@ -111,14 +111,14 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
     return looked
 
 
-def fly_lesioned(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
-    """Fly the policy in both modes on the track as it was asked for, with every lesion of its camera."""
+def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: float) -> list[Result]:
+    """Fly the policy in both modes on the track as it was asked for, with every corruption of its images."""
     trained = restored.trained
     worlds = worlds_of(trained) | {"start_noise": start_noise, "seed": config.seed}
     results = []
-    for name, lesion in LESIONS.items():
+    for name, make in CORRUPTIONS.items():
         for mode in MODES:
-            policy = LesionedPolicy(restored.flyer.evaluation_policy(), lesion())
+            policy = CorruptedPolicy(restored.flyer.evaluation_policy(), make())
             flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
             results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
             print(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
@@ -128,20 +128,20 @@ def fly_lesioned(config: PerceptionConfig, restored: Restored, start_noise: floa
 def write(
     directory: Path,
     looked: dict[str, Looked],
-    lesions: dict[float, list[Result]],
+    corrupted: dict[float, list[Result]],
     provenance: dict[str, Any],
     camera: Camera,
 ) -> None:
-    """Write numbers, tables and the plot; lesions are by the noise of starts."""
+    """Write numbers, tables and the plot; flights with corrupted images are by the noise of starts."""
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
     flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
     plot_sight(flights, camera, directory / "perception.png", title)
-    (directory / "perception.md").write_text(to_markdown(title, looked, lesions, provenance))
+    (directory / "perception.md").write_text(to_markdown(title, looked, corrupted, provenance))
     numbers = {
         "flights": {name: kind.to_dict() for name, kind in looked.items()},
-        "lesions": [
+        "image_corruptions": [
             {"images": result.condition, "start_noise": noise, **result.to_dict()}
-            for noise, results in lesions.items()
+            for noise, results in corrupted.items()
             for result in results
         ],
         "provenance": provenance,
@@ -150,15 +150,15 @@ def write(
 
 
 def to_markdown(
-    title: str, looked: dict[str, Looked], lesions: dict[float, list[Result]], provenance: dict[str, Any]
+    title: str, looked: dict[str, Looked], corrupted: dict[float, list[Result]], provenance: dict[str, Any]
 ) -> str:
     """Return the tables as a page."""
     parts = [heading(title, provenance), "## What the camera is turned to\n", START_TEXT[START_NOISE]]
     sights = {name: kind.sights for name, kind in looked.items()}
     parts += [sight_table(sights), "Share of time in view, gate by gate:\n", gate_table(sights)]
     parts.append("![perception](perception.png)\n")
-    parts.append("## Lesions of the camera\n")
-    for noise, results in lesions.items():
+    parts.append("## Corrupted images\n")
+    for noise, results in corrupted.items():
         parts += [START_TEXT[noise], results_table(results, "images")]
     return "\n".join(parts)
 

@@ -17,7 +17,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.evaluation.course import act
 from dreamer_racing.evaluation.evaluate import CRASHES
-from dreamer_racing.evaluation.lesions import Intact, LesionedPolicy
+from dreamer_racing.evaluation.image_corruptions import CorruptedPolicy, intact
 from dreamer_racing.evaluation.protocol import (
     CONDITIONS,
     MODES,
@@ -160,9 +160,9 @@ def test_intervals_of_bars():
     assert mean_bar([5.0]) == (5.0, 5.0, 5.0, 1) and mean_bar([0.0, 1.0, 0.0]).low == 0.0
 
 
-def test_a_lesioned_policy_is_flown_like_any_other():
+def test_a_policy_with_corrupted_images_is_flown_like_any_other():
     worlds = {"track": "circle", "num_threads": 1, "renderer": "warp", "episode_steps": 5}
-    result = fly(LesionedPolicy(Falling(), Intact()), worlds, 1, deterministic=True)
+    result = fly(CorruptedPolicy(Falling(), intact), worlds, 1, deterministic=True)
     assert result.episodes[0].length == 5
 
 

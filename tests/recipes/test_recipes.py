@@ -11,7 +11,7 @@ import hydra
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.evaluation.lesions import LESIONS
+from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS
 from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import RunDirectory, env_steps_of, latest_checkpoint
 from tests.running_recipes import CONFIG, SMALL, build, recipe, recipe_module, rows
@@ -232,9 +232,9 @@ def test_the_perception_report(run_dir: Path, tmp_path: Path) -> None:
     assert set(report["flights"]) == {"without decoys", "with decoys"}
     for flights in report["flights"].values():
         assert {"next gate", "nearest visible gate", "gate 1", "decoy 1", "decoy 2"} <= set(flights["sights"])
-    lesions = [(record["start_noise"], record["images"], record["policy"]) for record in report["lesions"]]
+    corrupted = [(record["start_noise"], record["images"], record["policy"]) for record in report["image_corruptions"]]
     modes = ("deterministic", "stochastic")
-    assert lesions == [(noise, name, mode) for noise in (0.0, 1.0) for name in LESIONS for mode in modes]
+    assert corrupted == [(noise, name, mode) for noise in (0.0, 1.0) for name in CORRUPTIONS for mode in modes]
     assert (tmp_path / "seen" / "perception.png").exists() and (tmp_path / "seen" / "perception.md").exists()
     refused = recipe("perception", f"checkpoint='{run_dir}'", "+decoys=paper", *options, cwd=tmp_path)
     assert refused.returncode == 2 and "Traceback" not in refused.stderr

@@ -1,4 +1,4 @@
-"""Camera lesions: a policy that flies by sight must fail when its images are frozen, blank or noise.
+"""Image corruptions: a policy that flies by sight must fail when its images are frozen, blank or noise.
 
 Shapes: N environments, H × W pixels.
 """
@@ -15,16 +15,18 @@ from torchrl.envs.transforms import Transform
 from dreamer_racing.learners.learner import Policy
 
 GREY = 128
-Lesion = Callable[[Tensor, Tensor], Tensor]
-"""Images (N, H, W, 3) uint8 and where an episode begins, (N,) bool → the images that the policy sees instead."""
+Corruption = Callable[[Tensor, Tensor], Tensor]
+"""Maps images (N, H, W, 3) uint8, and where an episode begins, (N,) bool, to the images that the policy sees."""
 
 
-class Intact:
-    """Leaves images as they are: what lesions are compared with."""
+def intact(pixels: Tensor, is_init: Tensor) -> Tensor:
+    """Return the images as they are: what corruptions are compared with."""
+    return pixels
 
-    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
-        """Return the images."""
-        return pixels
+
+def blank(pixels: Tensor, is_init: Tensor) -> Tensor:
+    """Return grey images."""
+    return torch.full_like(pixels, GREY)
 
 
 class Frozen:
@@ -40,20 +42,8 @@ class Frozen:
         return self._first
 
 
-class Blank:
-    """Shows grey."""
-
-    def __call__(self, pixels: Tensor, is_init: Tensor) -> Tensor:
-        """Return grey images."""
-        return torch.full_like(pixels, GREY)
-
-
 class Noise:
-    """Shows uniform noise, drawn anew for every pixel, colour and step.
-
-    Args:
-        seed: of the noise.
-    """
+    """Shows uniform noise, drawn anew for every pixel, colour and step from a generator of the seed."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = torch.Generator().manual_seed(seed)
@@ -64,25 +54,30 @@ class Noise:
         return noise.to(pixels.device)
 
 
-LESIONS: dict[str, Callable[[], Lesion]] = {"intact": Intact, "frozen": Frozen, "blank": Blank, "noise": Noise}
-"""Makers of lesions by name; one is made for every flight, for it may remember images."""
+CORRUPTIONS: dict[str, Callable[[], Corruption]] = {
+    "intact": lambda: intact,
+    "frozen": Frozen,
+    "blank": lambda: blank,
+    "noise": Noise,
+}
+"""Makers of corruptions by name; one is made for every flight, for it may remember images."""
 
 
-class LesionedPolicy(torch.nn.Module):
-    """A policy behind a lesion of its camera; nothing but the policy sees the other images.
+class CorruptedPolicy(torch.nn.Module):
+    """A policy that sees corrupted images; nothing but the policy sees them.
 
     Args:
         policy: that reads ``pixels``.
-        lesion: what happens to them.
+        corruption: what happens to them.
 
     Example:
-        >>> # result = fly(LesionedPolicy(policy, Blank()), {"track": "circle"}, episodes=10)
+        >>> # result = fly(CorruptedPolicy(policy, blank), {"track": "circle"}, episodes=10)
     """
 
-    def __init__(self, policy: Policy, lesion: Lesion) -> None:
+    def __init__(self, policy: Policy, corruption: Corruption) -> None:
         super().__init__()
         self.policy = policy
-        self._lesion = lesion
+        self._corruption = corruption
 
     @property
     def deterministic(self) -> bool:
@@ -98,13 +93,13 @@ class LesionedPolicy(torch.nn.Module):
         return self.policy.make_primer()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act on the images that the lesion leaves.
+        """Act on the corrupted images.
 
         Raises:
             ValueError: there are no images.
         """
         pixels = tensordict.get("pixels", None)
         if pixels is None:
-            raise ValueError("a camera lesion needs a policy that sees: the environment has no 'pixels'.")
-        seen = tensordict.copy().set("pixels", self._lesion(pixels, tensordict["is_init"].flatten()))
+            raise ValueError("corrupted images need a policy that sees: the environment has no 'pixels'.")
+        seen = tensordict.copy().set("pixels", self._corruption(pixels, tensordict["is_init"].flatten()))
         return self.policy(seen).set("pixels", pixels)

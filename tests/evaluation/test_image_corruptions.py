@@ -1,4 +1,4 @@
-"""Camera lesions: what the policy sees, and that nobody else sees it."""
+"""Image corruptions: what the policy sees, and that nobody else sees it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.evaluation.lesions import LESIONS, Blank, Frozen, Intact, LesionedPolicy, Noise
+from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy, Frozen, Noise, blank, intact
 
 
 def images(*values: int) -> torch.Tensor:
@@ -50,8 +50,8 @@ def test_frozen_survives_images_that_are_changed_in_place():
 
 def test_blank_is_grey_and_intact_is_itself():
     pixels = images(1, 2)
-    assert Blank()(pixels, torch.ones(2)).unique().tolist() == [128]
-    assert Intact()(pixels, torch.ones(2)) is pixels
+    assert blank(pixels, torch.ones(2)).unique().tolist() == [128]
+    assert intact(pixels, torch.ones(2)) is pixels
 
 
 def test_noise_is_uniform_new_at_every_step_and_seeded():
@@ -64,9 +64,9 @@ def test_noise_is_uniform_new_at_every_step_and_seeded():
     assert counts.min() > 0.6 and counts.max() < 1.4
 
 
-def test_only_the_policy_sees_the_lesion():
+def test_only_the_policy_sees_corrupted_images():
     watching, data = Watching(), root(images(1, 2), True, True)
-    policy = LesionedPolicy(watching, Blank())
+    policy = CorruptedPolicy(watching, blank)
     acted = policy(data)
     assert watching.seen[0].unique().tolist() == [128]
     assert acted["pixels"][:, 0, 0, 0].tolist() == data["pixels"][:, 0, 0, 0].tolist() == [1, 2]
@@ -75,12 +75,12 @@ def test_only_the_policy_sees_the_lesion():
     assert watching.deterministic and policy.deterministic
 
 
-def test_every_lesion_is_made_afresh():
-    assert set(LESIONS) == {"intact", "frozen", "blank", "noise"}
-    assert LESIONS["frozen"]() is not LESIONS["frozen"]()
+def test_every_corruption_is_made_afresh():
+    assert set(CORRUPTIONS) == {"intact", "frozen", "blank", "noise"}
+    assert CORRUPTIONS["frozen"]() is not CORRUPTIONS["frozen"]()
 
 
 def test_blind_policies_are_refused():
     data = TensorDict({"vector": torch.zeros(1, 21), "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1])
     with pytest.raises(ValueError, match="no 'pixels'"):
-        LesionedPolicy(Watching(), Blank())(data)
+        CorruptedPolicy(Watching(), blank)(data)
