@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 
 from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs
 
@@ -244,15 +245,11 @@ def weight_raises(run: RunData) -> np.ndarray:
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:
-    """Average the middle half along the first axis.
+    """Average the middle half of S runs (S, ...): a quarter, rounded down, is cut off at either end.
 
     Reference: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.
-
-    Args:
-        scores: (S, ...) of S runs, of which a quarter, rounded down, is cut off at either end.
     """
-    cut = len(scores) // 4
-    return np.sort(scores, axis=0)[cut : len(scores) - cut].mean(axis=0)
+    return scipy.stats.trim_mean(scores, 0.25, axis=0)
 
 
 def bootstrap_interval(

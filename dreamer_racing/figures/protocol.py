@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
@@ -52,10 +53,8 @@ def share_bar(happened: Sequence[bool]) -> Bar:
 
     Reference: Wilson, Probable inference, the law of succession, and statistical inference, 1927.
     """
-    n, share = len(happened), float(np.mean(happened))
-    middle = (share + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
-    half = Z95 / (1 + Z95**2 / n) * np.sqrt(share * (1 - share) / n + Z95**2 / (4 * n**2))
-    return Bar(share, float(np.clip(middle - half, 0.0, share)), float(np.clip(middle + half, share, 1.0)), n)
+    low, high = scipy.stats.binomtest(sum(happened), len(happened)).proportion_ci(0.95, "wilson")
+    return Bar(float(np.mean(happened)), float(low), float(high), len(happened))
 
 
 def mean_bar(values: Sequence[float], height: float | None = None) -> Bar:

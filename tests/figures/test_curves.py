@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
 import yaml
 
 from dreamer_racing.figures.curves import (
@@ -146,9 +145,7 @@ def test_both_policies_can_be_drawn(tmp_path):
     assert QUANTITIES["stochastic_success_rate"].comparable
 
 
-def test_interquartile_mean_is_that_of_scipy():
-    scores = np.random.default_rng(0).normal(size=(11, 5))
-    np.testing.assert_allclose(interquartile_mean(scores), scipy.stats.trim_mean(scores, 0.25))
+def test_interquartile_mean_is_that_of_the_middle_half():
     assert interquartile_mean(np.array([100.0, 1, 2, 3, -50])) == 2.0  # the middle three of five
     assert interquartile_mean(np.array([1.0, 2, 6])) == 3.0  # nothing to cut
 
