@@ -6,11 +6,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
-
-from tests.running_recipes import module_of
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples" / "first_flight.ipynb"
@@ -19,10 +16,8 @@ PAGE = (ROOT / "docs" / "library.md").read_text()
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 
 
-@pytest.fixture(scope="module")
-def benchmark() -> ModuleType:
-    """What runs the examples to their ends, and reads them."""
-    return module_of("benchmarks", "front_doors")
+PROGRESS = re.compile(r"(\d+) steps: return (-?[\d.]+), ([\d.]+) gates an episode")
+RACES = re.compile(r"(sampled|clipped mean) actions: three laps from (\d+) of (\d+) noisy starts, (nan|[\d.]+) s a lap")
 
 
 def run(name: str, *arguments: str, cwd: Path) -> str:
@@ -61,39 +56,15 @@ def test_torchrl_loops(tmp_path: Path, name: str, arguments: tuple[str, ...], st
         ("sb3", ("--num-envs", "64", "--env-steps", "8192"), 8192),
     ],
 )
-def test_ppo_of_others(
-    tmp_path: Path, name: str, arguments: tuple[str, ...], steps: int, benchmark: ModuleType
-) -> None:
+def test_ppo_of_others(tmp_path: Path, name: str, arguments: tuple[str, ...], steps: int) -> None:
     if name == "sb3":
         pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`: pip install -e '.[sb3]'")
     *curve, sampled, clipped_mean = run(name, *arguments, cwd=tmp_path).splitlines()
-    rows = [row for row in map(benchmark.PROGRESS.fullmatch, curve) if row]
+    rows = [row for row in map(PROGRESS.fullmatch, curve) if row]
     assert int(rows[-1][1]) == steps and -30.0 < float(rows[-1][2]) < 30.0 and float(rows[-1][3]) < 3.0
     for actions, line in (("sampled", sampled), ("clipped mean", clipped_mean)):
-        race = benchmark.RACES.fullmatch(line)
+        race = RACES.fullmatch(line)
         assert race and race.groups() == (actions, "0", "100", "nan"), "nobody has learnt yet"
-
-
-def test_curves_are_read_off_what_examples_print(benchmark: ModuleType, tmp_path: Path, monkeypatch) -> None:
-    said = ["128 steps: return -3.5, 0.1 gates an episode", "256 steps: return 210.0, 17.5 gates an episode"]
-    said.append("sampled actions: three laps from 93 of 100 noisy starts, 2.61 s a lap")
-    said.append("clipped mean actions: three laps from 0 of 100 noisy starts, nan s a lap")
-    (tmp_path / "examples").mkdir()
-    (tmp_path / "examples" / "ppo.py").write_text("".join(f"print({line!r})\n" for line in said))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["front_doors.py", "--folder", "out", "--examples", "ppo", "--env-steps", "200"])
-    benchmark.main()
-    (record,) = json.loads((tmp_path / "out" / "ppo.json").read_text())
-    assert record["command"] == "python examples/ppo.py --env-steps 200"
-    assert record["env_steps"] == 256
-    assert [record[f"sampled_{name}"] for name in ("finished", "starts", "lap_s")] == [93, 100, 2.61]
-    assert [record[f"clipped_mean_{name}"] for name in ("finished", "starts", "lap_s")] == [0, 100, None]
-    rows = [line.split(",") for line in (tmp_path / "out" / "ppo.csv").read_text().splitlines()]
-    assert rows[0] == list(benchmark.CURVE) and [rows[2][0], *rows[2][2:]] == ["256", "210.0", "17.5"]
-    assert (tmp_path / "out" / "curves.png").stat().st_size > 5_000
-    (tmp_path / "examples" / "ppo.py").write_text("raise SystemExit(3)")
-    with pytest.raises(SystemExit, match="examples/ppo.py --env-steps 200: exit status 3"):
-        benchmark.main()
 
 
 @pytest.mark.slow

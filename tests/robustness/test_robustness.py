@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,20 +12,13 @@ from tests.robustness import faults, fuzz
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", fuzz.CASES)
 def test_input_that_nobody_means_is_taken_or_refused(kind: str) -> None:
-    record = fuzz.in_a_process(kind, share=0.0125, seed=0)
+    record = fuzz.in_a_process(kind, share=0.00625, seed=0)
     assert record["cases"] and not record["failed"], "\n".join(record["failures"])
 
 
-@pytest.fixture(scope="module")
-def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[faults.Arena]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "1")
-        folder: Path = tmp_path_factory.mktemp("faults")
-        yield faults.Arena(folder)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["kill", "clock"])
-def test_a_disturbed_run_ends_as_one_that_was_not(arena: faults.Arena, kind: str) -> None:
-    cases = list(arena.cases(kind, Namespace(kills=2, sigterms=1, most=1, seed=0)))
-    assert cases and not [case for case in cases if not case["survived"]], cases
+def test_a_run_does_not_care_what_time_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kills, signals, damage and full disks have tests of their own in tests/recipes and tests/training."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    cases = list(faults.Arena(tmp_path).clocks())
+    assert len(cases) == 2 and all(case["survived"] for case in cases), cases
