@@ -16,6 +16,7 @@ import shlex
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,6 +30,7 @@ from composing.usage import command
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
 
+from dreamer_racing.envs.imu import load_imu
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, hash_track, load_track
 from dreamer_racing.evaluation.protocol import MODES
@@ -138,6 +140,7 @@ def prepare(
         step,
         env.worlds.parameters,
         env.worlds.camera,
+        load_imu(worlds_of(trained)["imu"]),
         checkpoint=checkpoint.name,
         env_steps=metadata["env_steps"],
         weights=metadata["weights"],
@@ -280,11 +283,13 @@ def measure(step: ActorStep, flight: RecordedFlight, output: Path, parts: bool) 
     """Print how long one step takes, with one thread."""
     contract = read_contract(output.parent / CONTRACT)
     actors = {"onnxruntime": OnnxActor(output, whole=True), "torch": TorchActor(contract, step)}
+    felt = {} if flight.imu is None else {"imu": flight.imu[0]}
     for name, actor in actors.items():
-        print(f"one step, 1 thread, {name}: {measure_latency(actor.step, flight.observations)}")
+        print(f"one step, 1 thread, {name}: {measure_latency(partial(actor.step, **felt), flight.observations)}")
     if parts:
         actor = OnnxActor(output)
-        print(f"of it from image to action: {measure_latency(actor.step, flight.observations, actor.prepare)}")
+        latency = measure_latency(partial(actor.step, **felt), flight.observations, actor.prepare)
+        print(f"of it from image to action: {latency}")
 
 
 if __name__ == "__main__":

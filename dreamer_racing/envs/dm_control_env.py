@@ -9,6 +9,7 @@ Physics, rules, rewards and start poses are those of the batched environments, f
 | `linear_velocity` | (3,) | m/s, world |
 | `body_rates` | (3,) | rad/s, body frame |
 | `target_gate` | (1,) int64 | the gate to pass next |
+| `imu` | (6,) | body rates, rad/s, and specific force, m/s², body frame, only with `imu=` |
 | `pixels` | (height, width, 3) uint8 | nose camera, 64 × 64 by default, only with `from_pixels=True` |
 
 A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A broken
@@ -34,13 +35,22 @@ from dm_control.suite import base
 from dm_env import specs
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters, at_control_rate, load_preset
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, at_control_rate, load_preset
 from dreamer_racing.envs.drone.quadrotor import Quadrotor, wrong_action_type
+from dreamer_racing.envs.drone.rotation import rotate_inverse
+from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
-from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera, build_scene, load_camera
+from dreamer_racing.envs.simulator.scene import (
+    CAMERA_NAME,
+    HALL_GROUP,
+    Camera,
+    build_scene,
+    frame_interval,
+    load_camera,
+)
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
 from dreamer_racing.settings import check_numbers, without_none
@@ -62,6 +72,8 @@ def load(
     camera: Camera | None = None,
     weights: RewardWeights | None = None,
     control_rate: float | None = None,
+    camera_rate: float | None = None,
+    imu: str | ImuErrors | None = None,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
     """Make the race of one drone as a dm_control environment.
@@ -76,6 +88,9 @@ def load(
         camera: the nose camera.
         weights: of the reward, paper Eq. 1.
         control_rate: actions a second, Hz; if None the preset's, 50.
+        camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
+            one; if None the camera's, a frame at every control step.
+        imu: whether there is an observation `imu`: `exact`, `noisy` (see `IMUS`), or by how much it errs.
         environment_kwargs: further arguments of `control.Environment`, e.g. `flat_observation`.
 
     Raises:
@@ -89,7 +104,7 @@ def load(
         1.0
     """
     check_numbers({}, without_none(control_rate=control_rate, time_limit=time_limit))
-    camera = load_camera(camera)
+    camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu)
     track, parameters = load_track(track), load_preset(preset)
     if control_rate is not None:
         parameters = at_control_rate(parameters, control_rate)
@@ -105,6 +120,7 @@ def load(
         episode_steps=episode_steps,
         evaluation=evaluation,
         camera=camera if from_pixels else None,
+        imu=errors,
         weights=weights,
     )
     # no time_limit here: control.Environment would give a crash in the last step the discount of a truncation
@@ -183,6 +199,15 @@ class Physics(mujoco.Physics):
         """Angular velocity (3,) in the body frame, rad/s."""
         return self.data.qvel[3:6].copy()
 
+    def feel(self) -> Tensor:
+        """What an IMU in its centre shows, (1, 6), as `Simulator.feel`."""
+        rates, attitude, velocity = (
+            torch.from_numpy(part()) for part in (self.body_rates, self.attitude, self.linear_velocity)
+        )
+        step = self.quadrotor.parameters.physics_dt
+        acceleration = (velocity - self._flight.qvel_before[0, :3]) / step + torch.tensor((0.0, 0.0, GRAVITY))
+        return torch.cat((rates, rotate_inverse(attitude, acceleration))).unsqueeze(0)
+
     def path(self) -> Tensor:
         """Positions (P + 1, 1, 3) at the start of the control step and after each of its physics steps, m."""
         return torch.from_numpy(np.stack(self._path)).unsqueeze(1)
@@ -191,6 +216,7 @@ class Physics(mujoco.Physics):
         """Put the drone there, (3,), (4,) and (3,), not rotating, with its rotors at hover and new parameters."""
         self.data.qpos[:3], self.data.qpos[3:7] = position, attitude
         self.data.qvel[:3], self.data.qvel[3:6] = linear_velocity, 0.0
+        self._flight.qvel_before.copy_(torch.from_numpy(self.data.qvel))
         self.quadrotor.reset(torch.ones(1, dtype=torch.bool))
         self._start_path()
 
@@ -252,6 +278,7 @@ class DroneRace(base.Task):
         episode_steps: control steps after which an episode is truncated; None for those of 20 s.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
         camera: the nose camera; None for no `pixels`.
+        imu: by how much the IMU errs; None for no `imu`.
         weights: of the reward, paper Eq. 1.
 
     Attributes:
@@ -269,6 +296,7 @@ class DroneRace(base.Task):
         episode_steps: int | None = None,
         evaluation: bool = False,
         camera: Camera | None = None,
+        imu: ImuErrors | None = None,
         weights: RewardWeights | None = None,
     ) -> None:
         super().__init__(random=random)
@@ -281,8 +309,12 @@ class DroneRace(base.Task):
         self._generator = generator or torch.Generator()
         self._starts = StartSampler(track, self._generator, dtype=torch.float64)
         self._invalid_action = False
+        self._imu_errors = imu
+        self._imu: Imu | None = None
         self._camera = camera
         self._view: OnboardView | None = None
+        self._frame_interval = 1 if camera is None else frame_interval(camera, 1.0 / parameters.control_dt)
+        self._image, self._image_age = np.empty(0), 0  # what is shown, and for how many control steps it has been
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Collective thrust and body rates x, y, z, (4,) in [-1, 1]."""
@@ -295,6 +327,10 @@ class DroneRace(base.Task):
         physics.place(start.position[0].numpy(), start.attitude[0].numpy(), start.linear_velocity[0].numpy())
         self.race.begin(torch.ones(1, dtype=torch.bool), start.position, start.target_gate)
         self.outcome = None
+        self._image_age = self._frame_interval
+        if self._imu_errors is not None:
+            self._imu = Imu(self._imu_errors, physics.feel, self._generator)
+            self._imu.begin(torch.ones(1, dtype=torch.bool))
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Give the action (4,) to the flight controller; what lies beyond [-1, 1] is clipped.
@@ -316,6 +352,9 @@ class DroneRace(base.Task):
 
     def after_step(self, physics: Physics) -> None:
         """Judge the control step."""
+        self._image_age += 1
+        if self._imu is not None:
+            self._imu.step()
         body_rates = torch.from_numpy(physics.body_rates()).unsqueeze(0)
         self.outcome = self.race.step(physics.path(), body_rates, torch.tensor([self._invalid_action]))
 
@@ -328,10 +367,19 @@ class DroneRace(base.Task):
             body_rates=physics.body_rates(),
             target_gate=self.race.target_gate.numpy().copy(),
         )
+        if self._imu is not None:
+            observation["imu"] = self._imu.sample[0].numpy()
         if self._camera is not None:
-            self._view = self._view or OnboardView(physics, self._camera)
-            observation["pixels"] = self._view.image()
+            observation["pixels"] = self._look(physics)
         return observation
+
+    def _look(self, physics: Physics) -> np.ndarray:
+        """Return the image that is shown; take a frame where one is due."""
+        assert self._camera is not None, "asked"
+        self._view = self._view or OnboardView(physics, self._camera)
+        if self._frame_interval == 1 or self._image_age >= self._frame_interval:
+            self._image, self._image_age = self._view.image(), 0
+        return self._image.copy()
 
     def get_reward(self, physics: Physics) -> float:
         """Eq. 1 with today's b₂."""

@@ -5,6 +5,7 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 | `observation` | space |
 |---|---|
 | `"pixels"` | `Box(0, 255, (height, width, 3), uint8)`, the nose camera, 64 × 64 by default |
+| `"pixels_imu"` | `Dict` of `pixels` and `imu`, `Box(-inf, inf, (6,), float32)`: body rates and specific force |
 | `"vector"` | `Box(-inf, inf, (21,), float32)`, the race in the drone's own frame, see `RaceVector` |
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
@@ -29,6 +30,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
+from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
@@ -37,7 +39,7 @@ from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions
 from dreamer_racing.settings import FINITE, check_setting
 
-OBSERVATIONS = ("pixels", "vector", "state", "both")
+OBSERVATIONS = ("pixels", "pixels_imu", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -81,7 +83,7 @@ class GymWorlds:
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        observation: `pixels`, `vector`, `state` or `both`.
+        observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
@@ -118,7 +120,13 @@ class GymWorlds:
         self.observation = observation
         self.privileged = privileged
         self.renderer_name = worlds.get("renderer", "auto")
-        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=observation in ("pixels", "both"), **worlds)
+        if observation == "pixels_imu":
+            worlds = worlds.copy()
+            worlds["imu"] = worlds.get("imu") or "exact"
+        elif worlds.get("imu") is not None:
+            raise ValueError(f"imu={worlds.get('imu')!r} is for observation='pixels_imu', not {observation!r}.")
+        images = observation in ("pixels", "pixels_imu", "both")
+        self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=images, **worlds)
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
@@ -140,6 +148,8 @@ class GymWorlds:
         pixels = Box(0, 255, (camera.height, camera.width, 3), np.uint8)
         if self.observation == "pixels":
             return pixels
+        if self.observation == "pixels_imu":
+            return Dict({"pixels": pixels, "imu": Box(-np.inf, np.inf, (IMU_SIZE,), np.float32)})
         if self.observation == "vector":
             return Box(-np.inf, np.inf, (RACE_VECTOR_SIZE,), np.float32)
         spaces: dict[str, gymnasium.Space] = {
@@ -186,6 +196,9 @@ class GymWorlds:
         if self.observation == "state":
             return state
         pixels = self.worlds.render(None if mask is None else torch.from_numpy(mask)).numpy()
+        if self.observation == "pixels_imu":
+            assert self.worlds.imu is not None, "made so"
+            return {"pixels": pixels, "imu": self.worlds.imu.sample.numpy()[rows]}
         return pixels if self.observation == "pixels" else {"pixels": pixels, **state}
 
     def state(self) -> dict[str, np.ndarray]:
@@ -251,7 +264,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        observation: `pixels`, `vector`, `state` or `both`.
+        observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
         render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.

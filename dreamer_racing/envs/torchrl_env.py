@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds
@@ -93,6 +94,8 @@ class DroneRacingEnv(EnvBase):
             )
         else:
             observation["vector"] = number(RACE_VECTOR_SIZE)
+        if self.worlds.imu is not None:
+            observation["imu"] = number(IMU_SIZE)
         if self.privileged:
             observation["privileged"] = Composite(
                 position=number(3),
@@ -145,7 +148,7 @@ class DroneRacingEnv(EnvBase):
         rows = ended.nonzero().squeeze(-1)
         if not len(rows):
             return tensordict
-        self.worlds.reset(ended)
+        self.worlds.reset(None if len(rows) == len(ended) else ended)
         seen = self._observe()
         if self.from_pixels:
             seen["pixels"] = tensordict.get("pixels").clone()  # the step before keeps its own as its outcome
@@ -170,10 +173,12 @@ class DroneRacingEnv(EnvBase):
 
     def _observe(self) -> dict[str, Any]:
         """What the worlds' states show now, without images."""
+        data: dict[str, Any] = {} if self.worlds.imu is None else {"imu": self.worlds.imu.sample}
         if self.from_pixels and not self.privileged:
-            return {}
+            return data
         vector = self.worlds.vector()
-        data: dict[str, Any] = {} if self.from_pixels else {"vector": vector}
+        if not self.from_pixels:
+            data["vector"] = vector
         if self.privileged:
             data["privileged"] = self._group({**self.worlds.privileged(), "vector": vector})
         return data

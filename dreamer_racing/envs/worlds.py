@@ -18,6 +18,8 @@ from dreamer_racing.envs.drone.parameters import (
     without_randomisation,
 )
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
+from dreamer_racing.envs.held_frames import HeldFrames
+from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
@@ -26,7 +28,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.backends import check_device, make_simulator
 from dreamer_racing.envs.simulator.base import Simulator
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
-from dreamer_racing.envs.simulator.scene import Camera, load_camera
+from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.settings import check_numbers, quoted, without_none
@@ -53,6 +55,8 @@ class RaceOptions(TypedDict, total=False):
     start_noise: float
     miss_radius: float
     control_rate: float | None
+    camera_rate: float | None
+    imu: str | ImuErrors | None
 
 
 class WorldOptions(RaceOptions, total=False):
@@ -90,6 +94,10 @@ class RaceWorlds:
             and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
             lead past it.
         control_rate: actions a second, Hz; if None the preset's, 50.
+        camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
+            one, and none is drawn in between; if None the camera's, a frame at every control step.
+        imu: gyro and accelerometer beside the images: `exact`, `noisy` (see `IMUS`), or by how much they err; None for
+            none.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -125,18 +133,20 @@ class RaceWorlds:
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
         control_rate: float | None = None,
+        camera_rate: float | None = None,
+        imu: str | ImuErrors | None = None,
     ) -> None:
         _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_device(device)
-        self.camera = load_camera(camera)
-        self._process = os.getpid()
-        self.track = load_track(track)
+        self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
+        self._process, self._from_pixels = os.getpid(), from_pixels
+        self.track, self.evaluation = load_track(track), evaluation
         self.num_envs = num_envs = int(num_envs)
-        self.evaluation = evaluation
         self.parameters = load_preset(preset)
         if control_rate is not None:
             check_numbers({}, {"control_rate": control_rate})
             self.parameters = at_control_rate(self.parameters, control_rate)
+        interval = frame_interval(self.camera, 1.0 / self.parameters.control_dt)
         self._generator = torch.Generator(device)
         self.seed(seed)
         self.simulator: Simulator = make_simulator(
@@ -155,8 +165,9 @@ class RaceWorlds:
         self.race = self._make_race(weights, episode_steps, miss_radius)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
-        self._from_pixels = from_pixels
-        self._graph: GraphedFunction | None = None
+        self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
+        self.imu = None if errors is None else Imu(errors, self.simulator.feel, self._generator)
+        self._graphs: dict[bool, GraphedFunction] = {}  # of a control step, by whether it draws
         self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
         self.begun = False
 
@@ -237,12 +248,18 @@ class RaceWorlds:
             RuntimeError: this process was forked from the one that made the worlds.
         """
         self._check_process()
+        whole = mask is None
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         start = self._starts.sample(self.num_envs, self.evaluation)
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
         self._images, self.begun = None, True
+        if self._held is not None:
+            together = whole or (self.device.type == "cpu" and bool(mask.all()))  # elsewhere that would wait
+            self._held.begin(None if together else mask)
+        if self.imu is not None:
+            self.imu.begin(mask)
 
     def step(self, action: Tensor) -> RaceStep:
         """Fly one control step. The simulator is not differentiable: no gradient goes back to the action.
@@ -269,13 +286,20 @@ class RaceWorlds:
             )
         if action.device != self.device:
             raise ValueError(f"Action on {action.device}: these worlds live on {self.device}, and so must it.")
-        if self.device.type != "cuda":
-            return self._fly(action)
-        if self._graph is None:
-            self._graph = self._capture(action)
-        outcome = list(self._graph(action))
-        if self._from_pixels:
-            self._images = outcome.pop()
+        outcome = self._fly(action) if self.device.type != "cuda" else self._replay(action)
+        if self._held is not None:
+            self._held.step()
+        if self.imu is not None:
+            self.imu.step()
+        return outcome
+
+    def _replay(self, action: Tensor) -> RaceStep:
+        """Fly one control step as a CUDA graph, and draw where a frame is due."""
+        draws = self._from_pixels and (self._held is None or self._held.next_is_frame)
+        if draws not in self._graphs:
+            self._graphs[draws] = self._capture(action, draws)
+        outcome = list(self._graphs[draws](action))
+        self._images = outcome.pop() if draws else None
         return RaceStep(*outcome)
 
     def _fly(self, action: Tensor) -> RaceStep:
@@ -285,15 +309,15 @@ class RaceWorlds:
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
         return outcome
 
-    def _capture(self, action: Tensor) -> GraphedFunction:
-        """Capture physics, race and images of a step as one CUDA graph, and leave the worlds as they were.
+    def _capture(self, action: Tensor, draws: bool) -> GraphedFunction:
+        """Capture physics, race and perhaps images of a step as one CUDA graph, and leave the worlds as they were.
 
         The graph keeps the race's rules (laps, episode_steps, weights) as they are now.
         """
 
         def fly_and_draw(action: Tensor) -> list[Tensor]:
             outcome = list(vars(self._fly(action)).values())
-            return [*outcome, self.simulator.render()] if self._from_pixels else outcome
+            return [*outcome, self.simulator.render()] if draws else outcome
 
         before = self.state_dict()
         graph = GraphedFunction(fly_and_draw, action)
@@ -307,6 +331,10 @@ class RaceWorlds:
             RuntimeError: there are none, or this process was forked from the one that made the worlds.
         """
         self._check_process()
+        return self._draw(rows) if self._held is None else self._held.show(rows)
+
+    def _draw(self, rows: Tensor | None) -> Tensor:
+        """Draw what `render` returns, if no step has yet."""
         if self._images is None:
             images = self.simulator.render(rows)
         elif rows is None:
@@ -348,6 +376,8 @@ class RaceWorlds:
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
+            **({} if self._held is None else {"frames": self._held.state_dict()}),
+            **({} if self.imu is None else {"imu": self.imu.state_dict()}),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -361,6 +391,10 @@ class RaceWorlds:
             raise ValueError(
                 f"The saved state is of {saved} worlds, these are {self.num_envs}: resume with num_envs={saved}."
             )
+        if ("frames" in state_dict) != (self._held is not None):
+            raise ValueError("The saved worlds had another camera_rate than these: resume with theirs.")
+        if ("imu" in state_dict) != (self.imu is not None):
+            raise ValueError("The saved worlds had another imu than these: resume with theirs.")
         self.begun = True
         generator = state_dict["generator"].cpu()
         if generator.shape != self._generator.get_state().shape:
@@ -372,6 +406,10 @@ class RaceWorlds:
         self.simulator.load_state_dict(state_dict["simulator"])
         self.race.load_state_dict(state_dict["race"])
         self._images = None
+        if self._held is not None:
+            self._held.load_state_dict(state_dict["frames"])
+        if self.imu is not None:
+            self.imu.load_state_dict(state_dict["imu"])
         self._generator.set_state(generator)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -383,7 +421,8 @@ class RaceWorlds:
 
     def close(self) -> None:
         """Free rendering contexts and threads; a forked process has none, and leaves them to the one that made them."""
-        self._graph = self._images = None  # the graph draws into the simulator's buffers
+        self._graphs.clear()  # they draw into the simulator's buffers
+        self._images = None
         if os.getpid() == self._process:
             self.simulator.close()
 

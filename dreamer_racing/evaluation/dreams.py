@@ -144,6 +144,7 @@ def dream(
     assert trajectory.pixels is not None
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
     flight = {"pixels": trajectory.pixels, "previous_action": action, "target_gate": trajectory.target_gate}
+    flight |= {} if trajectory.imu is None else {"imu": trajectory.imu}
     windows = {name: torch.stack([value[part] for part in parts]) for name, value in flight.items()}
     shape = windows["pixels"].shape[:2]
     windows["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool)

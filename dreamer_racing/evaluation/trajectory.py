@@ -68,6 +68,8 @@ class Trajectory:
     """(K,): the return that a critic expected from row k on, discounted as in training; None if none judged."""
     camera_tilt: float | None = None
     """Of the camera that it was flown by, upwards from the body's x axis, degrees; None without one, or unknown."""
+    imu: Tensor | None = None
+    """(K + 1, 6) what the drone's IMU told beside the images; None without one, and in files."""
 
     @property
     def speed(self) -> Tensor:
@@ -86,6 +88,7 @@ class Trajectory:
             outcome=self.outcome if last >= len(self.position) - 1 else None,
             value=None if self.value is None else self.value[first:last],
             camera_tilt=self.camera_tilt,
+            imu=None if self.imu is None else self.imu[first : last + 1],
         )
 
     @property
@@ -160,9 +163,9 @@ class TrajectoryRecorder:
         for name in ("position", "attitude", "linear_velocity"):
             self._rows[name].append(self._copy(tensordict["privileged", name]))
         self._rows["target_gate"].append(self._copy(tensordict["privileged", "target_gate"].squeeze(-1)))
-        pixels = tensordict.get("pixels", None) if self._pixels else None
-        if pixels is not None:
-            self._rows["pixels"].append(self._copy(pixels))
+        for name in ("pixels", "imu") if self._pixels else ():
+            if (seen := tensordict.get(name, None)) is not None:
+                self._rows[name].append(self._copy(seen))
 
     def _copy(self, value: Tensor) -> Tensor:
         """(N, ...) → (M, ...) on the CPU, not changed by later steps."""

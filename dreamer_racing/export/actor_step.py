@@ -1,12 +1,12 @@
 """Export of the recurrent actor as one explicit step, published only if its copies fly as the original does.
 
 `ActorStep` takes all recurrent state as inputs and gives it back as outputs: ``(observation, h, z, previous_action,
-is_init[, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
+is_init[, imu][, noise]) -> (action, h_next, z_next)``, batch size 1. `export_actor` writes it for onnxruntime and as a
 ``torch.export`` program, and publishes both, with the contract of `contract`, only if they pass `parity`.
 
 A large step can be written in two `PARTS`, too: ``advance``, ``(h, z, previous_action, is_init) -> h_next``, which
 needs no observation, so that a vehicle can run it while a command is on its way; and ``act``, ``(observation,
-h_next[, noise]) -> (action, z_next)``, which is all that stands between seeing and acting.
+h_next[, imu][, noise]) -> (action, z_next)``, which is all that stands between seeing and acting.
 
 Shape legend: D belief, S state = L·K, L latents, K classes, A action, V numbers.
 """
@@ -30,6 +30,7 @@ from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, Torch
 from dreamer_racing.export.weights_file import write_weights
 from dreamer_racing.modules import join_features
 from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.interface import IMU, PIXELS, VECTOR
 from dreamer_racing.modules.rssm import mix_uniform
 from dreamer_racing.training.directory import ensure_writable
 
@@ -54,7 +55,7 @@ class ActorStep(nn.Module):
         noise_shape: Shape of the input ``noise``, or None if there is none.
 
     Raises:
-        ValueError: If the agent sees images and numbers both.
+        ValueError: If the agent sees images and numbers both, other than those of an IMU.
 
     Example:
         >>> from dreamer_racing.modules import Interface, get_size
@@ -70,9 +71,9 @@ class ActorStep(nn.Module):
     def __init__(self, agent: Agent) -> None:
         super().__init__()
         self.interface, self.size = agent.interface, agent.world_model.size
-        if len(self.interface.observation_keys) != 1:
+        if self.interface.observation_keys not in ([PIXELS], [VECTOR], [PIXELS, IMU]):
             seen = " and ".join(self.interface.observation_keys)
-            raise ValueError(f"This agent sees {seen}; only actors of one observation can be exported.")
+            raise ValueError(f"This agent sees {seen}; beside images only what an IMU tells can be exported.")
         self.encoder = copy.deepcopy(agent.world_model.encoder)
         self.rssm = copy.deepcopy(agent.world_model.rssm)
         self.actor = copy.deepcopy(agent.actor)
@@ -87,7 +88,7 @@ class ActorStep(nn.Module):
         return None
 
     def forward(
-        self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor
+        self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, *more: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Step.
 
@@ -97,21 +98,22 @@ class ActorStep(nn.Module):
             z: State after the last step, ``(1, S)``.
             previous_action: ``(1, A)``.
             is_init: Whether this is the first step of an episode, bool ``(1,)``.
+            more: What the IMU tells, float32 ``(1, 6)``, of an agent that has one; the noise, where there is any.
 
         Returns:
             Action ``(1, A)`` in [−1, 1], next belief ``(1, D)``, next state ``(1, S)``.
         """
         h = self.advance(h, z, previous_action, is_init)
-        action, z = self.act(observation, h)
+        action, z = self.act(observation, h, *more)
         return action, h, z
 
     def advance(self, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor) -> Tensor:
         """Return the next belief ``(1, D)``, which needs no observation; arguments as in `forward`."""
         return self.rssm.advance(previous_action, is_init, h, z)
 
-    def act(self, observation: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+    def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
         """Return action ``(1, A)`` and next state ``(1, S)`` by what is seen and the next belief ``(1, D)``."""
-        z = self.rssm.take_in(h, self._embed(observation), deterministic=True)
+        z = self.rssm.take_in(h, self._embed(observation, *more), deterministic=True)
         return self.actor(join_features(h, z)).clipped_mean(), z
 
     def example_inputs(self) -> dict[str, Tensor]:
@@ -122,6 +124,7 @@ class ActorStep(nn.Module):
             if interface.pixels
             else {"vector": torch.zeros(1, interface.vector_dim)}
         )
+        imu = {IMU: torch.zeros(1, interface.vector_dim)} if interface.vector_key == IMU else {}
         noise = {} if self.noise_shape is None else {"noise": torch.full((1, *self.noise_shape), 0.5)}
         return {
             **seen,
@@ -129,11 +132,12 @@ class ActorStep(nn.Module):
             "z": torch.zeros(1, size.state),
             "previous_action": torch.zeros(1, interface.action_dim),
             "is_init": torch.ones(1, dtype=torch.bool),
+            **imu,
             **noise,
         }
 
-    def _embed(self, observation: Tensor) -> Tensor:
-        return self.encoder({self.interface.observation_keys[0]: observation})
+    def _embed(self, *seen: Tensor) -> Tensor:
+        return self.encoder(dict(zip(self.interface.observation_keys, seen, strict=True)))
 
 
 class SampledActorStep(ActorStep):
@@ -152,17 +156,13 @@ class SampledActorStep(ActorStep):
         """Shape (L, K) of the noise of one step."""
         return self.size.latents, self.size.classes
 
-    def forward(  # type: ignore[override]  # one input more: the noise
-        self, observation: Tensor, h: Tensor, z: Tensor, previous_action: Tensor, is_init: Tensor, noise: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Step; arguments as in `ActorStep.forward`, and ``noise``: uniform numbers in [0, 1), ``(1, L, K)``."""
-        h = self.advance(h, z, previous_action, is_init)
-        action, z = self.act(observation, h, noise)
-        return action, h, z
+    def act(self, observation: Tensor, h: Tensor, *more: Tensor) -> tuple[Tensor, Tensor]:
+        """Return action and next state; arguments as in `ActorStep.act`.
 
-    def act(self, observation: Tensor, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        """Return action and next state; arguments as in `ActorStep.act` and `forward`."""
-        probabilities = mix_uniform(self.rssm.posterior_logits(h, self._embed(observation)), self.rssm.unimix)
+        The last one is the noise: uniform numbers in [0, 1), ``(1, L, K)``.
+        """
+        *imu, noise = more
+        probabilities = mix_uniform(self.rssm.posterior_logits(h, self._embed(observation, *imu)), self.rssm.unimix)
         gumbel = -(-noise.log()).log()
         index = (probabilities.log() + gumbel).argmax(-1, keepdim=True)
         z = torch.zeros_like(probabilities).scatter(-1, index, 1.0).flatten(1)
@@ -190,8 +190,8 @@ class StepPart(nn.Module):
         given, before = self.step.example_inputs(), (*RECURRENT, "is_init")
         if self.name == "advance":
             return {name: given[name] for name in before}
-        seen, *noise = (name for name in given if name not in before)
-        return {seen: given[seen], "h_next": torch.zeros_like(given["h"]), **{name: given[name] for name in noise}}
+        seen, *more = (name for name in given if name not in before)
+        return {seen: given[seen], "h_next": torch.zeros_like(given["h"]), **{name: given[name] for name in more}}
 
 
 LATENTS: dict[str, type[ActorStep]] = {step.latent: step for step in (ActorStep, SampledActorStep)}

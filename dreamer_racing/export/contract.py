@@ -11,20 +11,28 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters, Randomisation
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, Randomisation
+from dreamer_racing.envs.imu import ImuErrors
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.export.actor_step import OUTPUTS, ActorStep
-from dreamer_racing.export.onnx_actor import FORMAT, FORMAT_VERSION
+from dreamer_racing.export.onnx_actor import FORMAT
 
 
-def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Camera, **source: Any) -> dict[str, Any]:
+def make_contract(
+    step: ActorStep,
+    parameters: QuadrotorParameters,
+    camera: Camera,
+    imu: ImuErrors | None = None,
+    **source: Any,
+) -> dict[str, Any]:
     """Describe everything that a step takes and gives, for those who fly it without this project.
 
     Args:
         step: The step.
         parameters: Of the drone that the agent was trained with.
         camera: Through which it saw.
+        imu: By how much its IMU erred; None without one.
         source: Where it comes from, JSON values: checkpoint, env_steps, track and its `hash_track`, preset,
             and where the track was a file, all of it by `describe_track`, ``track_description``.
 
@@ -35,7 +43,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
     outputs = dict(zip(OUTPUTS, step(*step.example_inputs().values()), strict=True))
     return {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format_version": 2 if step.interface.pixels and (camera.rate is not None or imu is not None) else 1,
         "project_version": version("dreamer_racing"),
         "source": source,
         "weights_sha256": hash_weights(step),
@@ -61,6 +69,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
         ),
         "camera": describe_camera(camera) if step.interface.pixels else None,
         "vector": None if step.interface.pixels else _describe_vector(),
+        **({} if imu is None else {"imu": _describe_imu(imu)}),
         "control": {"rate_hz": 1.0 / parameters.control_dt, "period_s": parameters.control_dt},
         "frames": {
             "body": "FLU: x forward, y left, z up, right-handed",
@@ -74,6 +83,7 @@ def make_contract(step: ActorStep, parameters: QuadrotorParameters, camera: Came
 _MEANINGS = {
     "image_u8": "what the nose camera sees now: (1, height, width, RGB)",
     "vector": "what the drone knows now, instead of an image",
+    "imu": "what the flight controller's gyro and accelerometer tell now, as 'imu' says",
     "h": "deterministic state (belief) after the step before",
     "z": "stochastic state after the step before, of (latents, classes), flattened: ",
     "previous_action": "the action of the step before",
@@ -109,6 +119,7 @@ def describe_camera(camera: Camera) -> dict[str, Any]:
         "tilt_up_deg": camera.tilt,
         "position_body_m": list(camera.position),
         "model": "pinhole without distortion, looks along body +x tilted up, square pixels, centre at the image's",
+        **({} if camera.rate is None else {"rate_hz": camera.rate}),
     }
 
 
@@ -121,6 +132,15 @@ def _describe_vector() -> dict[str, Any]:
             {"name": name, "unit": unit, "divisor": divisor}
             for name, (unit, divisor) in zip(names, scales, strict=True)
         ],
+    }
+
+
+def _describe_imu(errors: ImuErrors) -> dict[str, Any]:
+    names = ((f"body_rate_{axis}", "rad/s") for axis in "xyz"), ((f"specific_force_{axis}", "m/s^2") for axis in "xyz")
+    return {
+        "channels": [{"name": name, "unit": unit} for part in names for name, unit in part],
+        "at_rest": [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY],
+        "trained_errors": asdict(errors),
     }
 
 

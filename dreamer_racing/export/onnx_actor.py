@@ -18,6 +18,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,11 +27,12 @@ import numpy as np
 logger = logging.getLogger(__name__)
 
 CONTRACT = "contract.json"
-FORMAT, FORMAT_VERSION = "dreamer_racing.actor", 1
+FORMAT, FORMAT_VERSIONS = "dreamer_racing.actor", (1, 2)
+"""A contract is of version 2 where the image is to be held between frames (``camera.rate_hz``), or there is an IMU."""
 RECURRENT = ("h", "z", "previous_action")
 PARTS = {"advance": ("h_next",), "act": ("action", "z_next")}
 """Outputs of the two parts of a step. The first takes all that is recurrent and ``is_init``, the second the
-observation, ``h_next`` and the noise, if there is any."""
+observation, ``h_next`` and what there is of IMU and noise."""
 WARM_UP_STEPS = 20
 
 _TENSOR = {"name": str, "shape": [int], "type": str}
@@ -52,6 +54,7 @@ _LAYOUT = {
         "vertical_field_of_view_deg": float,
         "tilt_up_deg": float,
         "position_body_m": [float],
+        "rate_hz?": float,
     },
 }
 """What is read of a contract: keys and types of values; of a list, what each entry is. ``?``: may be absent or null."""
@@ -82,6 +85,11 @@ class RecurrentActor:
         self.reset()
 
     @property
+    def feels(self) -> bool:
+        """Whether a step takes what an IMU tells."""
+        return "imu" in self._shapes
+
+    @property
     def noise_shape(self) -> tuple[int, ...] | None:
         """Shape (L, K) of the noise of one step; None if the actor takes none."""
         return self._shapes["noise"][1:] if "noise" in self._shapes else None
@@ -97,25 +105,32 @@ class RecurrentActor:
         Worth it after a step, when its action is on its way.
         """
 
-    def step(self, observation: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, observation: np.ndarray, noise: np.ndarray | None = None, imu: np.ndarray | None = None
+    ) -> np.ndarray:
         """Take in what is seen now and return what to do; call it once per control period.
 
         Args:
             observation: uint8 RGB image (height, width, 3), top row first, or the float32 vector (V,) of an actor that
                 sees numbers; the contract's first input says which.
             noise: Only for ``latent=sample``: uniform numbers in [0, 1), float32 (L, K); drawn here if None.
+            imu: Only for actors with one (`feels`): body rates, rad/s, and specific force, m/s², FLU, float32 (6,).
 
         Returns:
             float32 (A,) in [−1, 1]; `setpoint` gives it units.
 
         Raises:
-            ValueError: Wrong shape or type, numbers that are not finite, or noise for an actor that takes none.
+            ValueError: Wrong shape or type, numbers that are not finite, or noise or IMU for an actor that takes none.
         """
         feed = {
             **self.state,
             self._observed: self._checked(self._observed, observation, self._dtype),
             "is_init": np.array([self.is_init]),
         }
+        if self.feels:
+            feed["imu"] = self._checked("imu", imu, np.dtype(np.float32))
+        elif imu is not None:
+            raise ValueError("imu: this actor has none, by its contract.")
         if self.noise_shape is not None:
             noise = self._random.random(self.noise_shape, np.float32) if noise is None else noise
             feed["noise"] = self._checked("noise", noise, np.dtype(np.float32))
@@ -276,9 +291,10 @@ def read_contract(path: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}.") from error
     found = (contract.get("format"), contract.get("format_version")) if isinstance(contract, dict) else (None, None)
-    if found != (FORMAT, FORMAT_VERSION):
+    if found[0] != FORMAT or found[1] not in FORMAT_VERSIONS:
+        known = " and ".join(map(str, FORMAT_VERSIONS))
         raise ValueError(
-            f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, version {FORMAT_VERSION}. "
+            f"{path}: format {found[0]!r}, version {found[1]!r}; this file reads {FORMAT!r}, versions {known}. "
             "Use the onnx_actor.py of the release that exported it, or export again."
         )
     if misfit := _unlike(contract, _LAYOUT, "") or _unfit(contract):
@@ -406,10 +422,11 @@ def main() -> None:
         parser.error(str(error))
     entry = actor.contract["inputs"][0]
     seen = np.random.default_rng(0).integers(0, 256, (arguments.steps, *entry["shape"][1:])).astype(entry["type"])
+    step = partial(actor.step, imu=np.zeros(6, np.float32)) if actor.feels else actor.step
     logger.info("onnxruntime, %d steps, %d thread(s): %s", arguments.steps, arguments.threads,
-                measure_latency(actor.step, seen))  # fmt: skip
+                measure_latency(step, seen))  # fmt: skip
     if actor.in_parts:
-        logger.info("of it from seeing to acting: %s", measure_latency(actor.step, seen, actor.prepare))
+        logger.info("of it from seeing to acting: %s", measure_latency(step, seen, actor.prepare))
 
 
 if __name__ == "__main__":

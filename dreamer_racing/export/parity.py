@@ -42,11 +42,13 @@ class RecordedFlight:
         observations: uint8 ``(T, height, width, 3)`` or float32 ``(T, V)``.
         is_init: Whether each step is its episode's first, bool ``(T,)``.
         actions: What the policy did, ``(T, A)``.
+        imu: What the IMU told, float32 ``(T, 6)``; None without one.
     """
 
     observations: np.ndarray
     is_init: np.ndarray
     actions: np.ndarray
+    imu: np.ndarray | None = None
 
     @property
     def episodes(self) -> int:
@@ -70,15 +72,15 @@ def record_flight(env: DroneRacingEnv, agent: Agent, steps: int) -> RecordedFlig
         raise ValueError(f"env has batch size {list(env.batch_size)}; a flight is recorded with num_envs=1.")
     policy = DreamerPolicy(agent.world_model, agent.actor, deterministic=True)
     flying = with_memory(env, policy.make_primer())
-    names = (agent.interface.observation_keys[0], "is_init", "action")
+    names = (*agent.interface.observation_keys, "is_init", "action")
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     tensordict = flying.reset()
     for _ in range(steps):
         flown, tensordict = flying.step_and_maybe_reset(policy(tensordict))
         for name in names:
             rows[name].append(flown[name][0].numpy().copy())
-    observations, is_init, actions = (np.stack(rows[name]) for name in names)
-    return RecordedFlight(observations, is_init[:, 0], actions)
+    observations, *imu, is_init, actions = (np.stack(rows[name]) for name in names)
+    return RecordedFlight(observations, is_init[:, 0], actions, *imu)
 
 
 def episode_steps(steps: int) -> int:
@@ -160,7 +162,8 @@ def _replay(actor: RecurrentActor, flight: RecordedFlight, noise: np.ndarray | N
     for index, observation in enumerate(flight.observations):
         if flight.is_init[index]:
             actor.reset()
-        actions.append(actor.step(observation, None if noise is None else noise[index]))
+        imu = None if flight.imu is None else flight.imu[index]
+        actions.append(actor.step(observation, None if noise is None else noise[index], imu))
         latents.append(actor.state["z"].reshape(actor.contract["model"]["latents"], -1).copy())
     return np.stack(actions), np.stack(latents)
 

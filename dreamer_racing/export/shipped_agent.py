@@ -35,6 +35,7 @@ _SETTINGS = {
     "camera.width_px": "env.image_size",
     "camera.height_px": "env.image_size",
     "camera.tilt_up_deg": "env.camera_tilt",
+    "camera.rate_hz": "env.camera_rate",
 }
 """Settings by what a contract calls them."""
 
@@ -208,10 +209,11 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
     pairs: dict[str, tuple[Any, Any]] = {
         "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt),
         "env.from_pixels": (camera is not None, env.from_pixels),
+        "env.imu": tuple("exact" if has else "none" for has in ("imu" in contract, env.worlds.imu is not None)),
     }
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)
-        pairs |= {f"camera.{name}": (value, here.get(name)) for name, value in camera.items()}
+        pairs |= {f"camera.{name}": (camera.get(name), here.get(name)) for name in {**camera, "rate_hz": None}}
     for name, (trained, given) in pairs.items():
         numbers = isinstance(trained, float) and isinstance(given, int | float)
         if not (math.isclose(trained, given, rel_tol=1e-6, abs_tol=1e-9) if numbers else trained == given):

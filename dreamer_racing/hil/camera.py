@@ -84,4 +84,5 @@ def camera_of(contract: dict[str, Any]) -> Camera:
         field_of_view=described["vertical_field_of_view_deg"],
         tilt=described["tilt_up_deg"],
         position=tuple(described["position_body_m"]),
+        rate=described.get("rate_hz"),
     )

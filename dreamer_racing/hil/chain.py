@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dreamer_racing.envs.simulator.scene import frame_interval
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.battery import Battery, BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.imu import ImuReading, unlike_rest
 from dreamer_racing.hil.operator import Operator
 from dreamer_racing.hil.pose import PosePacket, Received
 from dreamer_racing.hil.progress import GateProgress
@@ -81,6 +83,7 @@ class Inputs(NamedTuple):
         overrun: Deadlines that the tick before missed, as it took longer than its period.
         voltages: Of the battery since the last tick, oldest first.
         dropped: Whether the command of the tick before did not go out.
+        imu: What the IMU told since the last tick, oldest first; asked for only if the flyer needs it.
     """
 
     time: float
@@ -89,6 +92,7 @@ class Inputs(NamedTuple):
     overrun: int
     voltages: Sequence[Reading] = ()
     dropped: bool = False
+    imu: Sequence[ImuReading] = ()
 
 
 class Outputs(NamedTuple):
@@ -102,7 +106,7 @@ class Outputs(NamedTuple):
         image: What the flyer saw; None if it has no camera, or was not asked.
         target_gate: Index of the gate that comes next.
         passes: Gates passed in this flight.
-        render_s: s that drawing the image took.
+        render_s: s that drawing the image took; 0 where that of a tick before is still shown.
         act_s: s that the flyer took.
         voltage: V, by which the link is to turn thrust into a throttle; None: as it is set.
     """
@@ -134,14 +138,15 @@ class FlightChain:
         camera: Draws what the flyer sees; None if it needs no image.
 
     Raises:
-        ValueError: The latency is no time, or the lift lifts nothing, or is more than is sensible or safety lets
-            through.
+        ValueError: The latency is no time, the camera's frames do not fit the flyer's rate, or the lift lifts nothing,
+            or is more than is sensible or safety lets through.
 
     Attributes:
         progress: Which gates were passed.
         clock: Of the poses.
         safety: Has the last word.
         battery: Its voltage; None if nobody asks for it.
+        feels: Whether the flyer needs what the IMU tells.
     """
 
     def __init__(self, flyer: Flyer, track: Track, config: ChainConfig, camera: NoseCamera | None) -> None:
@@ -151,6 +156,11 @@ class FlightChain:
         self.safety = Safety(config.limits)
         self.battery = None if config.battery is None else Battery(config.battery)
         self._flyer, self._camera, self._config = flyer, camera, config
+        self._frame_interval = 1 if flyer.camera is None else frame_interval(flyer.camera, flyer.rate)
+        self.feels = bool(getattr(flyer, "feels", False))
+        self._felt: ImuReading | None = None  # the newest
+        self._image: np.ndarray | None = None  # that is shown; None before the first of a flight
+        self._shown = 0  # ticks for which it has been
         drawn = None if camera is None else camera.camera
         self._mismatch = None if flyer.camera in (None, drawn) else f"it sees by {flyer.camera}, drawn is {drawn}"
         self._gates_in_all = None if config.laps is None else config.laps * track.num_gates
@@ -170,14 +180,15 @@ class FlightChain:
         """Do once what a tick does, before the first one: libraries take their time then."""
         level = np.array([1.0, 0.0, 0.0, 0.0])
         start = np.array(self._config.limits.start_position, float)
+        self._felt = ImuReading(0.0, np.array((0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY)))
         self._choose(Pose(0.0, start, level, np.zeros(3), np.zeros(3)))
-        self._flyer.reset()
+        self._felt = None
+        self._begin()
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Take in what came, choose, and let safety judge."""
         if not self._flying:  # each tick is the first of the flight
-            self._flyer.reset()
-            self.progress.reset()
+            self._begin()
         poses = [pose for received in inputs.received if (pose := self.clock.read(received)) is not None]
         for pose in poses:
             self._newest = pose
@@ -185,6 +196,7 @@ class FlightChain:
             self.progress.update(pose, judged=pose is poses[-1])
         self._flying |= self._has_risen()
         pose = None if self._newest is None else extrapolate(self._newest, inputs.time)
+        numb = self._feel(inputs) if self.feels else None
         finish = self._gates_in_all is not None and len(self.progress.passes) >= self._gates_in_all
         tick = Tick(
             now=inputs.time,
@@ -193,7 +205,8 @@ class FlightChain:
             setpoint=None,
             operator=inputs.operator,
             arm_requested=self._config.arm,
-            contract_mismatch=self._mismatch,
+            # in flight there is no setpoint instead: it holds, then cuts
+            contract_mismatch=self._mismatch if self.safety.armed else self._mismatch or numb,
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,
@@ -201,7 +214,7 @@ class FlightChain:
         )
         findings = self.safety.examine(tick)
         # What is cut anyway does not wait for drawing and choosing.
-        setpoint, image, render_s, act_s = self._choose(None if self.safety.cuts(findings) else pose)
+        setpoint, image, render_s, act_s = self._choose(None if numb or self.safety.cuts(findings) else pose)
         verdict = self.safety.judge(tick._replace(setpoint=setpoint), findings)
         self._lifting = tick.lift is not None and self.safety.lets_through
         self._flying = finish or (verdict.command.armed and (self._flying or self._has_moved()))
@@ -245,10 +258,37 @@ class FlightChain:
         if pose is None:
             return None, None, 0.0, 0.0
         start = time.perf_counter()
-        image = None if self._camera is None else self._camera.see(pose)
+        image = self._look(pose)
         drawn = time.perf_counter()
-        setpoint = self._flyer.act(pose, image, self.progress.target)
-        return setpoint, image, drawn - start, time.perf_counter() - drawn
+        felt = () if not self.feels or self._felt is None else (self._felt.sample,)
+        act: Callable[..., Setpoint] = self._flyer.act  # of one that feels, with the sample
+        setpoint = act(pose, image, self.progress.target, *felt)
+        render_s = 0.0 if self._shown else drawn - start
+        return setpoint, image, render_s, time.perf_counter() - drawn
+
+    def _feel(self, inputs: Inputs) -> str | None:
+        """Take in what the IMU told; say why the flyer cannot fly by it, None if it can."""
+        if inputs.imu:
+            self._felt = inputs.imu[-1]
+        most = self._config.limits.hold_after
+        if self._felt is None or inputs.time - self._felt.time > most:
+            return f"it flies by the IMU, and nothing was heard of that for more than {most:g} s"
+        return None if self.safety.armed else unlike_rest(self._felt.sample)
+
+    def _begin(self) -> None:
+        """Begin a flight."""
+        self._flyer.reset()
+        self.progress.reset()
+        self._image = None
+
+    def _look(self, pose: Pose) -> np.ndarray | None:
+        """Return the image that the flyer is shown, a frame of now or, of a camera that is slower, one of before."""
+        if self._camera is None:
+            return None
+        self._shown += 1
+        if self._image is None or self._shown >= self._frame_interval:
+            self._image, self._shown = self._camera.see(pose), 0
+        return self._image
 
     def prepare(self) -> None:
         """Do what the next tick needs and can be done before it, once the command of this one is out."""
@@ -269,6 +309,7 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "overrun": inputs.overrun,
         "voltages": [list(reading) for reading in inputs.voltages],
         "dropped": inputs.dropped,
+        **({"imu": [[felt.time, *felt.sample.tolist()] for felt in inputs.imu]} if inputs.imu else {}),
     }
 
 
@@ -282,7 +323,8 @@ def read_inputs(message: dict[str, Any]) -> Inputs:
     voltages = [Reading(*reading) for reading in message.get("voltages", ())]
     operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
     overrun = int(message["overrun"])  # flights of old say whether
-    return Inputs(message["time"], received, operator, overrun, voltages, dropped)
+    felt = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
+    return Inputs(message["time"], received, operator, overrun, voltages, dropped, felt)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

@@ -41,13 +41,14 @@ class Flyer(Protocol):
 
 
 class ActorFlyer:
-    """An exported actor: it sees the image and nothing else.
+    """An exported actor: it sees the image, and what the IMU tells if it was trained with one, and nothing else.
 
     Args:
         path: The ``.onnx`` file, or the folder of an agent that ships.
 
     Attributes:
         contract: Of the actor.
+        feels: Whether it must be told what the IMU tells.
 
     Raises:
         FileNotFoundError: There is none.
@@ -60,15 +61,17 @@ class ActorFlyer:
         self.contract: dict[str, Any] = self._actor.contract
         self.camera: Camera | None = camera_of(self.contract)
         self.rate = float(self.contract["control"]["rate_hz"])
+        self.feels = self._actor.feels
 
     def reset(self) -> None:
         """Begin a flight."""
         self._actor.reset()
 
-    def act(self, pose: Pose, image: np.ndarray | None, target_gate: int) -> Setpoint:
-        """Choose by the image."""
+    def act(self, pose: Pose, image: np.ndarray | None, target_gate: int, imu: np.ndarray | None = None) -> Setpoint:
+        """Choose by the image, and by what the IMU tells, (6,)."""
         assert image is not None, "there is a camera, so there is an image"
-        thrust, *rates = self._actor.setpoint(self._actor.step(image))
+        felt = None if imu is None else imu.astype(np.float32)
+        thrust, *rates = self._actor.setpoint(self._actor.step(image, imu=felt))
         return Setpoint(float(thrust), np.array(rates))
 
     def prepare(self) -> None:

@@ -79,7 +79,7 @@ class LoopStatistics:
         jitter: How late each tick began.
         pose_age: Of the newest pose, when the command was sent.
         latency: From the arrival of the pose that a command is made from to its being sent.
-        render: Of drawing.
+        render: Of drawing, in ticks that draw.
         act: Of the flyer.
         busy: Of the whole tick, until its command is out.
         prepare: Of what the next one needs and was done ahead of it.
@@ -226,7 +226,8 @@ class FlightLoop:
         """Do one tick: what came in → chain → link → file."""
         operator = self._ask_operator(armed)
         heard = self._listen()
-        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped)
+        felt = self._link.feel() if self._chain.feels else []
+        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, felt)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)
@@ -310,7 +311,7 @@ class FlightLoop:
         noted.jitter.append(jitter)
         noted.busy.append(done - inputs.time)
         if outputs.setpoint is not None:
-            noted.render.append(outputs.render_s)
+            noted.render += [outputs.render_s] if outputs.render_s else []
             noted.act.append(outputs.act_s)
         if outputs.pose is not None:
             noted.pose_age.append(done - outputs.measured)

@@ -12,6 +12,7 @@ import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.battery import Reading
+from dreamer_racing.hil.imu import ImuReading
 
 
 class Pose(NamedTuple):
@@ -67,7 +68,7 @@ def at_rest() -> Command:
 
 
 class Link(Protocol):
-    """Carries commands to a vehicle, and back what it says of its battery."""
+    """Carries commands to a vehicle, and back what it says of its battery and its IMU."""
 
     def send(self, command: Command) -> bytes:
         """Send a command now, without waiting; return the bytes that went out, none if it was dropped."""
@@ -75,6 +76,10 @@ class Link(Protocol):
 
     def listen(self) -> list[Reading]:
         """Return the battery's voltages that have come back since the last call, oldest first, without waiting."""
+        ...
+
+    def feel(self) -> list[ImuReading]:
+        """Return what the vehicle's IMU told until the last `listen`, oldest first; asked of links that hear one."""
         ...
 
     def reckon_with(self, voltage: float) -> None:

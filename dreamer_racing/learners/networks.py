@@ -1,4 +1,4 @@
-"""Networks of the model-free baselines: a CNN on images, numbers as they are, then one MLP.
+"""Networks of the model-free baselines: a CNN on images, numbers as they are, an IMU's by their symlog, then one MLP.
 
 Shape legend: N any batch, A action, O outputs.
 """
@@ -16,7 +16,8 @@ from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dreamer_racing.modules import Interface
-from dreamer_racing.modules.interface import PIXELS
+from dreamer_racing.modules.heads import symlog
+from dreamer_racing.modules.interface import IMU, PIXELS
 
 
 @dataclass
@@ -117,10 +118,15 @@ class ObservationNetwork(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the tensors under ``in_keys`` to ``(..., O)``."""
-        if self.trunk is not None:
-            position = self.in_keys.index(PIXELS)
-            inputs = (*inputs[:position], self.trunk(inputs[position]), *inputs[position + 1 :])
-        return self.mlp(inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1))
+        parts = [self._scaled(key, value) for key, value in zip(self.in_keys, inputs, strict=True)]
+        return self.mlp(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
+
+    def _scaled(self, key: str, value: Tensor) -> Tensor:
+        """Return what the MLP sees of an input."""
+        if key == PIXELS:
+            assert self.trunk is not None, "made so"
+            return self.trunk(value)
+        return symlog(value) if key == IMU else value
 
 
 class GaussianNetwork(nn.Module):
@@ -194,8 +200,9 @@ class BaselinePolicy(TensorDictModuleBase):
 
 
 def layers_of(size: NetworkSize, interface: Interface) -> dict[str, Any]:
-    """Return what a checkpoint says of its networks: their hidden layers, and the images that they see."""
-    return {**asdict(size), "image_size": interface.image_size if interface.pixels else None}
+    """Return what a checkpoint says of its networks: their hidden layers, and what they see."""
+    image_size = interface.image_size if interface.pixels else None
+    return {**asdict(size), "image_size": image_size, "imu": interface.vector_key == IMU}
 
 
 def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
@@ -213,6 +220,11 @@ def check_layers(saved: dict[str, Any], present: dict[str, Any]) -> None:
         raise ValueError(
             f"The checkpoint's networks were made with env.from_pixels={there}, this learner's with {here}: set "
             f"env.from_pixels={there}, or begin anew."
+        )
+    if (there := saved.get("imu", False)) is not present["imu"]:  # older ones have none
+        raise ValueError(
+            f"The checkpoint's networks were made {'with' if there else 'without'} env.imu, and this learner's are "
+            f"{'not' if there else 'made with it'}: set it as it was, or begin anew."
         )
     names = {"layers": "network.layers", "units": "network.units", "image_size": "env.image_size"}
     for key, setting in names.items():

@@ -15,7 +15,7 @@ from dreamer_racing.losses.config import LossConfig
 from dreamer_racing.losses.world_model import WorldModelLoss
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.decoder import VectorDecoder
-from dreamer_racing.modules.interface import PIXELS, PRIVILEGED, VECTOR
+from dreamer_racing.modules.interface import PIXELS, PRIVILEGED
 from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import Posterior
 from dreamer_racing.modules.world_model import WorldModel
@@ -73,7 +73,8 @@ class ReconstructionLoss(WorldModelLoss):
             image = self.image_scale * error * pixels.shape[-3:].numel()
             losses |= {"loss_image": image, "image_error": error.detach()}
         if self.world_model.vector_decoder is not None:
-            losses["loss_vector"] = self.world_model.vector_decoder.squared_error(features, tensordict.get(VECTOR))
+            numbers = tensordict.get(self.world_model.interface.vector_key)
+            losses["loss_vector"] = self.world_model.vector_decoder.squared_error(features, numbers)
         return losses
 
     def _share_of_records(self, *values: Tensor) -> tuple[Tensor, ...]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from dreamer_racing.modules.deferred import autocast_type
 from dreamer_racing.modules.heads import symlog
-from dreamer_racing.modules.interface import PIXELS, VECTOR, Interface
+from dreamer_racing.modules.interface import PIXELS, Interface
 from dreamer_racing.modules.layers import NORMS, NormedLinear, initialize_convolution
 from dreamer_racing.modules.sizes import ModelSize
 
@@ -187,7 +187,9 @@ class ObservationEncoder(nn.Module):
                 interface.image_size,
             )
         if interface.vector_dim:
-            encoders[VECTOR] = VectorEncoder(interface.vector_dim, size.vector_layers, size.units, size.norm)
+            encoders[interface.vector_key] = VectorEncoder(
+                interface.vector_dim, size.vector_layers, size.units, size.norm
+            )
         self.embedding_size = sum(encoder.embedding_size for encoder in encoders.values())
         self.encoders = nn.ModuleDict(encoders)
 

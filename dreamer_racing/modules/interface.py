@@ -14,6 +14,8 @@ PIXELS = "pixels"
 """Key of the images that the agent sees, uint8 ``(..., height, width, 3)``."""
 VECTOR = "vector"
 """Key of the numbers that the agent sees, float32 ``(..., V)``."""
+IMU = "imu"
+"""Key of the IMU's numbers, which it may see beside images instead: float32 ``(..., 6)``, rad/s and m/s²."""
 PRIVILEGED = ("privileged", "vector")
 """Key of the numbers that only a loss sees, float32 ``(..., P)``."""
 
@@ -26,8 +28,9 @@ class Interface:
         action_dim: A.
         pixels: Whether the agent sees images under ``"pixels"``.
         image_size: Height and width of those images, pixels.
-        vector_dim: V, size of what it sees under ``"vector"``; 0 if nothing.
+        vector_dim: V, size of what it sees under ``vector_key``; 0 if nothing.
         privileged_dim: P, size of what losses may use of ``("privileged", "vector")``; 0 if nothing.
+        vector_key: ``"vector"``, or ``"imu"``: whose numbers the agent sees.
 
     Raises:
         ValueError: If the agent would see nothing.
@@ -38,6 +41,7 @@ class Interface:
     image_size: int = 64
     vector_dim: int = 0
     privileged_dim: int = 0
+    vector_key: str = VECTOR
 
     def __post_init__(self) -> None:
         if not self.pixels and not self.vector_dim:
@@ -55,8 +59,9 @@ class Interface:
         height, width = specs[PIXELS].shape[-3:-1] if PIXELS in keys else [cls.image_size] * 2
         if height != width:
             raise ValueError(f"The environment's images are {height} × {width} pixels: agents see square ones.")
-        vector, privileged = (specs[key].shape[-1] if key in keys else 0 for key in (VECTOR, PRIVILEGED))
-        return cls(env.action_spec.shape[-1], PIXELS in keys, height, vector, privileged)
+        numbers = IMU if IMU in keys else VECTOR
+        vector, privileged = (specs[key].shape[-1] if key in keys else 0 for key in (numbers, PRIVILEGED))
+        return cls(env.action_spec.shape[-1], PIXELS in keys, height, vector, privileged, numbers)
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
@@ -66,7 +71,7 @@ class Interface:
     @property
     def observation_keys(self) -> list[str]:
         """Keys that the encoder reads."""
-        return [PIXELS] * self.pixels + [VECTOR] * bool(self.vector_dim)
+        return [PIXELS] * self.pixels + [self.vector_key] * bool(self.vector_dim)
 
     @property
     def replay_keys(self) -> list[NestedKey]:

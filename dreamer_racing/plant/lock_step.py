@@ -9,6 +9,7 @@ from dreamer_racing.hil.battery import Reading
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import Flyer
+from dreamer_racing.hil.imu import ImuReading
 from dreamer_racing.hil.links.udp import CommandPacket, encode_command
 from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.operator import Operator
@@ -70,6 +71,10 @@ class LockStep:
     def listen(self) -> list[Reading]:
         """Return nothing: this vehicle does not speak of its battery."""
         return []
+
+    def feel(self) -> list[ImuReading]:
+        """Return what the plant's IMU tells now."""
+        return [ImuReading(self.now(), self.plant.vehicle.feel())]
 
     def reckon_with(self, voltage: float) -> None:
         """Do nothing: thrust is sent as it is."""

@@ -12,9 +12,11 @@ import select
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from dreamer_racing.hil.imu import encode_imu
 from dreamer_racing.hil.inlet import bind
 from dreamer_racing.hil.links.udp import UdpTransport
 from dreamer_racing.plant.betaflight_sitl import DIALECTS, MOTOR_PORT, STATE_PORT, BetaflightSitl
@@ -59,8 +61,11 @@ class Plant:
         controls: What tells it what to do.
         delivery: What becomes of poses.
         send: Sends a pose packet.
+        incoming: By which whoever sent a command is told what the IMU tells, as often as poses are measured; None:
+            nobody is.
 
     Attributes:
+        commander: Address from which the last datagram came; None before it.
         time: s, to which everything has been done.
         vehicle: The drone.
         controls: What tells it what to do.
@@ -69,9 +74,16 @@ class Plant:
     """
 
     def __init__(
-        self, vehicle: PlantVehicle, controls: Controls, delivery: Delivery, send: Callable[[bytes], object]
+        self,
+        vehicle: PlantVehicle,
+        controls: Controls,
+        delivery: Delivery,
+        send: Callable[[bytes], object],
+        incoming: socket.socket | None = None,
     ) -> None:
         self.vehicle, self.controls = vehicle, controls
+        self._incoming, self._told = incoming, 0
+        self.commander: Any = None
         self._poses, self._send = PoseDelivery(delivery), send
         self.time = 0.0
         self.late, self.latest = 0, 0.0
@@ -89,9 +101,17 @@ class Plant:
                 self.controls.act(due)
             if self._poses.next_measurement <= due:
                 self._poses.measure(self.vehicle.pose(), due)
+                self._tell_imu()
             for packet in self._poses.depart(due):
                 self._send(packet)
         self._fly_to(until)
+
+    def _tell_imu(self) -> None:
+        if self._incoming is None or self.commander is None:
+            return
+        self._told += 1
+        with suppress(OSError):  # who listens no longer is no matter of the plant's
+            self._incoming.sendto(encode_imu(self._told, self.time, self.vehicle.feel()), self.commander)
 
     def _fly_to(self, until: float) -> None:
         if until > self.time:
@@ -141,7 +161,7 @@ def fly_in_real_time(
             now = min((time.monotonic() - start) * speed, duration)
             if now < plant.due + LATE * speed:  # else they came during what was late: as if at its beginning
                 plant.advance_to(now)
-            for data in _drain(incoming):
+            for data in _drain(plant, incoming):
                 plant.take(data)
         elif wait <= _PATIENCE:
             plant.advance_to(min(plant.due, duration))
@@ -161,19 +181,20 @@ def fly_in_lock_step(
     """
     while not stop.requested and plant.time < duration - _ROUNDING:
         if select.select([incoming], [], [], _PATIENCE)[0]:
-            for data in _drain(incoming):
+            for data in _drain(plant, incoming):
                 if plant.take(data):
                     plant.advance_to(plant.time + period)
 
 
-def _drain(incoming: socket.socket) -> list[bytes]:
-    """Return the datagrams that wait, as many as there is time for."""
+def _drain(plant: Plant, incoming: socket.socket) -> list[bytes]:
+    """Return the datagrams that wait, as many as there is time for, and let the plant know who sent them."""
     received: list[bytes] = []
     while len(received) < 256:
         try:
-            received.append(incoming.recv(_LONGEST))
+            data, plant.commander = incoming.recvfrom(_LONGEST)
         except (BlockingIOError, ConnectionRefusedError):
             break
+        received.append(data)
     return received
 
 
@@ -245,7 +266,7 @@ def run(vehicle: PlantVehicle, delivery: Delivery, options: ProcessOptions, sock
     controls: Controls = CommandReceiver(vehicle, options.failsafe)
     if options.betaflight is not None:
         controls = BetaflightSitl(vehicle, sockets.state.write, options.betaflight, options.failsafe)
-    plant = Plant(vehicle, controls, delivery, sockets.poses.write)
+    plant = Plant(vehicle, controls, delivery, sockets.poses.write, None if options.betaflight else sockets.incoming)
     duration = math.inf if options.duration is None else options.duration
     try:
         with GracefulExit() as stop:

@@ -173,6 +173,10 @@ class PlantVehicle:
         mujoco.mju_quat2Mat(rotation, self._qpos[3:])
         return rotation.reshape(3, 3).T @ (self._acceleration + np.array((0.0, 0.0, GRAVITY)))
 
+    def feel(self) -> np.ndarray:
+        """What an IMU in its centre tells: (6,) body rates, rad/s, and specific force, m/s², body frame."""
+        return np.concatenate((self._qvel[3:], self.specific_force))
+
     def pose(self) -> Pose:
         """Return where it is and how it moves, at its own `time`."""
         numbers = (self._qpos[:3], self._qpos[3:], self._qvel[:3], self._qvel[3:])

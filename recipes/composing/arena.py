@@ -52,7 +52,7 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
 def camera_of(config: RunConfig) -> Camera:
     """The nose camera."""
     side = config.env.image_size
-    return Camera(width=side, height=side, tilt=config.env.camera_tilt)
+    return Camera(width=side, height=side, tilt=config.env.camera_tilt, rate=config.env.camera_rate)
 
 
 def worlds_of(config: RunConfig) -> dict[str, Any]:
@@ -65,6 +65,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "camera": camera_of(config),
         "control_rate": env.control_rate,
         "from_pixels": env.from_pixels,
+        "imu": None if env.imu == "none" else env.imu,
         "device": env.device,
     }
 

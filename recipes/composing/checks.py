@@ -11,7 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import track_as_begun
+from composing.arena import track_as_begun, worlds_of
 from composing.command_line import override_key
 from composing.schema import (
     LOSS_RAMPS,
@@ -29,8 +29,10 @@ from composing.schema import (
 )
 from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
+from dreamer_racing.envs.imu import load_imu
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.simulator.scene import Camera, frame_interval
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.losses import (
@@ -56,6 +58,8 @@ from dreamer_racing.training.schedule import RampClock
 PPO_ACTORS = "loss.actor=ppo, flown_ppo, latent_ppo or asymmetric_ppo"
 RACE_ONLY = (
     "env.control_rate",
+    "env.camera_rate",
+    "env.imu",
     "env.start_beyond_gate",
     "env.start_at_gate",
     "env.start_on_line",
@@ -181,6 +185,10 @@ def check(config: RunConfig) -> None:
         raise ValueError(f"env.device={config.env.device} is for races: env.suite={config.env.suite} runs on cpu.")
     if config.env.looks != "nominal" and not (is_race(config) and config.env.from_pixels):
         raise ValueError(f"env.looks={config.env.looks} is for races seen in images: leave it at nominal.")
+    if config.env.camera_rate is not None and is_race(config) and not config.env.from_pixels:
+        raise ValueError(
+            f"env.camera_rate={config.env.camera_rate:g} is of images: leave it out of a run from numbers."
+        )
     if is_race(config):
         check_race(config)
         return
@@ -199,6 +207,8 @@ def check_race(config: RunConfig) -> None:
     track = track_as_begun(config)
     for group, check_it in (
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
+        ("env", lambda: frame_interval(Camera(rate=config.env.camera_rate), config.env.control_rate)),
+        ("env", lambda: load_imu(worlds_of(config)["imu"], config.env.from_pixels)),
         ("env", lambda: GateSweeper(track, miss_radius=config.env.miss_radius)),
         ("evaluation", lambda: StartSampler(track, start_noise=config.evaluation.start_noise)),
     ):

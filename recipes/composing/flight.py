@@ -314,6 +314,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
         thrust,
         config.arm_channel,
         rate,
+        imu=contract.get("imu") is not None,
     )
 
 

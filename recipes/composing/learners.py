@@ -65,7 +65,7 @@ def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment)
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
-        for name in ("env.control_rate", "env.camera_tilt"):
+        for name in ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu"):
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")

@@ -28,6 +28,10 @@ class EnvConfig:
     preset: str = "easy"  # physics: easy | faithful
     num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
     control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
+    # frames a second, Hz, control_rate divided by a whole number; null: one at every control step
+    camera_rate: float | None = setting(None, POSITIVE)
+    # gyro and accelerometer, seen beside the images: none | exact | noisy
+    imu: str = "none"
     # control steps of a training episode; null: those of 20 s, with env=dmc those of the task
     episode_steps: int | None = setting(None, COUNT)
     # share of training episodes, but for those on a line, that begin behind a gate, to practise turns

@@ -533,7 +533,7 @@ def spoil_input(number: int, key: str, value: object):
         (Path.unlink, FileNotFoundError, "contract.json"),
         (lambda path: path.write_text("{"), ValueError, "not valid JSON"),
         (lambda path: path.write_text("[]"), ValueError, "format None"),
-        (spoil("format_version", 2), ValueError, "version 2"),
+        (spoil("format_version", 3), ValueError, "version 3.* versions 1 and 2"),
         (spoil("files", {"onnx": {"name": "actor.onnx", "sha256": "0"}}), ValueError, "SHA-256"),
         (spoil("outputs", [{"name": "thrust", "shape": [1, 4], "type": "f"}]), ValueError, "promises .*thrust"),
         (spoil("files", {"onnx": 3}), ValueError, "files.onnx is 3, not an object"),

@@ -168,10 +168,12 @@ def test_an_agent_is_a_folder_of_its_own(shipped: Path) -> None:
         ({"camera": Camera(64, 64, tilt=30.0)}, "env.image_size=64: .*env.image_size=32"),
         ({"camera": Camera(32, 32, tilt=25.0)}, "env.camera_tilt=25.0: .*env.camera_tilt=30.0"),
         ({"camera": Camera(32, 32, 80.0, 30.0)}, "camera.vertical_field_of_view_deg=80.0: .*=90.0"),
+        ({"camera_rate": 12.5}, "env.camera_rate=12.5: .*env.camera_rate=None"),
         ({"control_rate": 50.0}, "env.control_rate=50.0: .*round was trained with env.control_rate=25.0"),
+        ({"imu": "noisy"}, "env.imu=exact: .*env.imu=none"),
         ({"from_pixels": False}, "env.from_pixels=False: .*env.from_pixels=True"),
     ],
-    ids=["image size", "tilt", "view", "control rate", "numbers"],
+    ids=["image size", "tilt", "view", "camera rate", "control rate", "imu", "numbers"],
 )
 def test_another_environment_is_refused(other: dict, message: str, shipped: Path) -> None:
     env = DroneRacingEnv(**WORLDS | other)
@@ -183,7 +185,7 @@ def test_another_environment_is_refused(other: dict, message: str, shipped: Path
 def described(contract: dict, **camera: object) -> SimpleNamespace:
     """What `check_env` looks at of an environment that is as a contract describes it, but for its camera."""
     parameters = SimpleNamespace(control_dt=1.0 / contract["control"]["rate_hz"])
-    worlds = SimpleNamespace(parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera))
+    worlds = SimpleNamespace(parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera), imu=None)
     return SimpleNamespace(from_pixels=True, worlds=worlds)
 
 
@@ -194,6 +196,16 @@ def test_an_agent_of_any_tilt_flies_with_its_own_only(tilt: float, shipped: Path
     check_env(shipped, contract, described(contract, tilt=tilt + 1e-12))
     with pytest.raises(ValueError, match="env.camera_tilt="):
         check_env(shipped, contract, described(contract, tilt=tilt + 0.01))
+
+
+def test_a_slow_camera_is_in_the_contract_of_a_version_of_its_own(shipped: Path, env: DroneRacingEnv) -> None:
+    camera = replace(env.worlds.camera, rate=12.5)
+    contract = make_contract(ActorStep(make_agent()), env.worlds.parameters, camera)
+    assert (contract["format_version"], contract["camera"]["rate_hz"]) == (2, 12.5)
+    check_env(shipped, contract, described(contract, rate=12.5))
+    with pytest.raises(ValueError, match="env.camera_rate=None: .*env.camera_rate=12.5"):
+        check_env(shipped, contract, described(contract))
+    assert read_contract(shipped / CONTRACT)["format_version"] == 1
 
 
 @pytest.mark.parametrize("side", ["width", "height"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,7 @@ def test_images_are_those_of_training(camera):
 def test_a_contract_gives_its_camera_back():
     camera = Camera(width=96, height=48, field_of_view=75.0, tilt=-5.0, position=(0.2, 0.01, 0.0))
     assert camera_of({"camera": describe_camera(camera)}) == camera
+    assert camera_of({"camera": describe_camera(replace(camera, rate=25.0))}) == replace(camera, rate=25.0)
     with pytest.raises(ValueError, match="trained on numbers, not on images"):
         camera_of({"camera": None})
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.hil.battery import BatteryConfig, Reading
 from dreamer_racing.hil.camera import NoseCamera
@@ -208,6 +209,39 @@ def test_poses_are_lost_to_cut_within_200_ms_at_25_hz_by_an_actor_that_takes_30_
     last_armed = max(moment for moment, command in plant.sent if command.armed)
     cut = min(moment for moment, command in plant.sent if moment > last_armed)
     assert 0.15 < cut - measured[-1] <= 0.195
+
+
+def test_a_slow_camera_is_drawn_at_its_frames_and_shown_between_them(monkeypatch):
+    """The flight begins with a frame; the ticks of its loop, two to a frame, see the same one."""
+    plant, drawn = Watched(CIRCLE), []
+
+    class Seeing(Hover):
+        camera = Camera(32, 32, rate=25.0)
+        seen: ClassVar[list] = []
+
+        def reset(self):
+            self.seen.clear()
+
+        def act(self, pose, image, target_gate):
+            self.seen.append((pose, image))
+            return Setpoint(GRAVITY + 0.5, np.zeros(3))
+
+    see = NoseCamera.see
+    monkeypatch.setattr(NoseCamera, "see", lambda self, pose: drawn.append(pose) or see(self, pose))
+    flyer = Seeing()
+    chain = make_chain(flyer, plant.plant.vehicle, ChainConfig(SafetyLimits.of_track(CIRCLE), arm=True))
+    loop = plant.fly(chain, 50.0, 2.0)
+    poses, images = zip(*flyer.seen, strict=True)
+    assert len(images) > 20, loop
+    first = images[::2]
+    assert all(one is other for one, other in zip(first, images[1::2], strict=False))
+    assert not any(np.array_equal(one, other) for one, other in pairwise(first))
+    assert [pose.time for pose in drawn[-len(first) :]] == [pose.time for pose in poses[::2]]
+    assert np.array_equal(NoseCamera(CIRCLE, Seeing.camera).see(poses[0]), images[0])
+    chain.close()
+    Seeing.camera = Camera(32, 32, rate=30.0)
+    with pytest.raises(ValueError, match=r"camera_rate=30 Hz: .* 25 or 50 are the nearest"):
+        make_chain(Seeing(), plant.plant.vehicle, ChainConfig(SafetyLimits.of_track(CIRCLE)))
 
 
 @pytest.mark.parametrize("armed", [True, False])

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.drone.rotation import rotate_inverse
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.looks import Looks, LooksSampler
 
@@ -72,6 +73,7 @@ class Simulator(ABC):
         velocity = torch.nn.functional.pad(linear_velocity.to(self.dtype), (0, 3))
         self._qpos.copy_(torch.where(rows, pose, self._qpos))
         self._qvel.copy_(torch.where(rows, velocity, self._qvel))
+        self._flight.qvel_before.copy_(torch.where(rows, velocity, self._flight.qvel_before))
         self.quadrotor.reset(mask)
         if self.looks is not None:
             self.looks.reset(mask)
@@ -84,6 +86,17 @@ class Simulator(ABC):
         """
         self.quadrotor.command(action)
         return self._flight.fly()
+
+    def feel(self) -> Tensor:
+        """What gyro and accelerometer in each drone's centre show: body rates and specific force (N, 6).
+
+        In rad/s and m/s², body frame, (0, 0, 9.81) at rest; of the last physics step, and where a drone was put, of one
+        that is not accelerated.
+        """
+        change = self.state.linear_velocity - self._flight.qvel_before[:, :3]
+        change[:, 2] += GRAVITY * self.parameters.physics_dt
+        force = rotate_inverse(self.state.attitude, change / self.parameters.physics_dt)
+        return torch.cat((self.state.body_rates, force), dim=1)
 
     def _frames(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Looks | None]:
         """Positions (M, 3), attitudes (M, 4) and looks of all worlds, or of M rows."""

@@ -45,6 +45,9 @@ class FusedFlight:
         qvel: (N, 6) likewise.
         qfrc_applied: (N, 6) likewise: force in the world frame, torque in the body frame.
         integrate: makes one physics step with the present `qfrc_applied`.
+
+    Attributes:
+        qvel_before: (N, 6) as it was before the last physics step.
     """
 
     def __init__(
@@ -55,7 +58,7 @@ class FusedFlight:
         steps, num_drones = quadrotor.parameters.physics_steps, len(qpos)
         self._device, self._integrate, self._position = qpos.device, integrate, qpos[:, :3]
         self._path = torch.empty(steps + 1, num_drones, 3, dtype=qpos.dtype, device=qpos.device)
-        before = torch.empty_like(qvel, memory_format=torch.contiguous_format)
+        self.qvel_before = before = torch.zeros_like(qvel, memory_format=torch.contiguous_format)
         drones = quadrotor.own_parameters()
         arrays = [warp.from_torch(tensor) for tensor in (qpos, qvel, quadrotor.rotor_speed, quadrotor.setpoints)]
         own = [warp.from_torch(tensor) for tensor in drones]

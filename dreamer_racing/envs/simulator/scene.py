@@ -8,7 +8,7 @@ Dimensions of the hall, colours and the camera's mount are this project's choice
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -20,6 +20,7 @@ from dreamer_racing.settings import (
     FINITE,
     POSITIVE,
     check_numbers,
+    check_setting,
     check_settings,
     check_three,
     quoted,
@@ -52,6 +53,8 @@ class Camera:
         position: mount in the body frame, m.
         near: what is nearer is not drawn, m.
         far: what is farther is not drawn, m.
+        rate: frames a second, Hz, a whole number of control steps each, see `frame_interval`; if None, one at every
+            control step.
 
     Raises:
         ValueError: the message gives the number, and what is allowed.
@@ -64,6 +67,7 @@ class Camera:
     position: tuple[float, float, float] = (0.10, 0.0, 0.02)
     near: float = setting(0.01, POSITIVE)
     far: float = setting(100.0, POSITIVE)
+    rate: float | None = setting(None, POSITIVE)
 
     def __post_init__(self) -> None:
         whole, real = ("width", "height"), ("field_of_view", "tilt", "near", "far")
@@ -76,15 +80,48 @@ class Camera:
             raise ValueError(f"camera.near={self.near}: must be below camera.far={self.far}.")
 
 
-def load_camera(camera: Camera | None) -> Camera:
-    """Return the camera, the default one if None.
+def load_camera(camera: Camera | None, rate: float | None = None, from_pixels: bool = True) -> Camera:
+    """Return the camera, the default one if None, with another rate of frames, Hz, where one is given.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is none, or has no such rate, or there is one and nobody sees images.
     """
     if not (camera is None or isinstance(camera, Camera)):
         raise ValueError(f"camera={quoted(camera)}: must be a Camera, for instance Camera(tilt=25).")
-    return camera or Camera()
+    camera = camera or Camera()
+    if rate is None:
+        return camera
+    if not from_pixels:
+        raise ValueError(f"camera_rate={quoted(rate)}: is of images, and from_pixels=False shows none: leave it out.")
+    check_setting("camera_rate", rate, POSITIVE)
+    return replace(camera, rate=rate)
+
+
+def frame_interval(camera: Camera, control_rate: float) -> int:
+    """Return the control steps from one frame of a camera to the next, where control runs at a rate, Hz.
+
+    Raises:
+        ValueError: a frame would fall between two control steps; the message names the nearest rates that do not.
+
+    Example:
+        >>> frame_interval(Camera(rate=25), control_rate=100)
+        4
+    """
+    if camera.rate is None:
+        return 1
+    steps = control_rate / camera.rate
+    if steps < 1 - 1e-6:
+        raise ValueError(
+            f"camera_rate={camera.rate:g} Hz: at most control_rate={control_rate:g}, for an image is looked at once in "
+            "a control step."
+        )
+    if abs(steps - round(steps)) > 1e-6 * steps:
+        slower, faster = control_rate / math.ceil(steps), control_rate / math.floor(steps)
+        raise ValueError(
+            f"camera_rate={camera.rate:g} Hz: must be control_rate={control_rate:g} divided by a whole number, so that "
+            f"every frame is shown for as many control steps: {slower:g} or {faster:g} are the nearest."
+        )
+    return round(steps)
 
 
 def build_drone(parameters: QuadrotorParameters) -> mujoco.MjSpec:

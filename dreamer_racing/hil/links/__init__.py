@@ -1,13 +1,13 @@
 """Links to vehicles, by name.
 
-| name | goes over | says | needs | hears the battery by |
-|---|---|---|---|---|
-| ``udp``, ``simulated`` | UDP | setpoints in SI units | port | |
-| ``betaflight_sitl`` | UDP | channels | rates, thrust | |
-| ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR |
-| ``sbus`` | serial port | channels | device, rates, thrust | |
-| ``msp`` | serial port | channels | device, rates, thrust | BATTERY_STATE, which it asks for |
-| ``mavlink`` | UDP, or serial port | body rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS |
+| name | goes over | says | needs | hears the battery by | and the IMU |
+|---|---|---|---|---|---|
+| ``udp``, ``simulated`` | UDP | setpoints in SI units | port | | `hil.imu` |
+| ``betaflight_sitl`` | UDP | channels | rates, thrust | | RAW_IMU, which it asks for by MSP |
+| ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR | |
+| ``sbus`` | serial port | channels | device, rates, thrust | | |
+| ``msp`` | serial port | channels | device, rates, thrust | BATTERY_STATE, which it asks for | RAW_IMU, likewise |
+| ``mavlink`` | UDP, or serial port | rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS | two |
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from dataclasses import dataclass
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
-from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
+from dreamer_racing.hil.links.msp import BATTERY_REQUEST, G_COUNTS_SITL, IMU_REQUEST, MspTelemetry, encode_msp
 from dreamer_racing.hil.links.sbus import encode_sbus
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
-from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
+from dreamer_racing.hil.links.sitl import RC_PORT, FeelingTransport, encode_sitl
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
@@ -41,6 +41,7 @@ class LinkConfig:
         rates: What the flight controller makes of the sticks.
         thrust: What motors and battery make of the throttle.
         arm_channel: Index of the channel that arms, 4 for AUX1.
+        imu: Whether what the IMU tells is to be heard.
         rate: Commands a second, to refuse a serial port that is too slow for them; None: whatever comes.
 
     Raises:
@@ -56,6 +57,7 @@ class LinkConfig:
     thrust: ThrustMap | None = None
     arm_channel: int = FIRST_SWITCH
     rate: float | None = None
+    imu: bool = False
 
     def __post_init__(self) -> None:
         check_arm_channel(self.arm_channel)
@@ -79,6 +81,11 @@ def make_link(config: LinkConfig) -> TransportLink:
         raise ValueError(
             f"device={config.device} is for {', '.join(PROTOCOLS)}, and link={config.name} goes over UDP: choose one "
             "of those, or leave device= out."
+        )
+    if config.imu and config.name not in FEELING:
+        raise ValueError(
+            f"link={config.name} does not bring back what the IMU tells, and the actor flies by it: the links that do "
+            f"are {', '.join(FEELING)}."
         )
     link = LINKS[config.name](config)
     try:
@@ -105,24 +112,38 @@ def _check_speed(link: TransportLink, config: LinkConfig) -> None:
 
 
 def _udp(config: LinkConfig) -> TransportLink:
-    return UdpLink(config.host, _port(config))
+    return UdpLink(config.host, _port(config), config.imu)
 
 
 def _betaflight_sitl(config: LinkConfig) -> TransportLink:
     rates, thrust = _maps(config)
-    return ChannelLink(_datagrams(config, RC_PORT), encode_sitl, rates, thrust, config.arm_channel)
+    channels, telemetry = UdpTransport(config.host, _port(config, RC_PORT)), None
+    transport: Transport = channels
+    if config.imu:
+        transport, telemetry = FeelingTransport(channels, config.host), MspTelemetry(G_COUNTS_SITL)
+    return ChannelLink(transport, encode_sitl, rates, thrust, config.arm_channel, telemetry)
 
 
 def _radio(
     encode: Callable[[Sequence[float]], bytes],
     telemetry: Callable[[], Telemetry | None] = lambda: None,
     request: bytes = b"",
+    imu_request: bytes = b"",
 ) -> Callable[[LinkConfig], TransportLink]:
     """Return what makes the link of a radio's receiver at a serial port."""
 
     def make(config: LinkConfig) -> TransportLink:
         rates, thrust = _maps(config)
-        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel, telemetry(), request)
+        return ChannelLink(
+            _wire(config),
+            encode,
+            rates,
+            thrust,
+            config.arm_channel,
+            telemetry(),
+            request,
+            imu_request if config.imu else b"",
+        )
 
     return make
 
@@ -138,13 +159,16 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "betaflight_sitl": _betaflight_sitl,
     "crsf": _radio(encode_crsf, CrsfTelemetry),
     "sbus": _radio(encode_sbus),
-    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST),
+    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST, IMU_REQUEST),
     "mavlink": _mavlink,
 }
 """What makes a link, by its name."""
 
 HEARING = ("crsf", "msp", "mavlink")
 """Links that hear of the battery."""
+
+FEELING = ("udp", "simulated", "betaflight_sitl", "msp", "mavlink")
+"""Links that hear what the IMU tells."""
 
 
 def _maps(config: LinkConfig) -> tuple[RateMap, ThrustMap]:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from dreamer_racing.hil.battery import Reading
+from dreamer_racing.hil.imu import ImuReading
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, channels
 from dreamer_racing.hil.vehicle import Command, at_rest
@@ -69,6 +70,7 @@ class TransportLink(ABC):
         self.thrust = thrust
         self._transport, self._telemetry = transport, telemetry
         self._armed = False  # whether the last command was
+        self._felt: list[ImuReading] = []
 
     @property
     def rejected(self) -> int:
@@ -83,8 +85,17 @@ class TransportLink(ABC):
         """
         if self._telemetry is None:
             return []
-        arrived = self._transport.read()
-        return [Reading(time, voltage) for time, data in arrived for voltage in self._telemetry.read(data)]
+        readings = []
+        for time, data in self._transport.read():
+            readings += [Reading(time, voltage) for voltage in self._telemetry.read(data)]
+            self._felt += [ImuReading(time, sample) for sample in self._telemetry.felt]
+            self._telemetry.felt.clear()
+        return readings
+
+    def feel(self) -> list[ImuReading]:
+        """Return what the vehicle's IMU told until the last `listen`, oldest first."""
+        felt, self._felt = self._felt, []
+        return felt
 
     def reckon_with(self, voltage: float) -> None:
         """Let the thrust map reckon with a voltage, V, from now on, or with the nearest that it can (`ThrustMap.at`).
@@ -141,6 +152,7 @@ class ChannelLink(TransportLink):
         arm_channel: Index of the switch that arms, see `channels`.
         telemetry: See `TransportLink`.
         request: Asks for telemetry; goes out with the first of every `ASK_EVERY` commands.
+        always: Asks for what is wanted at each command.
     """
 
     thrust: ThrustMap
@@ -154,14 +166,15 @@ class ChannelLink(TransportLink):
         arm_channel: int = FIRST_SWITCH,
         telemetry: Telemetry | None = None,
         request: bytes = b"",
+        always: bytes = b"",
     ) -> None:
         super().__init__(transport, thrust, telemetry)
         self._encode_channels, self._rates, self._arm_channel = encode_channels, rates, arm_channel
-        self._request, self._encoded = request, 0
+        self._request, self._always, self._encoded = request, always, 0
 
     def encode(self, command: Command) -> bytes:
         """Return the frame of a command, and the request where that is due."""
         frame = self._encode_channels(channels(command, self._rates, self.thrust, self._arm_channel))
         due = self._encoded % ASK_EVERY == 0
         self._encoded += 1
-        return frame + self._request if due else frame
+        return frame + (self._request if due else b"") + self._always

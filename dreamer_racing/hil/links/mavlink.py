@@ -9,7 +9,9 @@ it counts in every mode, so none is sent before this link has armed the vehicle:
 Thrust is sent as the motors' command (`ThrustMap.to_motor`), which PX4 passes on as it is with ``THR_MDL_FAC = 0``.
 
 The battery's voltage comes back in BATTERY_STATUS (``id`` 0; mV of each cell, 65535 for those that are not there; a
-voltage that is only known as a whole stands in the first) or in SYS_STATUS (mV; 65535: not known).
+voltage that is only known as a whole stands in the first) or in SYS_STATUS (mV; 65535: not known). Gyro and
+accelerometer come back in HIGHRES_IMU (rad/s, m/s², FRD) or SCALED_IMU (mrad/s, mG): the vehicle must be set to send
+one of them as often as commands come.
 
 Reference: mavlink.io/en/messages/common.html.
 """
@@ -22,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from dreamer_racing.hil.imu import make_sample
 from dreamer_racing.hil.links.link import Transport, TransportLink
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.mavlink_messages import import_messages
@@ -32,6 +35,8 @@ IGNORE_ATTITUDE = 128
 """ATTITUDE_TARGET_TYPEMASK: rates and thrust count, the attitude does not."""
 FORCE = 21196.0
 """Second number of COMPONENT_ARM_DISARM: disarm wherever the vehicle is."""
+STANDARD_GRAVITY = 9.80665
+"""m/s², of a G in SCALED_IMU."""
 UNKNOWN = 65535
 """mV, of a voltage that is not known."""
 _LONGEST = Setpoint(GRAVITY, np.ones(3))  # zeros at a message's end are left out on the wire
@@ -103,7 +108,7 @@ class MavlinkLink(TransportLink):
 
 
 class MavlinkTelemetry(Telemetry):
-    """Reads BATTERY_STATUS, of the first battery, and SYS_STATUS, by pymavlink.
+    """Reads BATTERY_STATUS, of the first battery, SYS_STATUS, and the IMU's messages, by pymavlink.
 
     Args:
         system: Number of the vehicle: what others say is passed over.
@@ -123,6 +128,10 @@ class MavlinkTelemetry(Telemetry):
         voltages = []
         for message in self._parser.parse_buffer(data) or []:
             kind = message.get_type()
+            if kind in SAMPLES and message.get_srcSystem() == self._system:
+                sample = SAMPLES[kind](message)
+                self.rejected += sample is None
+                self.felt += [] if sample is None else [sample]
             if kind == "BAD_DATA":
                 self.rejected += 1
             elif message.get_srcSystem() == self._system and kind in VOLTAGES and not _is_another(message):
@@ -151,3 +160,18 @@ VOLTAGES: dict[str, Callable[[Any], float | None]] = {
     "SYS_STATUS": _of_sys_status,
 }
 """What reads the voltage, V, of a message by its name; None: it says nothing of it."""
+
+
+def _of_imu(message: Any, gyro: float, force: float) -> np.ndarray | None:
+    """Return a sample, FLU, of FRD numbers in units of so many rad/s and m/s²."""
+    return make_sample(
+        (gyro * message.xgyro, -gyro * message.ygyro, -gyro * message.zgyro),
+        (force * message.xacc, -force * message.yacc, -force * message.zacc),
+    )
+
+
+SAMPLES: dict[str, Callable[[Any], np.ndarray | None]] = {
+    "HIGHRES_IMU": lambda message: _of_imu(message, 1.0, 1.0),
+    "SCALED_IMU": lambda message: _of_imu(message, 1e-3, 1e-3 * STANDARD_GRAVITY),
+}
+"""What reads the IMU's message by its name; None: its numbers are none."""

@@ -1,19 +1,23 @@
-"""What comes back from a vehicle, as far as it is read: the voltage of its battery."""
+"""What comes back from a vehicle, as far as it is read: the voltage of its battery, and what its IMU tells."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 
 class Telemetry(ABC):
-    """Finds battery voltages in bytes that arrive in pieces. Frames of other kinds are passed over.
+    """Finds battery voltages and samples of an IMU in bytes that arrive in pieces. Other frames are passed over.
 
     Attributes:
+        felt: Samples (6,) of the IMU that have been found, oldest first, see `hil.imu`; whoever takes them clears it.
         rejected: Frames so far that were damaged or say no voltage, and stretches of bytes that were no frame.
     """
 
     def __init__(self) -> None:
         self.rejected = 0
+        self.felt: list[np.ndarray] = []
 
     @abstractmethod
     def read(self, data: bytes) -> list[float]:
@@ -47,6 +51,14 @@ class FrameTelemetry(Telemetry):
     def voltage(self, frame: bytes) -> float | None:
         """Return what a frame that speaks of the battery says, V; None if it is too short, or there is no battery."""
 
+    def is_imu(self, frame: bytes) -> bool:
+        """Whether a whole frame speaks of the IMU."""
+        return False
+
+    def sample(self, frame: bytes) -> np.ndarray | None:
+        """Return what a frame that speaks of the IMU says, (6,); None if it is too short, or there is none."""
+        raise NotImplementedError(f"{type(self).__name__} reads no IMU.")
+
     def read(self, data: bytes) -> list[float]:
         """Take in bytes; return the voltages in them, V, oldest first."""
         self._buffer += data
@@ -67,4 +79,8 @@ class FrameTelemetry(Telemetry):
                 voltage = self.voltage(frame)
                 self.rejected += voltage is None
                 voltages += [] if voltage is None else [voltage]
+            elif self.is_imu(frame):
+                sample = self.sample(frame)
+                self.rejected += sample is None
+                self.felt += [] if sample is None else [sample]
         return voltages

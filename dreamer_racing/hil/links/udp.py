@@ -18,7 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dreamer_racing.hil.imu import decode_imu
 from dreamer_racing.hil.links.link import TransportLink
+from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.vehicle import Command, Setpoint
 
 MAGIC = b"DRC1"
@@ -133,12 +135,24 @@ class UdpTransport:
         self._socket.close()
 
 
+class PacketTelemetry(Telemetry):
+    """Reads the packets of `hil.imu`, one a datagram."""
+
+    def read(self, data: bytes) -> list[float]:
+        """Take in a datagram; there are no voltages in it."""
+        sample = decode_imu(data)
+        self.rejected += sample is None
+        self.felt += [] if sample is None else [sample]
+        return []
+
+
 class UdpLink(TransportLink):
     """Sends command packets to a vehicle that takes setpoints as they are.
 
     Args:
         host: Name or address.
         port: Where it listens.
+        imu: Whether to hear what its IMU tells.
 
     Raises:
         OSError: There is no such host.
@@ -150,8 +164,8 @@ class UdpLink(TransportLink):
         >>> link.close()
     """
 
-    def __init__(self, host: str, port: int) -> None:
-        super().__init__(UdpTransport(host, port))
+    def __init__(self, host: str, port: int, imu: bool = False) -> None:
+        super().__init__(UdpTransport(host, port), telemetry=PacketTelemetry() if imu else None)
         self._sequence = 0
 
     def encode(self, command: Command) -> bytes:

@@ -1,0 +1,77 @@
+"""What a flight controller's gyro and accelerometer tell: readings, and the packet in which a plant sends them.
+
+A sample is (6,): body rates in rad/s, then specific force in m/s², +9.81 upwards at rest; body frame FLU. The packet,
+little endian, 68 bytes: ``b"DRI1"``, sequence number u32, the sender's time f64 (s), six f64, and CRC-32 u32 of all
+before it.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from dreamer_racing.envs.drone.parameters import GRAVITY
+
+MAGIC = b"DRI1"
+_BODY = struct.Struct("<4sId6d")
+_CHECK = struct.Struct("<I")
+PACKET_SIZE = _BODY.size + _CHECK.size
+"""Bytes of a packet: 68."""
+
+LARGEST = 1e4
+"""rad/s or m/s² beyond which a number is no measurement of a drone [choice]."""
+
+AT_REST = 0.25
+"""Share of its weight by which the specific force of what stands still may differ from it [choice]: one of another
+scale is off by a half at least."""
+
+
+class ImuReading(NamedTuple):
+    """A sample and when it arrived.
+
+    Args:
+        time: s, ``time.monotonic``.
+        sample: (6,) body rates, rad/s, and specific force, m/s², FLU.
+    """
+
+    time: float
+    sample: np.ndarray
+
+
+def make_sample(rates: tuple[float, ...], force: tuple[float, ...]) -> np.ndarray | None:
+    """Return a sample (6,); None if a number is not plausible."""
+    sample = np.array((*rates, *force), float)
+    return sample if bool((np.abs(sample) <= LARGEST).all()) else None
+
+
+def encode_imu(sequence: int, stamp: float, sample: np.ndarray) -> bytes:
+    """Return the bytes of a packet."""
+    body = _BODY.pack(MAGIC, sequence % 2**32, stamp, *(float(number) for number in sample))
+    return body + _CHECK.pack(zlib.crc32(body))
+
+
+def decode_imu(data: bytes) -> np.ndarray | None:
+    """Return the sample of a packet; None if it is none: of another size or kind, damaged, or not plausible."""
+    if (
+        len(data) != PACKET_SIZE
+        or data[:4] != MAGIC
+        or _CHECK.unpack_from(data, _BODY.size)[0] != zlib.crc32(data[: _BODY.size])
+    ):
+        return None
+    _, _, _, *numbers = _BODY.unpack_from(data)
+    return make_sample(tuple(numbers[:3]), tuple(numbers[3:]))
+
+
+def unlike_rest(sample: np.ndarray) -> str | None:
+    """Say what of a sample is not as where a vehicle stands still; None if it is."""
+    force = float(np.linalg.norm(sample[3:]))
+    if math.isfinite(force) and abs(force - GRAVITY) <= AT_REST * GRAVITY:
+        return None
+    return (
+        f"its accelerometer shows {force:.3g} m/s² where it stands, and not {GRAVITY}: is it calibrated, and its "
+        "message of another scale?"
+    )

@@ -1,0 +1,180 @@
+"""Cameras slower than control, by every front door: one frame for so many control steps, and none drawn in between."""
+
+from __future__ import annotations
+
+import copy
+from itertools import pairwise
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from dreamer_racing.envs.dm_control_env import load
+from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
+from dreamer_racing.envs.sb3_env import DroneRaceVecEnv
+from dreamer_racing.envs.simulator.scene import Camera, frame_interval
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.worlds import RaceWorlds
+
+STEPS, EVERY = 7, 4
+ACTION = np.array([-0.1, 0.1, -0.1, 0.2], np.float32)
+OPTIONS = {"preset": "faithful", "control_rate": 100.0, "camera": Camera(32, 32), "seed": 3}
+CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+
+
+def flown(num_envs: int, **arguments) -> Tensor:
+    """Images (T, N, H, W, 3) of a reset and the control steps after it."""
+    worlds = RaceWorlds("circle", num_envs, **{**OPTIONS, **arguments})
+    worlds.reset()
+    images = [worlds.render()]
+    for _ in range(STEPS):
+        worlds.step(torch.from_numpy(ACTION).expand(num_envs, 4).to(worlds.device))
+        images.append(worlds.render())
+    worlds.close()
+    return torch.stack(images).cpu()
+
+
+def held(images: Tensor) -> Tensor:
+    """What a camera shows that takes every fourth of such images."""
+    return torch.stack([images[step - step % EVERY] for step in range(len(images))])
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_a_frame_is_shown_until_the_next_one(device: str) -> None:
+    fast = flown(3, device=device)
+    assert not any(torch.equal(one, other) for one, other in pairwise(fast))
+    assert torch.equal(flown(3, device=device, camera_rate=25.0), held(fast))
+    assert torch.equal(flown(3, device=device, camera=Camera(32, 32, rate=25.0)), held(fast))
+    assert torch.equal(flown(3, device=device, camera_rate=100.0), fast)
+
+
+def test_what_is_not_shown_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = DroneRacingEnv("circle", 3, camera_rate=25.0, **OPTIONS)
+    drawn: list[int] = []
+    draw = env.worlds.simulator.render
+    monkeypatch.setattr(env.worlds.simulator, "render", lambda rows: drawn.append(1) or draw(rows))
+    env.rollout(2 * EVERY)
+    env.close()
+    assert len(drawn) == 1 + 2
+
+
+def test_a_new_episode_begins_with_a_frame_of_its_own_and_the_others_keep_theirs() -> None:
+    env = DroneRacingEnv("circle", 3, camera_rate=25.0, **OPTIONS)
+    data = env.reset()
+    action = torch.from_numpy(ACTION).expand(3, 4).clone()
+    for _ in range(EVERY + 1):
+        data = env.step(data.set("action", action))["next"].exclude("reward")
+    before = data["pixels"].clone()
+    data["done"][1] = True
+    begun = env.maybe_reset(data)["pixels"]
+    assert torch.equal(begun[[0, 2]], before[[0, 2]])
+    assert not torch.equal(begun[1], before[1])
+    assert torch.equal(begun[1], env.worlds.simulator.render()[1])
+    # the next frame is of all cameras
+    for expected in (False, False, True):
+        shown = env.step(data.set("action", action))["next", "pixels"]
+        assert torch.equal(shown, env.worlds.simulator.render()) is expected
+    env.close()
+
+
+def test_the_randomised_noise_of_a_frame_is_held_too() -> None:
+    images = flown(2, camera_rate=25.0, looks="randomised")
+    assert torch.equal(images, held(images))
+
+
+def test_state_dict_goes_on_with_the_frame_that_is_shown() -> None:
+    env = DroneRacingEnv("circle", 2, camera_rate=25.0, **OPTIONS)
+    env.rollout(EVERY + 2)
+    state = copy.deepcopy(env.state_dict())
+    action = torch.from_numpy(ACTION).expand(2, 4)
+
+    def fly(env: DroneRacingEnv) -> Tensor:
+        images = []
+        for _ in range(EVERY):
+            env.worlds.step(action)
+            images.append(env.worlds.render())
+        return torch.stack(images)
+
+    other = DroneRacingEnv("circle", 2, camera_rate=25.0, **OPTIONS)
+    other.load_state_dict(state)
+    assert torch.equal(other.worlds.render(), env.worlds.render())
+    assert torch.equal(fly(other), fly(env))
+    fast = DroneRacingEnv("circle", 2, **OPTIONS)
+    with pytest.raises(ValueError, match="another camera_rate"):
+        fast.load_state_dict(state)
+    for each in (env, other, fast):
+        each.close()
+
+
+def test_every_front_door_shows_the_same() -> None:
+    expected = held(flown(1))[:, 0].numpy()
+    options = {**OPTIONS, "camera_rate": 25.0}
+
+    env = DroneRacingEnv("circle", 1, **options)
+    check_env_specs(env)
+    env.set_seed(3)
+    seen = [env.reset()["pixels"][0].numpy()]
+    act = env.fake_tensordict().set("action", torch.from_numpy(ACTION)[None])
+    seen += [env.step(act.clone())["next", "pixels"][0].numpy() for _ in range(STEPS)]
+    env.close()
+    assert np.array_equal(seen, expected)
+
+    single = gymnasium.make("dreamer_racing/Circle-v0", **options)
+    seen = [single.reset(seed=3)[0], *(single.step(ACTION)[0] for _ in range(STEPS))]
+    single.close()
+    assert np.array_equal(seen, expected)
+
+    vector = DroneRaceVectorEnv(1, "circle", **options)
+    seen = [vector.reset(seed=3)[0][0], *(vector.step(ACTION[None])[0][0] for _ in range(STEPS))]
+    vector.close()
+    assert np.array_equal(seen, expected)
+
+    several = DroneRaceVecEnv("circle", 1, **options)
+    several.seed(3)
+    seen = [several.reset()[0], *(several.step(ACTION[None])[0][0] for _ in range(STEPS))]
+    several.close()
+    assert np.array_equal(seen, expected)
+
+
+def test_dm_control_holds_its_frames() -> None:
+    def images(camera_rate: float | None) -> np.ndarray:
+        env = load("circle", "faithful", random=0, from_pixels=True, control_rate=100.0, camera_rate=camera_rate)
+        seen = [env.reset(), *(env.step(ACTION) for _ in range(STEPS))]
+        return np.stack([step.observation["pixels"] for step in seen])
+
+    fast = images(None)
+    assert not np.array_equal(fast[0], fast[1])
+    assert np.array_equal(images(25.0), held(torch.from_numpy(fast)).numpy())
+
+
+@pytest.mark.parametrize(
+    ("camera_rate", "control_rate", "steps"), [(25, 50, 2), (30, 60, 2), (None, 50, 1), (50, 50, 1), (100 / 3, 100, 3)]
+)
+def test_frames_fall_on_control_steps(camera_rate: float | None, control_rate: float, steps: int) -> None:
+    assert frame_interval(Camera(rate=camera_rate), control_rate) == steps
+
+
+@pytest.mark.parametrize(
+    ("camera_rate", "words"),
+    [
+        (30, "camera_rate=30 Hz: must be control_rate=50 divided by a whole number.*: 25 or 50 are the nearest"),
+        (60, "camera_rate=60 Hz: at most control_rate=50"),
+        (0, "camera_rate=0: must be above 0"),
+        ("25", "camera_rate='25': must be a number"),
+        (float("nan"), "camera_rate=nan: must be above 0"),
+    ],
+)
+def test_other_rates_are_refused(camera_rate: object, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        DroneRacingEnv("circle", 1, camera_rate=camera_rate)
+    with pytest.raises(ValueError, match=words):
+        load("circle", from_pixels=True, camera_rate=camera_rate)
+
+
+def test_without_images_there_is_no_rate_of_them() -> None:
+    for make in (DroneRacingEnv, load):
+        with pytest.raises(ValueError, match="camera_rate=25: is of images, and from_pixels=False"):
+            make("circle", from_pixels=False, camera_rate=25)

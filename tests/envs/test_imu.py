@@ -1,0 +1,230 @@
+"""Gyro and accelerometer of the flight controller: closed-form flights, errors, and every front door."""
+
+from __future__ import annotations
+
+import copy
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Dict
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from dreamer_racing.envs.dm_control_env import load
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters
+from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
+from dreamer_racing.envs.imu import ACCELEROMETER_RANGE, IMUS, Imu, ImuErrors
+from dreamer_racing.envs.sb3_env import DroneRaceVecEnv
+from dreamer_racing.envs.simulator.backends import make_simulator
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+SMALL = {"camera": Camera(16, 16), "seed": 3}
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def simulated(parameters: QuadrotorParameters, attitude=LEVEL, velocity=(0.0, 0.0, 0.0)):
+    simulator = make_simulator(
+        load_track("circle"), parameters, 1, Camera(), None, 1, torch.Generator().manual_seed(0), "cpu"
+    )
+    rows = [torch.tensor([values], dtype=torch.float64) for values in ((0.0, 0.0, 5.0), attitude, velocity)]
+    simulator.reset(torch.tensor([True]), *rows)
+    return simulator
+
+
+def act(*action: float) -> Tensor:
+    return torch.tensor([action], dtype=torch.float64)
+
+
+def test_a_hover_weighs_its_weight() -> None:
+    simulator = simulated(PRESETS["easy"])
+    assert simulator.feel().tolist() == [[0, 0, 0, 0, 0, GRAVITY]]
+    for _ in range(20):
+        simulator.step(act(PRESETS["easy"].hover_action, 0.0, 0.0, 0.0))
+    assert torch.allclose(simulator.feel(), act(0, 0, 0, 0, 0, GRAVITY), atol=1e-3)
+
+
+def test_a_fall_weighs_nothing_and_full_thrust_what_the_rotors_give() -> None:
+    simulator = simulated(PRESETS["easy"], attitude=(0.6, 0.0, 0.8, 0.0))
+    for _ in range(60):
+        simulator.step(act(-1.0, 0.0, 0.0, 0.0))
+    assert simulator.feel().abs().max() < 0.01
+    for _ in range(60):
+        simulator.step(act(1.0, 0.0, 0.0, 0.0))
+    assert torch.allclose(simulator.feel()[:, 3:], act(0, 0, 4 * 4.0 / 0.6), atol=0.01)
+
+
+def test_drag_is_felt_against_the_way_and_rates_are_the_bodys() -> None:
+    parameters = PRESETS["faithful"]
+    drone = QuadrotorParameters(drag=parameters.drag, physics_dt=0.001)
+    simulator = simulated(drone, velocity=(5.0, -2.0, 0.0))
+    simulator.step(act(drone.hover_action, 0.0, 0.0, 0.0))
+    velocity = simulator.state.linear_velocity
+    expected = -velocity * torch.tensor(parameters.drag) / drone.mass
+    assert torch.allclose(simulator.feel()[:, 3:5], expected[:, :2], atol=0.01)
+    for _ in range(20):
+        simulator.step(act(0.0, 0.3, -0.2, 0.5))
+    assert torch.equal(simulator.feel()[:, :3], simulator.state.body_rates)
+    assert torch.allclose(simulator.feel()[:, :3], act(3.0, -2.0, 2.0), atol=0.1)
+
+
+def test_the_plant_feels_the_same() -> None:
+    """By `specific_force`, which it tells a firmware."""
+    vehicle = PlantVehicle("circle", "easy")
+    assert vehicle.specific_force.tolist() == [0, 0, GRAVITY]
+
+
+def test_noise_and_bias_have_their_widths_and_biases_stay_for_an_episode() -> None:
+    count, errors = 4000, ImuErrors(gyro_noise=0.1, gyro_bias=0.2, accelerometer_noise=0.3, accelerometer_bias=0.4)
+    imu = Imu(errors, lambda: torch.zeros(count, 6, dtype=torch.float64), torch.Generator().manual_seed(0))
+    imu.begin(torch.ones(count, dtype=torch.bool))
+    samples = []
+    for _ in range(20):
+        imu.step()
+        samples.append(imu.sample)
+    flown = torch.stack(samples)  # (20, N, 6)
+    assert torch.allclose(flown.std(0).mean(0), torch.tensor([0.1] * 3 + [0.3] * 3), rtol=0.05)
+    assert torch.allclose(flown.mean(0).std(0), torch.tensor([0.2] * 3 + [0.4] * 3), rtol=0.05)
+    kept = imu._bias.clone()
+    begun = torch.arange(count) % 2 == 0
+    imu.begin(begun)
+    changed = (imu._bias != kept).any(1)
+    assert torch.equal(changed, begun)
+
+
+def test_a_late_sample_is_the_one_of_before_and_none_is_older_than_its_episode() -> None:
+    felt = torch.arange(6.0).repeat(2, 1)
+    imu = Imu(ImuErrors(delay=2), lambda: felt, torch.Generator())
+    imu.begin(torch.tensor([True, True]))
+    seen = []
+    for step in range(1, 5):
+        felt = torch.arange(6.0).repeat(2, 1) + step
+        if step == 4:
+            imu.begin(torch.tensor([False, True]))
+        imu.step()
+        seen.append(imu.sample[:, 0].tolist())
+    assert seen == [[0, 0], [0, 0], [1, 1], [2, 4]]
+
+
+def test_a_sensor_has_its_range_and_a_broken_state_shows_finite_numbers() -> None:
+    felt = torch.tensor([[1e9, -1e9, float("nan"), float("inf"), -1e9, 0.0]])
+    imu = Imu(ImuErrors(), lambda: felt, torch.Generator())
+    imu.begin(torch.tensor([True]))
+    assert imu.sample.isfinite().all()
+    assert imu.sample[0, 4].item() == pytest.approx(-ACCELEROMETER_RANGE)
+
+
+def flown(env: DroneRacingEnv, steps: int) -> Tensor:
+    data = env.reset()
+    seen = [data["imu"]]
+    for _ in range(steps):
+        action = torch.tensor([-0.1, 0.1, -0.1, 0.2]).expand(*env.batch_size, 4).clone()
+        data = env.step(data.set("action", action))["next"]
+        seen.append(data["imu"])
+    return torch.stack(seen)
+
+
+def test_every_front_door_shows_the_same() -> None:
+    env = DroneRacingEnv("circle", 1, preset="faithful", imu="exact", privileged=False, **SMALL)
+    check_env_specs(env)
+    env.set_seed(3)
+    expected = flown(env, 5)[:, 0].numpy()
+    env.close()
+    assert expected.dtype == np.float32
+    action = np.array([-0.1, 0.1, -0.1, 0.2], np.float32)
+    options = {"observation": "pixels_imu", "preset": "faithful", **SMALL}
+
+    single = gymnasium.make("dreamer_racing/Circle-v0", **options)
+    assert isinstance(single.observation_space, Dict)
+    seen = [single.reset(seed=3)[0], *(single.step(action)[0] for _ in range(5))]
+    assert all(each in single.observation_space for each in seen)
+    single.close()
+    assert np.array_equal([each["imu"] for each in seen], expected)
+
+    vector = DroneRaceVectorEnv(1, "circle", **options)
+    seen = [vector.reset(seed=3)[0], *(vector.step(action[None])[0] for _ in range(5))]
+    vector.close()
+    assert np.array_equal([each["imu"][0] for each in seen], expected)
+
+    several = DroneRaceVecEnv("circle", 1, **options)
+    several.seed(3)
+    seen = [several.reset(), *(several.step(action[None])[0] for _ in range(5))]
+    several.close()
+    assert np.array_equal([each["imu"][0] for each in seen], expected)
+
+
+def test_dm_control_feels_what_the_batched_worlds_feel() -> None:
+    env = load("circle", "easy", random=0, evaluation=True, imu="exact")
+    worlds = RaceWorlds("circle", 1, evaluation=True, imu="exact", seed=0, camera=Camera(16, 16))
+    worlds.reset()
+    action = np.array([0.2, 0.1, -0.1, 0.2], np.float32)
+    seen = [env.reset(), *(env.step(action) for _ in range(5))]
+    assert worlds.imu is not None
+    expected = [worlds.imu.sample[0]]
+    for _ in range(5):
+        worlds.step(torch.from_numpy(action)[None])
+        expected.append(worlds.imu.sample[0])
+    worlds.close()
+    assert np.allclose([each.observation["imu"] for each in seen], torch.stack(expected), atol=1e-4)
+
+
+def test_the_worlds_are_those_without_and_go_on_from_a_state() -> None:
+    """Only noise draws from the generator."""
+    exact, without = (DroneRacingEnv("circle", 2, preset="faithful", imu=imu, **SMALL) for imu in ("exact", None))
+    for env in (exact, without):
+        env.reset()
+        for _ in range(6):
+            env.worlds.step(torch.zeros(2, 4))
+    assert torch.equal(exact.worlds.simulator.state.position, without.worlds.simulator.state.position)
+    with pytest.raises(ValueError, match="another imu"):
+        without.load_state_dict(exact.state_dict())
+    noisy, other = (DroneRacingEnv("circle", 2, preset="faithful", imu="noisy", **SMALL) for _ in range(2))
+    flown(noisy, 4)
+    other.load_state_dict(copy.deepcopy(noisy.state_dict()))
+    action = torch.zeros(2, 4)
+    for env in (noisy, other):
+        env.worlds.step(action)
+    assert torch.equal(noisy.worlds.imu.sample, other.worlds.imu.sample)
+    for env in (exact, without, noisy, other):
+        env.close()
+
+
+def test_who_flies_on_feels_no_reset_of_another() -> None:
+    env = DroneRacingEnv("circle", 2, imu="noisy", **SMALL)
+    flown(env, 3)
+    data = env.step(env.fake_tensordict().set("action", torch.zeros(2, 4)))["next"].exclude("reward")
+    before = data["imu"].clone()
+    data["done"][1] = True
+    begun = env.maybe_reset(data)["imu"]
+    env.close()
+    assert torch.equal(begun[0], before[0])
+    assert not torch.equal(begun[1], before[1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"imu": "perfect"}, "imu='perfect': must be exact, noisy, ImuErrors"),
+        ({"imu": True}, "imu=True: must be exact"),
+        ({"imu": "exact", "from_pixels": False}, "imu='exact': is seen beside images"),
+    ],
+)
+def test_bad_values_are_refused(arguments: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        DroneRacingEnv("circle", 1, **arguments)
+    with pytest.raises(ValueError, match="imu.gyro_noise=-1: must be at least 0"):
+        ImuErrors(gyro_noise=-1)
+    with pytest.raises(ValueError, match="imu.delay=0.5: must be a whole number"):
+        ImuErrors(delay=0.5)
+    with pytest.raises(ValueError, match="imu='exact' is for observation='pixels_imu', not 'pixels'"):
+        gymnasium.make("dreamer_racing/Circle-v0", imu="exact")
+
+
+def test_the_named_ones_are_what_they_are_called() -> None:
+    assert IMUS["exact"] == ImuErrors()
+    assert all(value > 0 for value in vars(IMUS["noisy"]).values())
