@@ -63,7 +63,7 @@ class FlyConfig:
     agent: str | None = None  # name of one in agents/, or path to an agent, a run directory or a checkpoint
     pilot: str | None = None  # scripted | hover | keyboard | gamepad; null: scripted, if there is no agent
     track: str | None = None  # built-in track, or path to a YAML file; null: kidney, or what the agent was trained on
-    preset: str | None = None  # physics: easy | faithful; null: easy, or what the agent was trained on
+    preset: str | None = None  # physics: easy | faithful | betaflight; null: easy, or what the agent was trained on
     run_dir: str = "runs/fly"
     image_size: int | None = None  # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
     camera_tilt: float | None = None  # degrees upwards; null: 25

@@ -30,7 +30,7 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
     """`recipes/plant.py`: which drone, and all that `Mismatch`, `Delivery` and `ProcessOptions` say."""
 
     track: str = "kidney"  # built-in track, or path to a YAML file
-    preset: str = "faithful"  # physics of the nominal drone, without their randomisation: easy | faithful
+    preset: str = "faithful"  # physics of the nominal drone, without their randomisation: easy | faithful | betaflight
 
 
 ConfigStore.instance().store(name="plant_schema", node=PlantConfig)

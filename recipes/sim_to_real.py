@@ -41,7 +41,7 @@ class SimToRealConfig:
 
     actor: str = PILOT  # pilot, an agent that ships by its name, or the path of an agent
     track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
-    preset: str = "faithful"  # physics before anything is changed: easy | faithful
+    preset: str = "faithful"  # physics before anything is changed: easy | faithful | betaflight
     rate: float = setting(50.0, Range(10, 500))  # Hz, of the pilot; an actor has its own
     flights: int = setting(5, COUNT)  # of each value, with different noise
     sweeps: list[str] | None = None  # of what is changed; null: all

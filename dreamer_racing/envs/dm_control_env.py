@@ -80,7 +80,7 @@ def load(
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         random: seed or state of start poses and physics randomisation; None for a random seed.
         time_limit: duration after which an episode is truncated, s; if None 20, in evaluation 30.
         evaluation: start at the start pose, at rest, without noise, and finish after the track's laps.

@@ -268,7 +268,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:

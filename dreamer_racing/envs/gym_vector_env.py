@@ -35,7 +35,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
         autoreset_mode: `NextStep`, `SameStep` or `Disabled`.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.

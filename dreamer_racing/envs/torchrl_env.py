@@ -28,7 +28,7 @@ class DroneRacingEnv(EnvBase):
         device: where the worlds and all tensors live, `cpu` or a CUDA device; see `RaceWorlds`.
         from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
         privileged: whether there are `("privileged", ...)` entries.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
         worlds: further arguments of `RaceWorlds`, see `RaceOptions`.
 

@@ -130,7 +130,7 @@ def view(
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         policy: maps a dm_env `TimeStep` to an action (4,); None hovers.
         arguments: further arguments of `envs.load`.
 

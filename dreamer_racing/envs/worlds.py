@@ -72,7 +72,7 @@ class RaceWorlds:
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        preset: physics preset (`easy`, `faithful`) or parameters.
+        preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         evaluation: start at the start pose, at rest, and finish after the track's laps.
         episode_steps: control steps until an episode is truncated; if None those of 20 s, in evaluation of 30 s.
         weights: of the reward, paper Eq. 1.

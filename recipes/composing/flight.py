@@ -61,7 +61,7 @@ class HilConfig:
     lift: float = LIFT  # weights of thrust, 1.1 to 1.5, that it is lifted with until it rises; 0: the actor takes off
     patience: float | None = setting(None, POSITIVE)  # s to wait for arming; null: as long as it takes
     rate: float | None = setting(None, Range(10, 500))  # Hz; null: the actor's own, which is the only one it can have
-    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful
+    preset: str = "faithful"  # actor=pilot: what it takes the vehicle for, easy | faithful | betaflight
     run_dir: str | None = None  # null: runs/hil_<track>_<time>
     replay: str | None = None  # a flight to play through the chain again
     report: str | None = None  # a flight to draw and to sum up

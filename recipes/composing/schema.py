@@ -25,7 +25,7 @@ class EnvConfig:
     """Where the agent acts: the race, or a task of the DeepMind Control Suite to compare with published curves."""
 
     suite: str = "race"  # race | dmc
-    preset: str = "easy"  # physics: easy | faithful
+    preset: str = "easy"  # physics: easy | faithful | betaflight
     num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
     control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
     # frames a second, Hz, control_rate divided by a whole number; null: one at every control step

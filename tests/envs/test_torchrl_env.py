@@ -310,7 +310,7 @@ def test_closing_twice_is_safe() -> None:
 def test_bad_arguments_are_explained() -> None:
     with pytest.raises(ValueError, match="num_envs=0: at least one world"):
         DroneRacingEnv(num_envs=0)
-    with pytest.raises(ValueError, match="preset=hard: there is no such physics; there are easy, faithful"):
+    with pytest.raises(ValueError, match="preset=hard: there is no such physics; there are betaflight, easy, faithful"):
         blind(preset="hard")
     with pytest.raises(TrackError, match="kidny"):
         blind(track="kidny")

@@ -1,12 +1,14 @@
 """Physical and control parameters of the quadrotor, as plain numbers: no torch in here.
 
 Sources of numbers: [paper] Romero et al., "Dream to Fly"; [rpg] public code of the same laboratory; [choice] this
-project's, because nobody published it.
+project's, because nobody published it; [rec] the drone of the recording of a Betaflight that `drone.betaflight` is held
+against.
 """
 
 import math
 from dataclasses import dataclass, fields, replace
 
+from dreamer_racing.envs.drone.betaflight import BetaflightParameters
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -21,6 +23,8 @@ from dreamer_racing.settings import (
 GRAVITY = 9.81  # m/s²
 INTEGRATORS = ("Euler", "RK4")
 """MuJoCo's names of those to choose from: `RigidStep` brings Euler's pose to second order, and RK4 needs nothing."""
+MOTOR_LAGS = ("speed", "thrust")
+"""What may follow its target at first order: a rotor's speed, or its thrust, which goes with the square."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +36,23 @@ class Randomisation:
     drag: float = 0.10
     thrust: float = 0.10  # all four rotors together: battery voltage
     torque: float = 0.01
-    delay_max: float = setting(0.040, NOT_NEGATIVE)  # s; the command delay is uniform in [0, delay_max]
+    delay_max: float = setting(0.040, NOT_NEGATIVE)  # s; the command delay is uniform in [delay_min, delay_max]
+    delay_min: float = setting(0.0, NOT_NEGATIVE)  # s
+    # of drones with a Betaflight
+    gains: float = 0.0  # P, I and D of each axis on its own
+    filters: float = 0.0  # cut-offs of the gyro, and those of D
+    motor_lag: float = 0.0
+    sag_max: float = 0.0  # share of thrust that the battery loses at full load, uniform in [0, sag_max]
 
     def __post_init__(self) -> None:
         widths = {f"Randomisation: {name}": width for name, width in vars(self).items()}
         check_numbers({}, widths)
         check_settings(self, "Randomisation: ")
         for name, width in widths.items():
-            if not name.endswith("delay_max") and not 0.0 <= width < 1.0:
+            if not name.endswith(("delay_max", "delay_min")) and not 0.0 <= width < 1.0:
                 raise ValueError(f"{name}={width}: a relative half-width, must be at least 0 and below 1.")
+        if self.delay_min > self.delay_max:
+            raise ValueError(f"Randomisation: delay_min={self.delay_min}: must be at most delay_max={self.delay_max}.")
 
 
 @dataclass(frozen=True)
@@ -61,10 +73,12 @@ class QuadrotorParameters:
     torque_constant: float = setting(0.022, POSITIVE)  # m: N m of yaw torque per N of rotor thrust [paper]
     rotor_thrust_max: float = setting(4.0, POSITIVE)  # N, thrust-to-weight ratio 2.72 [paper]
     motor_time_constant: float = 0.033  # s, first order on rotor speed [rpg]; inf: speeds stay
+    motor_lag_of: str = "speed"  # out of `MOTOR_LAGS`
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/(m/s), linear rotor drag in the body frame
     body_rate_max: tuple[float, float, float] = (10.0, 10.0, 4.0)  # rad/s at action ±1 [rpg]
     collective_thrust_scale: float = setting(13.33, POSITIVE)  # m/s²: c = scale · (1 + a) [rpg]
     rate_gain: float = setting(15.0, POSITIVE)  # 1/s, proportional body-rate loop [choice]
+    betaflight: BetaflightParameters | None = None  # instead of the proportional loop and its mixer
     command_delay: float = setting(0.0, NOT_NEGATIVE)  # s
     physics_dt: float = setting(0.002, POSITIVE)  # s [rpg]
     control_dt: float = setting(0.02, POSITIVE)  # s, 50 Hz [rpg]
@@ -83,8 +97,12 @@ class QuadrotorParameters:
         if self.integrator not in INTEGRATORS:
             there = " or ".join(INTEGRATORS)
             raise ValueError(f"{prefix}integrator={quoted(self.integrator)}: must be {there}, as MuJoCo calls them.")
-        if not (self.randomisation is None or isinstance(self.randomisation, Randomisation)):
-            raise ValueError(f"{prefix}randomisation={quoted(self.randomisation)}: must be a Randomisation or None.")
+        if self.motor_lag_of not in MOTOR_LAGS:
+            raise ValueError(f"{prefix}motor_lag_of={quoted(self.motor_lag_of)}: must be {' or '.join(MOTOR_LAGS)}.")
+        for name, kind in (("randomisation", Randomisation), ("betaflight", BetaflightParameters)):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, kind)):
+                raise ValueError(f"{prefix}{name}={quoted(value)}: must be a {kind.__name__} or None.")
         steps = self.control_dt / self.physics_dt
         if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
             raise ValueError(
@@ -119,11 +137,27 @@ PRESETS: dict[str, QuadrotorParameters] = {
         physics_dt=0.001,  # [rpg]
         randomisation=Randomisation(),
     ),
+    "betaflight": QuadrotorParameters(
+        drag=(0.26, 0.28, 0.42),  # [rpg]
+        motor_time_constant=0.030,  # [rec]
+        motor_lag_of="thrust",  # [rec]
+        betaflight=BetaflightParameters(),
+        command_delay=0.010,  # [rec]: from a channel to what acts on it
+        physics_dt=0.001,  # [rec]: of the firmware's loop
+        randomisation=Randomisation(
+            gains=0.2,
+            filters=0.2,
+            motor_lag=0.3,
+            sag_max=0.15,
+            delay_min=0.005,
+            delay_max=0.035,
+        ),
+    ),
 }
 
 
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
-    """Return the parameters of a named preset (`easy`, `faithful`), or the given parameters themselves.
+    """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), or the given parameters themselves.
 
     Raises:
         ValueError: unknown name.

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS, QuadrotorParameters, Randomisation
+from dreamer_racing.envs.drone.rate_loop import Own, RateLoop
 from dreamer_racing.envs.drone.rotation import rotate_inverse
 
 RELATIVE = ("mass", "inertia", "drag", "thrust", "torque")  # what is randomised as a factor of the nominal value
@@ -98,6 +99,10 @@ class Quadrotor:
         self._hover_setpoint = tensor((p.mass * GRAVITY, 0.0, 0.0, 0.0))
         self.setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
         self._drones = self._nominal_drones() if p.randomisation or history else None
+        self.rate_loop = None if p.betaflight is None else RateLoop(p, num_drones, device, dtype)
+        self._lag_of_thrust = p.motor_lag_of == "thrust"
+        if self.rate_loop is not None:
+            self._set_motors(torch.ones(num_drones, 1, dtype=torch.bool, device=device), 1.0, 0.0)
         self._everyone = torch.arange(num_drones, device=device)
 
     def _nominal_drones(self) -> _Drones:
@@ -120,8 +125,12 @@ class Quadrotor:
         rows = mask.unsqueeze(-1)  # (N, 1)
         self.rotor_speed.masked_fill_(rows, self._hover_speed)
         self.setpoints.copy_(torch.where(rows, self._hover_setpoint, self.setpoints))
-        if self.parameters.randomisation is not None:
-            self._randomise(rows, self.parameters.randomisation)
+        widths = self.parameters.randomisation
+        if widths is not None:
+            self._randomise(rows, widths)
+        if self.rate_loop is not None:
+            frame = 0.0 if widths is None else (self._uniform(self.num_drones) * self.rate_loop.frame_steps).floor()
+            self.rate_loop.reset(rows, frame)
 
     def _randomise(self, rows: Tensor, widths: Randomisation) -> None:
         drones = self._drones
@@ -130,8 +139,24 @@ class Quadrotor:
             current = getattr(drones, name)
             noise = 2.0 * self._uniform(*current.shape) - 1.0
             current.copy_(torch.where(rows, 1.0 + getattr(widths, name) * noise, current))
-        delay = (self._uniform(self.num_drones) * widths.delay_max / self.parameters.physics_dt).round().long()
+        delay = widths.delay_min + (widths.delay_max - widths.delay_min) * self._uniform(self.num_drones)
+        delay = (delay / self.parameters.physics_dt).round().long()
         drones.delay_steps.copy_(torch.where(rows[:, 0], delay, drones.delay_steps))
+        if self.rate_loop is not None:
+            own = self.rate_loop.own
+            noise = 2.0 * self._uniform(self.num_drones, 4, 3) - 1.0
+            relative = torch.cat((1.0 + widths.gains * noise[:, :3], 1.0 + widths.filters * noise[:, 3:]), dim=1)
+            own[:, : Own.MOTORS] = torch.where(rows.unsqueeze(-1), relative, own[:, : Own.MOTORS])
+            lag = 1.0 + widths.motor_lag * (2.0 * self._uniform(self.num_drones, 1) - 1.0)
+            self._set_motors(rows, lag, widths.sag_max * self._uniform(self.num_drones, 1))
+
+    def _set_motors(self, rows: Tensor, lag: Tensor | float, sag: Tensor | float) -> None:
+        """Give drones (N, 1) bool motors of a lag relative to nominal, and a battery that sags so far at full load."""
+        assert self.rate_loop is not None
+        motors = self.rate_loop.own[:, Own.MOTORS]
+        decay = math.log(self.motor_decay) / (torch.ones_like(motors[:, :1]) * lag)
+        values = torch.cat((decay.exp(), (0.5 * decay).exp(), torch.zeros_like(decay) + sag), dim=1)
+        motors.copy_(torch.where(rows, values, motors))
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self._device, dtype=self._dtype)
@@ -143,7 +168,10 @@ class Quadrotor:
             if self._drones is None
             else {field.name: getattr(self._drones, field.name).clone() for field in fields(_Drones)}
         )
-        return {"rotor_speed": self.rotor_speed.clone(), "setpoints": self.setpoints.clone(), "drones": drones}
+        state = {"rotor_speed": self.rotor_speed.clone(), "setpoints": self.setpoints.clone(), "drones": drones}
+        if self.rate_loop is not None:
+            state |= {"rate_loop": self.rate_loop.state.clone(), "rate_loop_own": self.rate_loop.own.clone()}
+        return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
@@ -152,6 +180,9 @@ class Quadrotor:
         if self._drones is not None:
             for name, value in state_dict["drones"].items():
                 getattr(self._drones, name).copy_(value)
+        if self.rate_loop is not None:
+            self.rate_loop.state.copy_(state_dict["rate_loop"])
+            self.rate_loop.own.copy_(state_dict["rate_loop_own"])
 
     def command(self, action: Tensor) -> None:
         """Take the actions (N, 4) in [-1, 1] of the coming control step: collective thrust and body rates x, y, z."""
@@ -185,16 +216,38 @@ class Quadrotor:
         """
         setpoint = self._setpoint(physics_step)
         gyroscopic = self.gyroscopic_torque(body_rates)
-        present_torque = _product(self.rotor_speed.square(), self._torque_effectiveness)
-        rates = self.rates_half_a_step_later(body_rates, present_torque, gyroscopic)
-        torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
-        target_speed = self.mix(setpoint[:, :1], torque).sqrt()
-        middle_speed = torch.lerp(target_speed, self.rotor_speed, self._motor_decay_half)
-        self.rotor_speed.copy_(torch.lerp(target_speed, self.rotor_speed, self.motor_decay))
-        wrench = _product(middle_speed.square(), self._effectiveness)
+        if self.rate_loop is None:
+            present_torque = _product(self.rotor_speed.square(), self._torque_effectiveness)
+            rates = self.rates_half_a_step_later(body_rates, present_torque, gyroscopic)
+            torque = torch.addcmul(self.gyroscopic_torque(rates), self._rate_gain, setpoint[:, 1:] - rates)
+            target = self.mix(setpoint[:, :1], torque).sqrt()
+        else:
+            commands = self.rate_loop.motor_commands(setpoint, body_rates)
+            target = commands * math.sqrt(self.parameters.rotor_thrust_max)
+        thrusts = self._turn_rotors(target)
+        wrench = _product(thrusts, self._effectiveness)
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
         return wrench
+
+    def _turn_rotors(self, target: Tensor) -> Tensor:
+        """Let rotors follow target speeds (N, 4) in √N for a physics step; return their thrusts in its middle, N."""
+        decay: Tensor | float = self.motor_decay
+        decay_half: Tensor | float = self._motor_decay_half
+        if self.rate_loop is not None:
+            decay, decay_half, sag = self.rate_loop.own[:, Own.MOTORS].split(1, dim=1)
+        speed = self.rotor_speed
+        if self._lag_of_thrust:
+            target, speed = target.square(), speed.square()
+            thrusts = target + decay_half * (speed - target)
+            self.rotor_speed.copy_((target + decay * (speed - target)).sqrt())
+        else:
+            thrusts = (target + decay_half * (speed - target)).square()
+            self.rotor_speed.copy_(target + decay * (speed - target))
+        if self.rate_loop is not None:
+            load = thrusts.mean(1, keepdim=True) / self.parameters.rotor_thrust_max
+            thrusts = thrusts * (1.0 - sag * load)
+        return thrusts
 
     def gyroscopic_torque(self, body_rates: Tensor) -> Tensor:
         """ω × Jω of the nominal body (N, 3), N m, at body rates (N, 3), rad/s."""

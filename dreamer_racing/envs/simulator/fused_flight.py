@@ -19,6 +19,8 @@ from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, ROTOR_SPINS
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.drone.rate_loop import Own
+from dreamer_racing.envs.simulator import fused_rate_loop
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 
 
@@ -29,11 +31,13 @@ class Kernels(NamedTuple):
         push: Controller and motors of a physics step; writes the force and torque that MuJoCo is to apply.
         settle: Corrects MuJoCo's Euler step and keeps the position it led to.
         constants: The struct of what all drones have in common.
+        firmware: The struct within it of flight controllers.
     """
 
     push: Any
     settle: Any
     constants: Any
+    firmware: Any
 
 
 class FusedFlight:
@@ -61,8 +65,9 @@ class FusedFlight:
         self.qvel_before = before = torch.zeros_like(qvel, memory_format=torch.contiguous_format)
         drones = quadrotor.own_parameters()
         arrays = [warp.from_torch(tensor) for tensor in (qpos, qvel, quadrotor.rotor_speed, quadrotor.setpoints)]
-        own = [warp.from_torch(tensor) for tensor in drones]
+        own = [*map(warp.from_torch, drones), *fused_rate_loop.arrays(quadrotor.rate_loop, qpos)]
         constants = _constants(quadrotor, kernels.constants)
+        constants.firmware = fused_rate_loop.fill(quadrotor.rate_loop, kernels.firmware)
         force, saved, path = (warp.from_torch(tensor) for tensor in (qfrc_applied, before, self._path))
         with scope(self._device):
             self._push, self._settle = (
@@ -105,6 +110,8 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
     constants.decay, constants.decay_half = quadrotor.motor_decay, quadrotor.motor_decay**0.5
     constants.half_step = 0.5 * p.physics_dt
     constants.rate_gain = p.rate_gain
+    constants.controlled = int(quadrotor.rate_loop is not None)
+    constants.lag_of_thrust = int(p.motor_lag_of == "thrust")
     constants.mass, constants.gravity = p.mass, (0.0, 0.0, -GRAVITY)
     constants.inertia, constants.drag = p.inertia, p.drag
     constants.rotor_x, constants.rotor_y = x, y
@@ -120,9 +127,15 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
     wp = load_warp()
     real = wp.dtype_from_torch(dtype)
     vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    rate_loop = fused_rate_loop.make_kernels(dtype)
+    Firmware, motor_commands = rate_loop.firmware, rate_loop.motor_commands
+    motors_row = int(Own.MOTORS)
 
     @wp.struct
     class Constants:
+        firmware: Firmware
+        controlled: int  # whether there is such a flight controller
+        lag_of_thrust: int  # whether thrusts follow their targets, or speeds
         physics_steps: int
         oldest: int  # index of the oldest command kept
         perturbed: int  # whether there is drag, or drones have parameters of their own
@@ -195,6 +208,8 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         thrust_factor: wp.array2d(dtype=real),
         torque_factor: wp.array2d(dtype=real),
         delay_steps: wp.array(dtype=wp.int64),
+        memory: wp.array2d(dtype=vec3),
+        own: wp.array2d(dtype=vec3),
         qfrc_applied: wp.array2d(dtype=real),
         before: wp.array2d(dtype=real),
     ):
@@ -206,14 +221,31 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         rates = vec3(qvel[i, 3], qvel[i, 4], qvel[i, 5])
 
         speed = vec4(rotor_speed[i, 0], rotor_speed[i, 1], rotor_speed[i, 2], rotor_speed[i, 3])
-        middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
-        torque = gyroscopic(c, middle_rates) + c.rate_gain * wp.cw_mul(c.inertia, wanted - middle_rates)
-        target = mix(c, setpoints[age, i, 0], torque)
-        for rotor in range(4):
-            target[rotor] = wp.sqrt(target[rotor])
-            rotor_speed[i, rotor] = target[rotor] + c.decay * (speed[rotor] - target[rotor])
-        middle = target + c.decay_half * (speed - target)
-        thrusts = wp.cw_mul(middle, middle)
+        decay, decay_half, sag = real(c.decay), real(c.decay_half), real(0.0)
+        target = vec4()  # thrusts
+        if c.controlled != 0:
+            commands = motor_commands(c.firmware, i, setpoints[age, i, 0], wanted, rates, memory, own)
+            target = c.limit * wp.cw_mul(commands, commands)
+            motors = own[i, motors_row]
+            decay, decay_half, sag = motors[0], motors[1], motors[2]
+        else:
+            middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
+            torque = gyroscopic(c, middle_rates) + c.rate_gain * wp.cw_mul(c.inertia, wanted - middle_rates)
+            target = mix(c, setpoints[age, i, 0], torque)
+        thrusts = vec4()  # of the step's middle
+        if c.lag_of_thrust != 0:
+            lag = wp.cw_mul(speed, speed) - target
+            thrusts = target + decay_half * lag
+            for rotor in range(4):
+                rotor_speed[i, rotor] = wp.sqrt(target[rotor] + decay * lag[rotor])
+        else:
+            for rotor in range(4):
+                target[rotor] = wp.sqrt(target[rotor])
+                rotor_speed[i, rotor] = target[rotor] + decay * (speed[rotor] - target[rotor])
+            middle = target + decay_half * (speed - target)
+            thrusts = wp.cw_mul(middle, middle)
+        load = real(0.25) * (thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3]) / c.limit
+        thrusts = (real(1.0) - sag * load) * thrusts
         force = vec3(real(0.0), real(0.0), thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3])
         torque = torque_of(c, thrusts)
 
@@ -264,4 +296,4 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         for axis in range(3):
             path[physics_step + 1, i, axis] = qpos[i, axis]
 
-    return Kernels(push, settle, Constants)
+    return Kernels(push, settle, Constants, Firmware)

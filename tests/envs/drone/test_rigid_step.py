@@ -36,9 +36,7 @@ class Bodies:
         self.qpos[:, :3] += 0.002 * self.qvel[:, :3]
 
 
-@pytest.mark.parametrize(
-    "parameters", [PRESETS["easy"], PRESETS["faithful"], DELAYED], ids=["easy", "faithful", "late"]
-)
+@pytest.mark.parametrize("parameters", [*PRESETS.values(), DELAYED], ids=[*PRESETS, "late"])
 def test_kernels_do_what_torch_does(parameters: QuadrotorParameters) -> None:
     quadrotor = Quadrotor(parameters, N, generator=torch.Generator().manual_seed(1))
     quadrotor.reset(torch.ones(N, dtype=torch.bool))
@@ -65,7 +63,7 @@ def test_kernels_do_what_torch_does(parameters: QuadrotorParameters) -> None:
         ):  # fmt: skip
             # the square root of a rotor thrust of 0 plus a rounding error of 1e-17 N is 3e-9
             torch.testing.assert_close(one, expected, rtol=1e-7, atol=1e-7)
-    assert (quadrotor.rotor_speed < 0.1).any()  # some rotors were at their limits
+    assert (quadrotor.rotor_speed < 0.3).any()  # some rotors were at their limits
     assert (quadrotor.rotor_speed > 1.9).any()
 
 
