@@ -194,6 +194,40 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             thrusts[rotor] = wp.clamp(each + scale * roll_pitch[rotor] + share * yaw[rotor], real(0.0), c.limit)
         return thrusts
 
+    @wp.func
+    def turn_rotors(
+        c: Constants,
+        i: int,
+        target: vec4,
+        speed: vec4,
+        decay: real,
+        decay_half: real,
+        rotor_speed: wp.array2d(dtype=real),
+    ):  # towards target thrusts; returns those of the step's middle
+        if c.lag_of_thrust != 0:
+            lag = wp.cw_mul(speed, speed) - target
+            for rotor in range(4):
+                rotor_speed[i, rotor] = wp.sqrt(target[rotor] + decay * lag[rotor])
+            return target + decay_half * lag
+        goal = vec4()
+        for rotor in range(4):
+            goal[rotor] = wp.sqrt(target[rotor])
+            rotor_speed[i, rotor] = goal[rotor] + decay * (speed[rotor] - goal[rotor])
+        middle = goal + decay_half * (speed - goal)
+        return wp.cw_mul(middle, middle)
+
+    # the wrench that gives the nominal body the acceleration of a drone's own
+    @wp.func
+    def own_force(c: Constants, thrust: vec3, velocity: vec3, rates: vec3, gravity: vec3, mass: real, drag: real):
+        now = (thrust - drag * wp.cw_mul(c.drag, velocity)) / mass
+        middle = velocity + c.half_step * (now / c.mass + gravity - wp.cross(rates, velocity))
+        return (thrust - drag * wp.cw_mul(c.drag, middle)) / mass
+
+    @wp.func
+    def own_torque(c: Constants, torque: vec3, rates: vec3, factors: vec3):
+        own_gyroscopic = wp.cross(rates, wp.cw_mul(wp.cw_mul(factors, c.inertia), rates))
+        return wp.cw_div(torque - own_gyroscopic, factors) + gyroscopic(c, rates)
+
     @wp.kernel(module="unique", enable_backward=False)
     def push(
         physics_step: int,
@@ -232,34 +266,18 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
             torque = gyroscopic(c, middle_rates) + c.rate_gain * wp.cw_mul(c.inertia, wanted - middle_rates)
             target = mix(c, setpoints[age, i, 0], torque)
-        thrusts = vec4()  # of the step's middle
-        if c.lag_of_thrust != 0:
-            lag = wp.cw_mul(speed, speed) - target
-            thrusts = target + decay_half * lag
-            for rotor in range(4):
-                rotor_speed[i, rotor] = wp.sqrt(target[rotor] + decay * lag[rotor])
-        else:
-            for rotor in range(4):
-                target[rotor] = wp.sqrt(target[rotor])
-                rotor_speed[i, rotor] = target[rotor] + decay * (speed[rotor] - target[rotor])
-            middle = target + decay_half * (speed - target)
-            thrusts = wp.cw_mul(middle, middle)
+        thrusts = turn_rotors(c, i, target, speed, decay, decay_half, rotor_speed)
         load = real(0.25) * (thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3]) / c.limit
         thrusts = (real(1.0) - sag * load) * thrusts
         force = vec3(real(0.0), real(0.0), thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3])
         torque = torque_of(c, thrusts)
 
-        if c.perturbed != 0:  # the wrench that gives the nominal body the acceleration of this drone's own
+        if c.perturbed != 0:
             velocity = rotate(w, -v, vec3(qvel[i, 0], qvel[i, 1], qvel[i, 2]))
-            thrust = thrust_factor[i, 0] * force
-            now = (thrust - drag[i, 0] * wp.cw_mul(c.drag, velocity)) / mass[i, 0]
-            change = now / c.mass + rotate(w, -v, c.gravity) - wp.cross(rates, velocity)
-            middle_velocity = velocity + c.half_step * change
-            force = (thrust - drag[i, 0] * wp.cw_mul(c.drag, middle_velocity)) / mass[i, 0]
-            factors = vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2])
+            gravity = rotate(w, -v, c.gravity)
+            force = own_force(c, thrust_factor[i, 0] * force, velocity, rates, gravity, mass[i, 0], drag[i, 0])
             torque = thrust_factor[i, 0] * vec3(torque[0], torque[1], torque_factor[i, 0] * torque[2])
-            own_gyroscopic = wp.cross(rates, wp.cw_mul(wp.cw_mul(factors, c.inertia), rates))
-            torque = wp.cw_div(torque - own_gyroscopic, factors) + gyroscopic(c, rates)
+            torque = own_torque(c, torque, rates, vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2]))
 
         # the force in its direction of the step's middle, the torque that does there what this one does
         middle_rates = half_a_step_later(c, rates, torque)

@@ -165,18 +165,9 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         return shares
 
     @wp.func
-    def motor_commands(
-        f: Firmware,
-        i: int,
-        thrust: real,
-        wanted: vec3,
-        rates: vec3,
-        memory: wp.array2d(dtype=vec3),
-        own: wp.array2d(dtype=vec3),
-    ):
-        receive(f, i, thrust, wanted, memory)
-        throttle = memory[i, THROTTLE][0]
-        setpoint = memory[i, SETPOINT]
+    def filter_gyro(
+        f: Firmware, i: int, rates: vec3, throttle: real, memory: wp.array2d(dtype=vec3), own: wp.array2d(dtype=vec3)
+    ):  # returns what P and I see, and by how much what D sees has fallen
         filters = own[i, OWN_FILTERS]
         first = memory[i, GYRO_LPF2]
         first = first + share(f, f.gyro_lpf2 * filters[0]) * (real(DEGREES) * rates - first)
@@ -190,7 +181,22 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         memory[i, GYRO_LPF1] = gyro
         memory[i, DTERM_LPF1] = slow
         memory[i, DTERM_LPF2] = slower
+        return gyro, before - slower
 
+    @wp.func
+    def motor_commands(
+        f: Firmware,
+        i: int,
+        thrust: real,
+        wanted: vec3,
+        rates: vec3,
+        memory: wp.array2d(dtype=vec3),
+        own: wp.array2d(dtype=vec3),
+    ):
+        receive(f, i, thrust, wanted, memory)
+        throttle = memory[i, THROTTLE][0]
+        setpoint = memory[i, SETPOINT]
+        gyro, change = filter_gyro(f, i, rates, throttle, memory, own)
         relaxed = memory[i, RELAX]
         relaxed = relaxed + f.relax_gain * (setpoint - relaxed)
         proportional = memory[i, PROPORTIONAL]
@@ -217,7 +223,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             boost_1[axis] = boost_1[axis] + f.boost_gain * (raised - boost_1[axis])
             boost_2[axis] = boost_2[axis] + f.boost_gain * (boost_1[axis] - boost_2[axis])
             rise = real(1.0) + wp.min(boost_2[axis], f.d_rise[axis])
-            derivative = f.d[axis] * own_d[axis] * (before[axis] - slower[axis]) / f.dt * rise * attenuation
+            derivative = f.d[axis] * own_d[axis] * change[axis] / f.dt * rise * attenuation
             total = lifted + integral[axis] + derivative
             correction[axis] = wp.clamp(total, -f.sum_limit[axis], f.sum_limit[axis]) / real(1000.0)
         memory[i, RELAX] = relaxed
