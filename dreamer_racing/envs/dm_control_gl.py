@@ -3,7 +3,10 @@
 import os
 import sys
 
+from dreamer_racing.envs.gl_variables import imports_with_variable
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, RendererUnavailableError, loads
+
+RENDERING = "dm_control._render"
 
 
 def choose_backend() -> None:
@@ -20,7 +23,16 @@ def choose_backend() -> None:
     os.environ["MUJOCO_GL"] = next(usable, "disable")
 
 
-choose_backend()
+def import_dm_control() -> None:
+    """Import dm_control with the OpenGL that the user names, else with one that is there, else without any."""
+    for _ in range(2):  # the user's, and one of those that are there
+        choose_backend()
+        if imports_with_variable(RENDERING):
+            return
+    os.environ["MUJOCO_GL"] = "disable"
+
+
+import_dm_control()
 
 from dm_control import _render, mujoco  # noqa: E402 - after the choice
 

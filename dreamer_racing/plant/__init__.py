@@ -3,3 +3,5 @@
 `vehicle` is the drone, with what sets it apart from the one that was trained on; `commands` or `betaflight_sitl` moves
 it; `delivery` sends its poses as a motion-capture system would; `process` keeps all of it in time.
 """
+
+import dreamer_racing.envs  # noqa: F401 - before MuJoCo, whose variables it heeds

@@ -20,7 +20,8 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from dreamer_racing.caches import ensure_caches, warp_cache, why_not_writable
-from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES
+from dreamer_racing.envs.gl_variables import VARIABLES, refused
+from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, loads
 
 DISTRIBUTION = "dreamer_racing"
 RECORD_BYTES = 13_570
@@ -86,6 +87,7 @@ def examine(capacity: int, keep: int, run_dir: Path) -> Iterator[Diagnosis]:
     yield memory(capacity * RECORD_BYTES + NETWORKS_BYTES)
     yield disk((keep + 1) * capacity * RECORD_BYTES / SMALLER_ON_DISK, run_dir)
     yield caches()
+    yield from variables()
     yield from renderers(probes)
 
 
@@ -231,10 +233,20 @@ def renderers(probes: dict[str, subprocess.Popen[str]]) -> Iterator[Diagnosis]:
     for backend, images in found.items():
         yield Diagnosis(backend, Verdict.fine, f"{images:,} images a second, 64 × 64 pixels, one core")
     for backend, reason in reasons.items():
-        yield Diagnosis(backend, Verdict.fine if found else Verdict.note, f"not here: {reason}")
+        named = sorted(name for name in VARIABLES if f"{name}=" in reason)
+        remedy = f"unset {' '.join(named)}" if named else ""
+        yield Diagnosis(backend, Verdict.fine if found and not named else Verdict.note, f"not here: {reason}", remedy)
     if not found:
-        remedy = "apt-get install libegl1 libopengl0 libgl1-mesa-dri: seven times as fast"
+        installed = any(loads(library) for library in GL_LIBRARIES["egl"])
+        remedy = "" if installed else "apt-get install libegl1 libopengl0 libgl1-mesa-dri: seven times as fast"
         yield Diagnosis("ray caster", Verdict.note, "draws, for want of OpenGL", remedy)
+
+
+def variables() -> Iterator[Diagnosis]:
+    """Look for variables that are in the way of OpenGL, and were left out of account."""
+    for setting, reason in refused.items():
+        name = setting.partition("=")[0]
+        yield Diagnosis(name, Verdict.note, f"{setting} is left out of account: {reason}", f"unset {name}")
 
 
 def _start_probe(backend: str) -> subprocess.Popen[str]:

@@ -101,6 +101,7 @@ def test_more_threads_than_cores_are_wrong(asked: str, monkeypatch: pytest.Monke
 def test_without_opengl_the_ray_caster_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     program = "import sys; sys.exit('RendererUnavailableError: egl needs libEGL.so.1')"
     monkeypatch.setattr(examination, "PROBE", program)
+    monkeypatch.setattr(examination, "loads", lambda library: False)
     *_, last = examination.renderers({"egl": examination._start_probe("egl")})
     assert last.what == "ray caster" and "apt-get install" in last.remedy
 

@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dreamer_racing.envs.gl_variables import in_the_way
 from dreamer_racing.envs.simulator.scene import CAMERA_NAME, HALL_GROUP, Camera
 
 MAX_GEOMS = 1000  # capacity of MuJoCo's list of visible geoms
@@ -101,7 +102,8 @@ def open_scene(backend: str, model: mujoco.MjModel, camera: Camera) -> OpenGLSce
     try:
         return OpenGLScene(backend, model, camera)
     except Exception as error:  # PyOpenGL raises anything from AttributeError to its own GLError
-        raise RendererUnavailableError(f"{backend} did not start ({type(error).__name__}: {error}).") from error
+        reason = f"{backend} did not start ({type(error).__name__}: {error}){in_the_way(backend)}."
+        raise RendererUnavailableError(reason) from error
 
 
 def keep_display(backend: str) -> None:
