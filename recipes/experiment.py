@@ -36,7 +36,7 @@ from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
 FOLDER = Path(__file__).resolve().parent
 LOG = "log.txt"
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # settings that no recipe has
 
 # Launchers send configurations to processes of theirs, which must find the modules of this folder.
@@ -173,6 +173,8 @@ def run(command: list[str], run_dir: Path) -> int:
     """
     received: list[signal.Signals] = []
     before = {number: signal.getsignal(number) for number in SIGNALS} if is_main_thread() else {}
+    if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+        del before[signal.SIGHUP]
     for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
         signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, for Slurm sends them to every process
     with (

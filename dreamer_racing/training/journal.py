@@ -44,17 +44,23 @@ class Periods:
 
 
 class Interval:
-    """Says when something that happens every so many minutes of wall clock is due; never if they are 0."""
+    """Says when something that happens every so many minutes of wall clock is due; never if they are 0.
 
-    def __init__(self, minutes: float) -> None:
+    Args:
+        minutes: between two times.
+        first: minutes until the first time, if that is sooner; 0: as between two.
+    """
+
+    def __init__(self, minutes: float, first: float = 0.0) -> None:
         self._seconds = 60.0 * minutes
+        self._next = 60.0 * (min(first, minutes or first) or minutes)
         self._last = time.monotonic()
 
     def due(self) -> bool:
         """Whether the interval has passed; if so it begins anew."""
-        if not self._seconds or time.monotonic() - self._last < self._seconds:
+        if not self._next or time.monotonic() - self._last < self._next:
             return False
-        self._last = time.monotonic()
+        self._last, self._next = time.monotonic(), self._seconds
         return True
 
 

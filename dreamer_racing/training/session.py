@@ -46,6 +46,9 @@ OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
 OF_WORLDS = ("env", "collector")
 """Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
 
+FIRST_CHECKPOINT = 1.5
+"""Minutes after which a run that saves on the way does so first: within two of its start [choice]."""
+
 
 class Evaluator(Protocol):
     """Evaluates a learner's policy."""
@@ -119,7 +122,7 @@ class Session:
         self.say: Callable[[str], None] = logger.info
         self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
         self._periods = Periods(log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every)
-        self._minutes = Interval(config.checkpoint.minutes)
+        self._minutes = Interval(config.checkpoint.minutes, FIRST_CHECKPOINT if config.checkpoint.every else 0.0)
         self._memory = KeptMemory()
         self._unsaved: dict[str, int] = {}  # since which env_steps what cannot be written
         self._stack = ExitStack()  # signals and progress

@@ -11,12 +11,18 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
+from dreamer_racing.terminal import leave_terminal
+
+HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
+ENDING = [number for number in (signal.SIGINT, signal.SIGTERM, HANG_UP) if number is not None]
+
 
 class GracefulExit:
-    """Turns SIGINT and SIGTERM into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag that a loop polls; a second signal raises `KeyboardInterrupt`.
 
-    The handlers from before are put back at exit. Outside the main thread, where Python allows no handlers, the flag
-    is never set.
+    A signal that is ignored, as SIGHUP under `nohup` and SIGINT in a shell's background, stays ignored. SIGHUP says
+    that the terminal is gone, perhaps several times, and is no second signal. The handlers from before are put back at
+    exit. Outside the main thread, where Python allows no handlers, the flag is never set.
 
     Args:
         answer: Said at once at the first signal, after its name; nothing if empty.
@@ -49,8 +55,9 @@ class GracefulExit:
 
     def __enter__(self) -> GracefulExit:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+            for number in ENDING:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(
@@ -62,7 +69,11 @@ class GracefulExit:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
+        if number == HANG_UP:
+            leave_terminal()
         if self._arrived:
+            if HANG_UP in (number, self._arrived):
+                return
             raise KeyboardInterrupt(number)
         self._arrived = number
         if not self._agree:

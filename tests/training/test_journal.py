@@ -34,3 +34,15 @@ def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     interval, never = Interval(2.0), Interval(0.0)
     for now[0], due in ((119.0, False), (120.0, True), (200.0, False), (245.0, True)):
         assert interval.due() == due and not never.due()
+
+
+def test_the_first_time_of_an_interval_may_come_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    intervals = {minutes: Interval(minutes, first=2.0) for minutes in (0.0, 1.0, 10.0)}
+    due: dict[float, list[int]] = {minutes: [] for minutes in intervals}
+    for minute in range(1, 25):
+        now[0] = 60.0 * minute
+        for minutes, interval in intervals.items():
+            due[minutes] += [minute] if interval.due() else []
+    assert due == {0.0: [2], 1.0: list(range(1, 25)), 10.0: [2, 12, 22]}

@@ -159,3 +159,18 @@ def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) ->
     with pytest.raises(WorkerError):
         run.go()
     assert [env_steps_of(path) for path in (tmp_path / "checkpoints").glob("checkpoint-*")] == [12]
+
+
+@pytest.mark.parametrize(("every", "saved"), [(10**6, [104, 200]), (0, [200])])
+def test_a_run_that_saves_on_the_way_does_so_within_two_minutes(
+    every: int, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    run = Run(tmp_path, total=200, rollout=4, save_every=every)
+
+    def pass_time(updates: int) -> None:
+        now[0] = 60.0 * 0.015 * updates
+
+    run.on_update = pass_time
+    assert [env_steps for event, env_steps in run.go() if event == "saved"] == saved
