@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dreamer_racing.settings import suggestion
+from dreamer_racing.terminal import take_any_terminal
 
 PACKAGE = Path(__file__).resolve().parent
 
@@ -37,6 +38,7 @@ def usage(folder: Path) -> Iterator[str]:
 
 def main() -> None:
     """Run the recipe that the command line names, as `python recipes/RECIPE.py` does."""
+    take_any_terminal()
     folder = recipes_folder()
     name, *overrides = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h"):

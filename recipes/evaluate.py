@@ -39,6 +39,7 @@ from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import check_settings
+from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION, RunDirectory, replace_text
 
 PROTOCOLS = ("nominal", "full")
@@ -70,7 +71,7 @@ def main(config: DictConfig) -> None:
         if not report:
             write_markdown(directory, results, written["provenance"])
         replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
-    print(f"\nwritten to {directory}")
+    say(f"\nwritten to {directory}")
 
 
 def check(config: EvaluateConfig) -> None:
@@ -122,7 +123,7 @@ def evaluate_nominal(report: EvaluationReport) -> dict[str, Any]:
         result = report.evaluate(deterministic=name == "deterministic")
         report.write(name, result)
         written[name] = result.to_dict()
-        print(f"\n{name} policy, {len(result.episodes)} episodes\n{result.summary()}")
+        say(f"\n{name} policy, {len(result.episodes)} episodes\n{result.summary()}")
     report.close()
     return written
 
@@ -136,7 +137,7 @@ def evaluate_fully(config: EvaluateConfig, restored: Restored, directory: Path) 
     results = []
     for result in run_protocol(policy, worlds, config.episodes, num_envs=config.num_envs, seed=config.seed):
         results.append(result)
-        print(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
+        say(f"\n{result.preset}, {result.condition}, {result.mode} policy\n{result.evaluation.summary()}")
         if result.preset == trained.env.preset:
             write_flight(directory, result, config.video_steps)
         path = RunDirectory(directory).evaluations / f"{result.name}.json"
@@ -171,7 +172,7 @@ def write_markdown(directory: Path, results: list[Result], provenance: dict[str,
     meanings = "\n".join(f"- `{condition.name}`: {condition.meaning}" for condition in CONDITIONS)
     plots = "\n\n".join(f"![{name}](plots/{name}.png)" for name in ("conditions", *(f"crashes_{p}" for p in PRESETS)))
     text = f"{heading(title, provenance)}\n{results_table(results)}\n{meanings}\n\n{plots}\n"
-    (directory / "evaluation.md").write_text(text)
+    (directory / "evaluation.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

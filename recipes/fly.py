@@ -21,6 +21,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import composing  # noqa: F401 - first: says how to run this where packages are missing
 import numpy as np
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
@@ -45,6 +46,7 @@ from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION
 
 GIF_SIZE = 256  # pixels, least side of either picture
@@ -159,7 +161,7 @@ def fly(config: FlyConfig) -> None:
         result = flight.fly()
         flight.env.close()
         laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
-        print(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
+        say(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
         write(directory, flight.env.track, result)
 
 

@@ -29,6 +29,7 @@ from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, si
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import check_settings
+from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import replace_text
 
 RESULT = "perception.json"
@@ -57,7 +58,7 @@ def main(config: DictConfig) -> None:
     provenance = restored.provenance(settings, time.monotonic() - started)
     with plain_disk_errors():
         write(directory, looked, corrupted, provenance, worlds_of(restored.trained)["camera"])
-    print(f"\nwritten to {directory}")
+    say(f"\nwritten to {directory}")
 
 
 @dataclass
@@ -105,7 +106,7 @@ def fly_and_look(config: PerceptionConfig, restored: Restored, tracks: dict[str,
             num_trajectories=config.episodes,
             record_pixels=False,
         )
-        print(f"\n{name}, {len(flown.trajectories)} flights recorded\n{flown.summary()}")
+        say(f"\n{name}, {len(flown.trajectories)} flights recorded\n{flown.summary()}")
         sights = measure_sight(flown.trajectories, track, worlds["camera"], decoys)
         looked[name] = Looked(track, flown.gates_per_episode, flown.success_rate, flown.trajectories[0], sights)
     return looked
@@ -121,7 +122,7 @@ def fly_corrupted(config: PerceptionConfig, restored: Restored, start_noise: flo
             policy = CorruptedPolicy(restored.flyer.evaluation_policy(), make())
             flown = fly(policy, worlds, config.episodes, mode == "deterministic", config.num_envs, num_trajectories=0)
             results.append(Result(trained.env.preset, name, mode, worlds["track"], flown))
-            print(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
+            say(f"\n{name} images, {mode} policy, start noise {start_noise:g}\n{flown.summary()}")
     return results
 
 
@@ -136,7 +137,7 @@ def write(
     title = f"{provenance['algorithm']} on {provenance['track']}, {provenance['env_steps']:,} env_steps"
     flights = {name: (kind.track, kind.trajectory, kind.sights) for name, kind in looked.items()}
     plot_sight(flights, camera, directory / "perception.png", title)
-    (directory / "perception.md").write_text(to_markdown(title, looked, corrupted, provenance))
+    (directory / "perception.md").write_text(to_markdown(title, looked, corrupted, provenance), encoding="utf-8")
     numbers = {
         "flights": {name: kind.to_dict() for name, kind in looked.items()},
         "image_corruptions": [

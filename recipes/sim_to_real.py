@@ -30,6 +30,7 @@ from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
 from dreamer_racing.settings import COUNT, Range, check_settings, setting
+from dreamer_racing.terminal import say
 
 PILOT = "pilot"
 RESULT, RESULT_BESIDE = "sim_to_real.json", "sim_to_real_pilot.json"
@@ -84,7 +85,7 @@ def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimTo
         flown.append(flight._asdict())
         lap = "–" if flight.lap_time is None else f"{flight.lap_time:.2f} s"
         words = f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}"
-        print(f"{actor}: {words}", flush=True)
+        say(f"{actor}: {words}")
     made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": actor, "track": track.name}
     return {"provenance": {**made, "preset": config.preset, "flights": config.flights}, "flights": flown}
 
