@@ -161,7 +161,7 @@ def test_what_was_delivered_before_workers_were_lost_is_saved(tmp_path: Path) ->
     assert [env_steps_of(path) for path in (tmp_path / "checkpoints").glob("checkpoint-*")] == [12]
 
 
-@pytest.mark.parametrize(("every", "saved"), [(10**6, [104, 200]), (0, [200])])
+@pytest.mark.parametrize(("every", "saved"), [(10**6, [112, 204]), (0, [204])])
 def test_a_run_that_saves_on_the_way_does_so_within_two_minutes(
     every: int, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
