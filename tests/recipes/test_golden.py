@@ -151,8 +151,6 @@ def store() -> None:
 
 if __name__ == "__main__":
     import os
-    import sys
 
-    sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
     os.environ.setdefault("MUJOCO_GL", "egl")
     store()
