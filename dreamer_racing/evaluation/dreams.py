@@ -80,7 +80,7 @@ class Dream:
             with np.load(path) as file:
                 real, reconstructed, predicted = (file[name] for name in ("real", "reconstructed", "imagined"))
                 context, frame_dt = int(file["context"]), float(file["frame_dt"])
-                from_pose = "from_pose" in file and bool(file["from_pose"])  # older ones do not say
+                from_pose = bool(file["from_pose"])
         except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"{path} holds no dream, or half of one.") from error
         imagined = np.concatenate((reconstructed[:, :context], predicted), axis=1)

@@ -212,7 +212,7 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
 
     Raises:
         ValueError: this is no such file, or it was cut short.
-        TrackError: its track cannot be flown; or, in a file of before tracks were in it, is not there any more.
+        TrackError: its track cannot be flown.
         OSError: it cannot be read.
     """
     text = Path(path).read_text(encoding="utf-8", errors="replace")
@@ -252,9 +252,7 @@ def read_trajectory(path: str | Path) -> tuple[Trajectory, Track]:
 
 
 def _read_track(text: str, path: str | Path) -> Track:
-    """Read a track that a file holds, or, in older ones, names."""
-    if not text.startswith("{"):
-        return load_track(text)
+    """Read the track that a file holds."""
     try:
         content = json.loads(text)
     except ValueError as error:

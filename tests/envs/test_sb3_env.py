@@ -27,8 +27,10 @@ def vec_env(num_envs: int = 3, observation: str = "vector", **arguments) -> Dron
     return DroneRaceVecEnv("circle", num_envs, observation, **arguments)
 
 
-@pytest.mark.parametrize("observation", POLICIES)
-@pytest.mark.parametrize("name", dreamer_racing.GYM_ENVIRONMENTS)
+@pytest.mark.parametrize(
+    ("name", "observation"),
+    [*(("Circle", each) for each in POLICIES), *((each, "vector") for each in dreamer_racing.GYM_ENVIRONMENTS)],
+)
 @pytest.mark.filterwarnings("error")
 def test_checker_finds_nothing(name: str, observation: str) -> None:
     env = gymnasium.make(f"dreamer_racing/{name}-v0", observation=observation, render_mode="rgb_array")

@@ -66,9 +66,6 @@ def test_a_track_that_was_changed_since_is_drawn_as_it_was_flown(tmp_path):
     mine = replace(load_track("circle"), name="kidney", laps=2)  # called as another, as an edited copy may be
     write_trajectory(tmp_path / "flight.csv", random_flight(), mine)
     assert read_trajectory(tmp_path / "flight.csv")[1] == mine
-    lines = (tmp_path / "flight.csv").read_text().splitlines()
-    (tmp_path / "old.csv").write_text("\n".join(["# track: figure8", *lines[1:]]) + "\n")  # as before
-    assert read_trajectory(tmp_path / "old.csv")[1] == load_track("figure8")
 
 
 def test_value_and_images_come_back_with_the_flight(tmp_path):
