@@ -60,7 +60,7 @@ class Evaluation:
     """The episodes of an evaluation, and statistics of them.
 
     Args:
-        episodes: every episode, in the order in which they were dealt to the environments.
+        episodes: every episode, in the order in which they were assigned to the environments.
         num_gates: race gates of the track.
         trajectories: the recorded ones.
     """
@@ -230,7 +230,7 @@ def evaluate(
 ) -> Evaluation:
     """Fly exactly this many whole episodes.
 
-    Episodes are dealt to the environments beforehand (number k to environment k mod N), so that how long an episode
+    Episodes are assigned to the environments beforehand (number k to environment k mod N), so that how long an episode
     lasts has no influence on whether it counts. Only recorded images are kept.
 
     Args:
@@ -262,7 +262,7 @@ def evaluate(
     """
     control_dt = _check(env, episodes)
     num_envs = env.batch_size[0]
-    shares = deal(episodes, num_envs)
+    shares = split_episodes(episodes, num_envs)
     logs = [_EpisodeLog(control_dt) for _ in range(num_envs)]
     flown: list[list[Episode]] = [[] for _ in range(num_envs)]
     with set_exploration_type(exploration_type):
@@ -294,8 +294,8 @@ def evaluate(
     return Evaluation(ordered, env.worlds.track.num_gates, recorder.trajectories(control_dt, tilt))
 
 
-def deal(episodes: int, worlds: int) -> list[int]:
-    """Return how many of some episodes each world has: one more or less, so that how they go has no say in it."""
+def split_episodes(episodes: int, worlds: int) -> list[int]:
+    """Return the number of episodes of each world, which differ by one at most, fixed before any is flown."""
     return [episodes // worlds + (index < episodes % worlds) for index in range(worlds)]
 
 

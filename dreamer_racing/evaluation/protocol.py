@@ -13,7 +13,7 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.looks import LooksRandomisation
 from dreamer_racing.envs.tracks import Track, displace_gates, load_track
 from dreamer_racing.evaluation.course import Course
-from dreamer_racing.evaluation.evaluate import Evaluation, deal
+from dreamer_racing.evaluation.evaluate import Evaluation, split_episodes
 from dreamer_racing.learners.learner import Policy
 
 EPISODES = 100
@@ -34,7 +34,7 @@ class Condition:
         camera_tilt: half-width of the uniform draw that is added to the camera's tilt in every episode, degrees.
         gate_shift: radius of the ball in which every gate is displaced, m.
         gate_turn: half-width of the uniform draw of every gate's turn, degrees.
-        num_tracks: how many displaced tracks there are; episodes are dealt evenly to them.
+        num_tracks: how many displaced tracks there are; episodes are split evenly among them.
     """
 
     name: str
@@ -137,7 +137,7 @@ def run_protocol(
             if condition.needs_images and not worlds.get("from_pixels", True):
                 continue
             races = list(condition.races(track, seed))
-            shares = deal(episodes, len(races))
+            shares = split_episodes(episodes, len(races))
             for mode in MODES:
                 parts = [
                     fly(

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.evaluation.course import Course, act
 from dreamer_racing.evaluation.dreams import Painter, dream, find_painter, record_dream
-from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, deal
+from dreamer_racing.evaluation.evaluate import Evaluation, Trajectory, split_episodes
 from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
 from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
@@ -130,7 +130,7 @@ class ReturnReport:
         directory: of the run; files go to its `videos` and `evaluations` folders.
         learner: whose policy acts.
         env: batch size [N], with `pixels` or `vector`.
-        episodes: episodes of an evaluation, dealt to the N worlds beforehand.
+        episodes: episodes of an evaluation, assigned to the N worlds beforehand.
         video_steps: steps that the video shows at most.
         seed: of the environment, anew at each evaluation: all meet the same starts, also in a run that was resumed.
     """
@@ -179,7 +179,7 @@ class ReturnReport:
     def _act(self) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Return the episodes' returns and lengths ``(episodes,)`` and the images of world 0's first episode."""
         num_envs = self._env.batch_size[0]
-        left = torch.tensor(deal(self.episodes, num_envs))
+        left = torch.tensor(split_episodes(self.episodes, num_envs))
         total, length = torch.zeros(num_envs), torch.zeros(num_envs)  # (N,) of the episodes under way
         returns, lengths, frames, filming = [], [], [], True
         self._env.set_seed(self._seed)

@@ -8,7 +8,7 @@ import torch
 from dreamer_racing.modules.heads import symexp
 from tests.running_recipes import module_of
 
-seeing = module_of("benchmarks", "seeing")
+state_estimation = module_of("benchmarks", "state_estimation")
 
 
 def shown(number: int, tangled: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -21,12 +21,12 @@ def shown(number: int, tangled: bool) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize(("tangled", "least", "most"), [(False, 0.0, 1e-6), (True, 0.95, 1.1)])
 def test_a_linear_map_tells_what_is_linear(tangled: bool, least: float, most: float) -> None:
     torch.manual_seed(0)
-    assert least <= seeing.linear_share(shown(4000, tangled), shown(1000, tangled)) <= most
+    assert least <= state_estimation.linear_share(shown(4000, tangled), shown(1000, tangled)) <= most
 
 
 def test_a_probe_that_learns_on_tells_what_is_tangled() -> None:
     torch.manual_seed(0)
     learned, measured = shown(4000, tangled=True), shown(1000, tangled=True)
-    probe = seeing.Probe(7, 2)
-    late = seeing.settle(probe, learned, measured, 20)["share"]
-    assert seeing.settle(probe, learned, measured, 400)["share"] < 0.5 * late
+    probe = state_estimation.Probe(7, 2)
+    late = state_estimation.settle(probe, learned, measured, 20)["share"]
+    assert state_estimation.settle(probe, learned, measured, 400)["share"] < 0.5 * late

@@ -1,8 +1,8 @@
 """How much of the simulator's state can be told from the latents of an agent, or of a fresh world model that learns.
 
-    OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/circle runs/kidney --json seeing.json
-    OMP_NUM_THREADS=1 python benchmarks/seeing.py runs/kidney --variant "" model.learning_rate=2e-3 size.cnn_depth=32 \
-        "loss.world_model=reconstruction loss.image_scale=0.003"
+    OMP_NUM_THREADS=1 python benchmarks/state_estimation.py runs/circle runs/kidney --json state_estimation.json
+    OMP_NUM_THREADS=1 python benchmarks/state_estimation.py runs/kidney --variant "" size.cnn_depth=32 \
+        model.learning_rate=2e-3 "loss.world_model=reconstruction loss.image_scale=0.003"
 
 As it stands, an agent flies, sampling, in 64 worlds of which half begin on a line; the state is told from the latents
 with which it acts, 52 worlds to learn from and 12 to measure. So any run can be compared, whatever its replay.
@@ -69,7 +69,7 @@ def main() -> None:
                 if variant is None
                 else learning(trained, variant, arguments.updates, arguments.every)
             )
-            rows = [{"benchmark": "seeing", **trained.where, **record} for record in found]
+            rows = [{"benchmark": "state_estimation", **trained.where, **record} for record in found]
             print_table(rows, COLUMNS)
             records += rows
             write_json(records, arguments.json)  # of all so far: a later variant may not fit
