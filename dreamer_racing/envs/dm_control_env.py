@@ -168,7 +168,7 @@ class Physics(mujoco.Physics):
     """One drone in its hall.
 
     Its flight controller and motors run in every physics step. What they remember (rotor speeds, commands under way)
-    lives in `quadrotor`, outside MuJoCo's own state: `get_state`, `copy` and pickling do not carry it.
+    lives in `quadrotor`, outside MuJoCo's own state: `get_state` does not carry it, and copies and pickles are refused.
 
     Args:
         data: the simulation of a scene of `build_scene`.
@@ -182,6 +182,21 @@ class Physics(mujoco.Physics):
         qpos, qvel, force = (torch.from_numpy(array).unsqueeze(0) for array in arrays)
         self._flight = FusedFlight(quadrotor, qpos, qvel, force, self._integrate)
         self._start_path()
+
+    def copy(self, share_model: bool = False) -> "Physics":
+        """Refuse, as with `copy.deepcopy` and pickling: the copy would have no flight controller, or share this one's.
+
+        Raises:
+            TypeError: always; the message says what to do instead.
+        """
+        raise TypeError(
+            "This race cannot be copied or pickled: make another by load() with the same arguments. With the same "
+            "random= and the same actions it flies the same."
+        )
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled."""
+        return self.copy()
 
     def position(self) -> np.ndarray:
         """Position (3,) in the world, m."""
