@@ -32,8 +32,8 @@ sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 import dreamer_v3
 from composing.arena import make_env
 from composing.building import make_collector
-from composing.command_line import CONFIG_DIR
 from composing.learners import make_learner
+from composing.options import CONFIG_DIR
 from composing.schema import CollectorKind, DreamerConfig
 from composing.workers import make_own_env, make_rollouts
 

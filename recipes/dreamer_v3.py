@@ -21,11 +21,11 @@ from composing.building import (
     seed_generators,
 )
 from composing.checks import check_dreamer, steps_alone
-from composing.command_line import CONFIG_DIR
 from composing.devices import choose_device, choose_mixed_precision
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, make_learner, make_schedule
+from composing.options import CONFIG_DIR
 from composing.schema import CollectorKind, DreamerConfig, register
 from composing.sharing import imagines, share_of
 from composing.tuned import changed_from_tuned

@@ -18,10 +18,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
 
+from composing.callbacks import FAILURES
 from composing.checks import check_variant
 from composing.command_line import as_override, merge_overrides, override_key
 from composing.entry import in_plain_words, recipe
-from composing.report import FAILURES
 from composing.saved import read_yaml
 from composing.schema import ExperimentConfig, RunConfig, register
 from hydra import compose

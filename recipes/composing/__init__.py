@@ -6,13 +6,13 @@ from composing.missing import refuse_without_packages
 
 refuse_without_packages()  # before anything needs them
 
-from composing.interruption import end_quietly  # noqa: E402
-from composing.usage import answer_help  # noqa: E402
+from composing.messages import end_quietly  # noqa: E402
+from composing.usage import answer_early  # noqa: E402
 from dreamer_racing.caches import CacheError, ensure_caches  # noqa: E402
 from dreamer_racing.terminal import take_any_terminal  # noqa: E402
 
 take_any_terminal()
-answer_help()  # here, because it is before torch is loaded, which takes seconds
+answer_early()  # here, because it is before torch is loaded, which takes seconds
 try:
     ensure_caches()  # before Matplotlib is loaded
 except CacheError as error:

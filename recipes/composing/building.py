@@ -24,8 +24,9 @@ from composing.arena import (
     worlds_device,
 )
 from composing.checks import refuse_to_replace
-from composing.command_line import CONFIG_DIR, new_run_dir
+from composing.command_line import new_run_dir
 from composing.devices import choose_device
+from composing.options import CONFIG_DIR
 from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing import parallel

@@ -3,7 +3,6 @@
 import logging
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -14,11 +13,10 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf.errors import MissingMandatoryValue
 
+from composing.messages import say_error
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
-CONFIG_DIR = Path(__file__).parents[1] / "config"
 AGENTS = Path(__file__).parents[2] / "agents"
-HEAD_START = 10.0  # s that the first of several processes has to say an error; longer than it takes to end the others
 
 
 @contextmanager
@@ -49,27 +47,11 @@ def plain_disk_errors() -> Iterator[None]:
         raise SystemExit(1) from error
 
 
-def say_error(error: object) -> None:
-    """Say on stderr why nothing was begun.
-
-    Of several processes that `torchrun` started, the first goes ahead: at its end the others are ended too, and so what
-    is wrong for all of them is said once.
-    """
-    if follows():
-        time.sleep(HEAD_START)
-    print(f"error: {error}", file=sys.stderr, flush=True)
-
-
 def start_logging() -> None:
     """Show what the package chose and why, one line each."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout, force=True)
     logging.getLogger("dreamer_racing").setLevel(logging.INFO)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-
-
-def follows() -> bool:
-    """Whether `torchrun` started this process beside a first one."""
-    return int(os.environ.get("WORLD_SIZE") or 1) > 1 and os.environ.get("RANK") != "0"
 
 
 def follow_quietly() -> None:

@@ -1,32 +1,20 @@
 """Entry points: a recipe's `main`, given what hydra composes of the command line, or plain words on what it cannot."""
 
-import difflib
 import functools
 import os
 import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from typing import Any
 
 import hydra
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import (
-    CONFIG_DIR,
-    as_override,
-    follows,
-    hydra_takes,
-    override_key,
-    plain_errors,
-    say_error,
-)
-from composing.interruption import INTERRUPTED
-from dreamer_racing.settings import shortened, suggestion
+from composing.command_line import as_override, hydra_takes, override_key
+from composing.messages import INTERRUPTED, follows, say_error
+from composing.options import CONFIG_DIR, FLAGS, no_such_choice, no_such_setting
 
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
@@ -37,13 +25,6 @@ PLAIN = {
     r"Invalid type assigned: .*Ramp.*": "a schedule has an end and times of its own, NAME.to=, .begin=, .end=",
 }
 """What the libraries say, and what is said instead."""
-FLAGS = {"--json": "json=true"}
-"""Settings that are customary as flags, for recipes that have them."""
-HYDRAS_FLAGS = (
-    "--cfg", "--config-dir", "--config-name", "--config-path", "--experimental-rerun", "--help", "--hydra-help",
-    "--info", "--multirun", "--package", "--resolve", "--run", "--shell-completion", "--version",
-)  # fmt: skip
-"""Flags that are hydra's own; it takes the beginnings of their names, too."""
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
@@ -66,9 +47,6 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
             sys.excepthook = sys.__excepthook__  # packages are loaded
             sys.argv[1:] = [readable(FLAGS.get(argument, argument)) for argument in sys.argv[1:]]
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors as they are, instead of hydra's own page
-            with plain_errors():
-                refuse_dashes(sys.argv[1:])
-                refuse_unknown_settings(sys.argv[1:], name)
             try:
                 main()
             except HydraException as error:
@@ -112,7 +90,7 @@ def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[
         return no_such_setting(match[1], recipe_name)
     if match := re.search(r"Could not find '(.+)/(.+?)'\n\nAvailable options in '.+?':\n((?:\t.+\n)+)", text):
         group, choice, choices = match[1], match[2], [word for word in match[3].split() if word != "schema"]
-        return f"{group}={choice}: there are {', '.join(choices)}{suggestion(choice, choices)}."
+        return no_such_choice(group, choice, choices)
     if match := re.search(r"Error merging override (.+)", text):
         wanted = str(cause).partition("\n")[0] if isinstance(cause, OmegaConfBaseException) else "it does not fit"
         for words, plain in PLAIN.items():
@@ -123,67 +101,3 @@ def in_plain_words(error: HydraException, recipe_name: str, overrides: Sequence[
         given = f"{match[1]}: an override is" if match else f"{' '.join(overrides)}: overrides are"
         return f"{given} written name=value, and a value with brackets, commas or spaces in quotes: 'name=\"a, b\"'."
     return " ".join(text.split())
-
-
-def no_such_setting(name: str, recipe_name: str) -> str:
-    """Say that there is no setting of a name, and which may be meant."""
-    ready = GlobalHydra.instance().is_initialized()  # in the midst of an experiment
-    with nullcontext() if ready else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-        known = setting_names(hydra.compose(recipe_name))
-    if name in known:  # a group that nothing is taken from where nobody says so
-        return f"{name}: is added, with a plus: +{name}=..."
-    last = {full.rpartition(".")[2]: full for full in known}
-    close = difflib.get_close_matches(name, known, n=1) or [
-        last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)
-    ]
-    meant = f" (did you mean {close[0]}?)" if close else ""
-    return f"{name}: there is no such setting of recipes/{recipe_name}.py{meant}. docs/options.md has them all."
-
-
-def setting_names(config: DictConfig, prefix: str = "") -> list[str]:
-    """Return the dotted names of all settings and groups."""
-    names = []
-    for key in config:
-        name = prefix + str(key)
-        names.append(name)
-        if not OmegaConf.is_missing(config, key) and isinstance(inner := config[key], DictConfig):
-            names += setting_names(inner, f"{name}.")
-    return names
-
-
-def refuse_dashes(arguments: Sequence[str]) -> None:
-    """Refuse a setting that is written as a flag, of which hydra has some of its own.
-
-    Raises:
-        ValueError: the message says how it is written.
-    """
-    for argument in arguments:
-        flag, _, value = argument.partition("=")
-        if flag.startswith("--") and not any(known.startswith(flag) for known in HYDRAS_FLAGS):
-            written = f"{flag[2:].replace('-', '_')}={value or 'VALUE'}"
-            raise ValueError(f"{argument}: settings are written without dashes, {written}.")
-
-
-def refuse_unknown_settings(overrides: Sequence[str], recipe_name: str) -> None:
-    """Refuse +name=value of what is neither a group of configurations nor a free entry: nothing would read it.
-
-    A list of lists for a group is refused too: hydra fails on it.
-
-    Raises:
-        ValueError: the message says which may be meant.
-    """
-    for override in overrides:
-        group, _, value = override.partition("=")
-        if value.replace(" ", "").startswith("[[") and (CONFIG_DIR / group.lstrip("+")).is_dir():
-            raise ValueError(f"{group}={shortened(value)}: a group takes the name of one of its configurations.")
-    added = [override_key(override) for override in overrides if override.startswith("+")]
-    if not added or any(override.startswith(("--config", "-c")) for override in overrides):
-        return  # with configurations of one's own there may be other groups
-    with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-        config = hydra.compose(recipe_name)
-    known = set(setting_names(config))
-    for name in added:
-        inside = OmegaConf.select(config, name.rpartition(".")[0]) if "." in name else None
-        free = isinstance(inside, DictConfig) and OmegaConf.get_type(inside) is dict
-        if not (free or name in known or name.startswith("hydra") or (CONFIG_DIR / name).is_dir()):
-            raise ValueError(no_such_setting(name, recipe_name))

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from composing.command_line import CONFIG_DIR
+from composing.options import CONFIG_DIR
 from dreamer_racing.figures.runs import flatten
 
 

@@ -1,46 +1,40 @@
-"""What `--help` says of a recipe: its own words, its groups and its options. No torch, so that it is there at once."""
+"""What a recipe answers before torch is loaded: `--help`, and slips of the pen."""
 
 from __future__ import annotations
 
 import ast
 import os
-import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import wrap
-from typing import NamedTuple
 
-import yaml
+from composing.messages import say_error
+from composing.options import FOLDER, groups, options, refuse_slips
 
-FOLDER = Path(__file__).parents[1]
-OPTIONS = FOLDER.parent / "docs" / "options.md"
-TRAINING = ("dreamer_v3", "ppo", "sac")
 WIDTH, COLUMN = 118, 42
 
 
-class Option(NamedTuple):
-    """A row of the page."""
-
-    name: str  # with the sign that follows it
-    default: str
-    allowed: str
-    meaning: str
-
-
-def answer_help() -> None:
-    """Print the help and leave, if the command line of a recipe asks for it."""
+def answer_early() -> None:
+    """Print the help of the recipe that is started, if it is asked for, or say which setting is none; and leave."""
     program = Path(sys.argv[0])
-    if program.resolve().parent == FOLDER and {"--help", "-h"} & set(sys.argv[1:]):
+    if program.resolve().parent != FOLDER:
+        return
+    if {"--help", "-h"} & set(sys.argv[1:]):
         try:
             print("\n".join(usage(program.stem)), flush=True)
         except BrokenPipeError:  # `| head` has what it wanted: what is left goes nowhere, also at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
+    try:
+        refuse_slips(program.stem, sys.argv[1:])
+    except ValueError as error:
+        say_error(error)
+        raise SystemExit(2) from error
 
 
 def command(recipe: str) -> str:
-    """The words that start a recipe: from a clone its file, from an installed package, which holds it, the package."""
+    """Return the words that start a recipe: from a clone its file, from an installed package, which holds it, that."""
     installed = (FOLDER.parent / "__main__.py").is_file()
     return f"python -m dreamer_racing {recipe}" if installed else f"python recipes/{recipe}.py"
 
@@ -54,42 +48,16 @@ def usage(recipe: str) -> Iterator[str]:
         for name, choices in found.items():
             yield from _entry(f"{name}=", ", ".join(choices))
         yield ""
-    sections = tables(OPTIONS.read_text(encoding="utf-8"))
     yield "Options (NAME=DEFAULT; `chosen` means: by the recipe, which prints it)"
     family = ""
-    shared = sections["All training recipes"] if recipe in TRAINING else []
-    options = {option.name: option for option in (*shared, *sections.get(f"recipes/{recipe}.py", []))}
-    for name, default, allowed, meaning in options.values():
-        if (own := name.partition(".")[0] if "." in name else "") != family:
+    for option in options(recipe):
+        if (own := option.name.partition(".")[0] if "." in option.name else "") != family:
             family = own
             yield ""
-        may_be = f"({allowed})" if allowed else ""
-        yield from _entry(f"{name}{default}", " ".join(filter(None, (meaning, may_be))))
+        may_be = f"({option.allowed})" if option.allowed else ""
+        text = " ".join(filter(None, (option.meaning, may_be)))
+        yield from _entry(f"{option.name}={option.default}".replace("`", ""), text.replace("`", ""))
     yield from ("", "More: docs/options.md, docs/recipes.md")
-
-
-def groups(recipe: str) -> dict[str, list[str]]:
-    """Return the configuration groups that a recipe composes, and what there is to choose in each."""
-    config = FOLDER / "config"
-    defaults = yaml.safe_load((config / f"{recipe}.yaml").read_text(encoding="utf-8")).get("defaults", [])
-    named = [name for entry in defaults if isinstance(entry, dict) for name in entry if "/" not in name]
-    named += ["decoys"] if recipe in TRAINING else []
-    choices = {name: sorted(path.stem for path in (config / name).glob("*.yaml")) for name in named}
-    return {name: found for name, found in choices.items() if found}
-
-
-def tables(page: str) -> dict[str, list[Option]]:
-    """Read the page of options by its sections."""
-    found: dict[str, list[Option]] = {}
-    section = ""
-    for line in page.splitlines():
-        if line.startswith("## "):
-            section = line.removeprefix("## ").strip("`")
-        elif line.startswith("| `"):
-            cells = re.split(r"(?<!\\)\|", line)[1:-1]
-            option = Option(*(cell.strip().replace("`", "").replace("\\|", "|") for cell in cells))
-            found.setdefault(section, []).append(option)
-    return found
 
 
 def _entry(name: str, text: str) -> Iterator[str]:

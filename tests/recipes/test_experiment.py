@@ -58,7 +58,7 @@ def test_a_variant_of_the_command_line_is_not_handed_to_the_recipe(tmp_path: Pat
 
 
 def test_failures_of_an_earlier_command_are_forgotten(tmp_path: Path) -> None:
-    report = recipe_module("composing.report")
+    report = recipe_module("composing.callbacks")
     note = tmp_path / report.FAILURES / "ppo_circle_slip_seed0.txt"
     note.parent.mkdir()
     note.write_text("variant=slip: there are default")

@@ -40,11 +40,9 @@ values = st.one_of(numbers.map(str), st.text(max_size=20), st.sampled_from(["nul
 
 
 def names(recipe: str) -> list[str]:
-    entry = recipe_module("composing.entry")
     recipe_module("composing.schema").register()
     recipe_module(recipe)  # some have schemas of their own
-    with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
-        return entry.setting_names(hydra.compose(recipe))
+    return recipe_module("composing.options").names(recipe)
 
 
 def compose(recipe: str, *overrides: str) -> DictConfig:

@@ -232,7 +232,7 @@ def test_figures_are_named_where_one_chooses_them(recipe):
 def test_figures_of_an_experiment_do_not_depend_on_each_other(runs):
     write_run(runs / "runs", "dreamer_v3_circle_paper_seed2", seed=2, env={"preset": "faithful"})
     config = OmegaConf.create({"hydra": {"sweep": {"dir": str(runs / "runs")}}})
-    recipe_module("composing.report").DrawFigures().on_multirun_end(config)
+    recipe_module("composing.callbacks").DrawFigures().on_multirun_end(config)
     assert (runs / "runs" / "figures" / "trajectories.png").exists()
 
 

@@ -239,13 +239,12 @@ def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
 def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
     """Yield cases that compose, resolve and check a configuration."""
     sys.path.insert(0, str(ROOT / "recipes"))
-    from composing import checks, command_line, entry, schema
+    from composing import checks, command_line, entry, options, schema
     from dreamer_v3 import resolve
 
     schema.register()
     config_dir = str(ROOT / "recipes" / "config")
-    with hydra.initialize_config_dir(config_dir, version_base="1.3"):
-        names = entry.setting_names(hydra.compose("dreamer_v3"))
+    names = options.names("dreamer_v3")
     os.chdir(folder)
 
     def value() -> str:
@@ -260,7 +259,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
         quiet = io.StringIO()
         try:
             with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), command_line.plain_errors():
-                entry.refuse_unknown_settings(given, "dreamer_v3")
+                options.refuse_slips("dreamer_v3", given)
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
                 checks.check_overrides(config, given)
