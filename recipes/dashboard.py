@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 from composing.arena import worlds_of
-from composing.command_line import existing_agent_path, plain_errors, start_logging
-from composing.drawing import run_of, stage_name
+from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import restore
 from composing.schema import EvaluateConfig
@@ -29,10 +28,12 @@ from omegaconf import DictConfig, OmegaConf
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.protocol import fly as fly_races
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
+from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import write_page
 from dreamer_racing.figures.dashboard_live import serve
 from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
+from dreamer_racing.figures.plotting import run_of, stage_name
 from dreamer_racing.figures.runs import evaluation_files
 from dreamer_racing.figures.scene_3d import check_viser
 from dreamer_racing.settings import SEED, Range, check_settings, setting

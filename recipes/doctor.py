@@ -13,10 +13,10 @@ from pathlib import Path
 
 from composing.command_line import plain_errors
 from composing.entry import recipe
-from composing.examination import Diagnosis, Verdict, examine
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
+from dreamer_racing.doctor import Diagnosis, Verdict, examine
 from dreamer_racing.settings import COUNT, check_settings, setting
 
 

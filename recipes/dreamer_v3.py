@@ -21,7 +21,6 @@ from composing.building import (
     seed_generators,
 )
 from composing.checks import check_dreamer, steps_alone
-from composing.devices import choose_device, choose_mixed_precision
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import begin_with, make_learner, make_schedule
@@ -35,6 +34,7 @@ from torch import Tensor
 from torch import device as Device
 
 from dreamer_racing import parallel
+from dreamer_racing.devices import choose_device, choose_mixed_precision
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics, world_model_metrics

@@ -22,25 +22,28 @@ from typing import Any, NamedTuple, cast
 
 from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
-from composing.flight import (
-    HilConfig,
-    check,
-    check_flight,
-    link_config,
-    make_chain,
-    make_flyer,
-    make_operator,
-    pose_config,
-    stamping_of,
-)
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
+from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.hil.battery import STALE
 from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
-from dreamer_racing.hil.flyer import trained_track
+from dreamer_racing.hil.configuration import (
+    PILOT,
+    PILOT_RATE,
+    HilConfig,
+    check,
+    check_flight,
+    link_config,
+    make_chain,
+    make_operator,
+    pilot_contract,
+    pose_config,
+    stamping_of,
+)
+from dreamer_racing.hil.flyer import ActorFlyer, Flyer, trained_track
 from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
@@ -64,6 +67,25 @@ def main(config: DictConfig) -> None:
         if settings.actor is None:
             raise SystemExit(replay(settings) if settings.replay else report(settings))
     raise SystemExit(fly(settings))
+
+
+def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
+    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
+
+    Args:
+        config: Says who.
+        track: That a pilot is to fly; None: the one of its name.
+    """
+    assert config.actor is not None, "checked"
+    if config.actor == PILOT:
+        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
+
+        if config.track is None:
+            raise ValueError("track= is missing: actor=pilot has none of its own.")
+        rate = config.rate or PILOT_RATE
+        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
+    flyer = ActorFlyer(existing_agent_path("actor", config.actor))
+    return flyer, flyer.contract
 
 
 @contextmanager

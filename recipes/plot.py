@@ -13,10 +13,11 @@ named, and does not cost the others. `learning_curves.csv` beside a figure holds
 from typing import cast
 
 from composing.command_line import plain_errors, start_logging
-from composing.drawing import draw
 from composing.entry import recipe
-from composing.schema import PlotConfig, register
+from composing.schema import register
 from omegaconf import DictConfig, OmegaConf
+
+from dreamer_racing.figures.plotting import PlotConfig, draw
 
 register()
 

@@ -16,13 +16,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from composing.command_line import existing_agent_path, new_run_dir, plain_errors, start_logging
+from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.figures.sim_to_real import plot_study
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, trained_track

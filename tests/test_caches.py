@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from dreamer_racing import caches
-from tests.running_recipes import ROOT, recipe_module
+from dreamer_racing import caches, doctor
+from tests.running_recipes import ROOT
 
 
 @pytest.fixture
@@ -44,9 +44,8 @@ def test_the_doctor_says_so(tmp_path: Path, homeless: dict[str, str]) -> None:
 
 
 def test_the_doctor_tries_to_write_where_runs_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    examination = recipe_module("composing.examination")
-    monkeypatch.setattr(examination, "why_not_writable", lambda folder: "Read-only file system")
-    found = examination.disk(1.0, tmp_path / "runs")
+    monkeypatch.setattr(doctor, "why_not_writable", lambda folder: "Read-only file system")
+    found = doctor.disk(1.0, tmp_path / "runs")
     assert found.state.name == "wrong" and f"{tmp_path} takes no files (Read-only file system)" in found.found
 
 

@@ -85,11 +85,30 @@ def test_the_page_of_options_is_up_to_date(options):
     assert options.PAGE.read_text(encoding="utf-8") == options.make_page(), "run python docs/options.py"
 
 
-def test_comments_and_attributes_are_read(options):
-    source = '    a: int = 1  # of a\n    # of b,\n    # and more\n    b: str = "x"\n    c: float = 2.0\n'
-    assert options.of_comments(source) == {"a": "of a", "b": "of b, and more"}
-    docstring = "Says.\n\nAttributes:\n    a: Of a,\n        and more.\n    b: Of b.\n\nReference: none."
-    assert options.of_attributes(docstring) == {"a": "Of a, and more.", "b": "Of b."}
+def test_comments_and_attributes_are_read(tmp_path):
+    source = '''class Config:
+    """Says.
+
+    Attributes:
+        c: Of c,
+            and more.
+        d: Of d.
+
+    Reference: none.
+    """
+
+    a: int = 1  # of a
+    # of b,
+    # and more
+    b: str = "x"
+    c: float = 2.0
+    d: bool = True
+'''
+    (tmp_path / "config.py").write_text(source)
+    read = module_of("recipes", "composing.options")
+    module = read.Module(tmp_path / "config.py")
+    meanings = read.read_meanings(module.classes["Config"], module)
+    assert meanings == {"a": "of a", "b": "of b, and more", "c": "Of c, and more.", "d": "Of d."}
 
 
 def test_names_that_are_chosen_from_are_all_on_their_pages(options):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,15 +90,17 @@ def length(function: ast.FunctionDef) -> int:
 
 @pytest.mark.parametrize("folder", ["dreamer_racing", "recipes"])
 def test_functions_are_short(folder):
-    """But for kernels, which warp compiles whole."""
-    lengths = {name: length(function) for name, function in functions(folder) if not name.endswith("make_kernels")}
+    """But for kernels, which warp compiles whole, and the loops of recipes, which read top to bottom."""
+    whole = re.compile(r"make_kernels$|^recipes/\w+\.py: train$")
+    lengths = {name: length(function) for name, function in functions(folder) if not whole.search(name)}
     assert {name: lines for name, lines in lengths.items() if lines > 60} == {}
     assert sorted(lengths.values())[int(0.9 * len(lengths))] <= 24
 
 
 def test_few_plain_modules_stand_at_the_top():
     top = {path.name for path in PACKAGE.glob("*.py")} - {"__init__.py"}
-    assert top == {"__main__.py", "machine.py", "parallel.py", "settings.py"}
+    known = {"caches.py", "devices.py", "doctor.py", "machine.py", "parallel.py", "settings.py", "terminal.py"}
+    assert top == {"__main__.py", *known}
 
 
 def test_recipes_are_what_a_person_starts():

@@ -25,11 +25,11 @@ from composing.arena import (
 )
 from composing.checks import refuse_to_replace
 from composing.command_line import new_run_dir
-from composing.devices import choose_device
 from composing.options import CONFIG_DIR
 from composing.saved import flat_settings
 from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
 from dreamer_racing import parallel
+from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.race import EPISODE_TIME

@@ -16,8 +16,6 @@ from omegaconf.errors import MissingMandatoryValue
 from composing.messages import say_error
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 
-AGENTS = Path(__file__).parents[2] / "agents"
-
 
 @contextmanager
 def plain_errors(applies: Callable[[], bool] = lambda: True) -> Iterator[None]:
@@ -64,34 +62,6 @@ def follow_quietly() -> None:
 def new_run_dir(recipe: str, track: str) -> Path:
     """A fresh folder name below `runs/`."""
     return Path("runs") / f"{recipe}_{Path(track).stem}_{datetime.now():%Y%m%d-%H%M%S}"
-
-
-def agent_path(name: str) -> Path:
-    """The folder of an agent that ships, by its name; else the path that the name is."""
-    named = AGENTS / name
-    return named if Path(name).name == name and (named / "agent.json").is_file() else Path(name)
-
-
-def existing_agent_path(setting_name: str, name: str) -> Path:
-    """As `agent_path`, of something that is there.
-
-    Raises:
-        FileNotFoundError: nothing is; the message names the setting, and the agents that ship.
-    """
-    path = agent_path(name)
-    if not path.exists():
-        raise FileNotFoundError(f"{setting_name}={name}: there is no such file or folder. {agents_that_ship()}")
-    return path
-
-
-def agents_that_ship() -> str:
-    """A sentence that names them."""
-    return f"Agents that ship, to be given by name: {', '.join(agents_in(AGENTS)) or 'none'}."
-
-
-def agents_in(folder: Path) -> list[str]:
-    """The names of the agents that lie in a folder, sorted."""
-    return sorted(path.parent.name for path in folder.glob("*/agent.json"))
 
 
 def override_key(override: str) -> str:

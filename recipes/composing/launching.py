@@ -18,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 from composing.building import open_session
 from composing.checks import check_overrides, check_read
 from composing.command_line import (
-    agent_path,
     as_override,
     follow_quietly,
     merge_overrides,
@@ -32,6 +31,7 @@ from composing.schema import DreamerConfig, RunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import WorkerError
+from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (

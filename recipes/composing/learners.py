@@ -7,10 +7,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
 from composing.checks import steps_alone
-from composing.command_line import existing_agent_path
 from composing.saved import read_yaml
 from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
 from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner

@@ -9,8 +9,6 @@ from typing import Any, cast
 import torch
 
 from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
-from composing.command_line import agent_path, agents_that_ship
-from composing.devices import choose_device
 from composing.learners import IN_CHECKPOINTS, make_learner, make_schedule
 from composing.saved import trained_config
 from composing.schema import (
@@ -20,9 +18,11 @@ from composing.schema import (
     RunConfig,
     is_race,
 )
+from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track
 from dreamer_racing.export.actor_step import ActorStep
+from dreamer_racing.export.agents import agent_path, agents_that_ship
 from dreamer_racing.export.contract import hash_weights
 from dreamer_racing.export.shipped_agent import (
     AVERAGED,

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import cache
-from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
+from dreamer_racing.figures.plotting import PlotConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.dreamer_config import LearnerConfig
 from dreamer_racing.losses import LossConfig
@@ -371,31 +371,6 @@ class ExportConfig:
     steps: int = setting(200, COUNT)  # of a recorded flight, over which the export must fly as the original does
     renderer: str = "auto"
     seed: int = setting(0, SEED)
-
-
-class Aggregate(Enum):
-    """What stands for the seeds of a learning curve."""
-
-    mean = "mean"
-    iqm = "iqm"
-
-
-@dataclass
-class PlotConfig:
-    """`recipes/plot.py`."""
-
-    runs: Any = "runs"  # run directory, folder of some, pattern, or a list [a,b]; or a learning_curves.csv
-    figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
-    output: str = "figures"  # folder
-    quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
-    aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
-    axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
-    # of the curves' running mean, in units of their axis; null: 2 % of the longest run
-    window: float | None = setting(None, NOT_NEGATIVE)
-    flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
-    flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
-    over: str = "distance"  # axis of the speed profile: distance | time
-    dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
 
 
 def is_race(config: RunConfig) -> bool:

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.export import agents
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
 from dreamer_racing.training.checksums import write_checksums
@@ -151,9 +152,9 @@ def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> N
 
 
 def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    restoring, command_line = recipe_module("composing.restoring"), recipe_module("composing.command_line")
-    assert command_line.AGENTS == ROOT / "agents"
-    monkeypatch.setattr(command_line, "AGENTS", tmp_path)
+    restoring = recipe_module("composing.restoring")
+    assert agents.AGENTS == ROOT / "agents"
+    monkeypatch.setattr(agents, "AGENTS", tmp_path)
     with pytest.raises(FileNotFoundError, match="kidny: the path does not exist.* ship, to be given by name: none"):
         restoring.find_trained("kidny")
     for name in ("kidney", "circle"):
@@ -162,7 +163,7 @@ def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monk
     with pytest.raises(FileNotFoundError, match="by name: circle, kidney"):
         restoring.find_trained("kidny")
     (tmp_path / "unfinished").mkdir()
-    assert command_line.agents_in(tmp_path) == ["circle", "kidney"] and command_line.agents_in(tmp_path / "none") == []
+    assert agents.agents_in(tmp_path) == ["circle", "kidney"] and agents.agents_in(tmp_path / "none") == []
     assert restoring.find_trained("kidney") == restoring.find_trained(str(tmp_path / "kidney")) == tmp_path / "kidney"
 
 
@@ -184,7 +185,7 @@ def test_averaged_weights_that_were_not_kept_are_refused(run_dir: Path, tmp_path
     assert restoring.restore_learner(config, latest_checkpoint(run_dir), cpu, "trained")[0].averaged is None
 
 
-@pytest.mark.parametrize("name", recipe_module("composing.command_line").agents_in(ROOT / "agents"))
+@pytest.mark.parametrize("name", agents.agents_in(ROOT / "agents"))
 def test_each_agent_that_ships_is_restored(name: str) -> None:
     """Also those that were made when networks had fewer numbers."""
     folder = ROOT / "agents" / name
@@ -198,7 +199,7 @@ def test_each_agent_that_ships_is_restored(name: str) -> None:
 
 
 def test_the_agents_that_ship_are_whole_and_small() -> None:
-    folders = [ROOT / "agents" / name for name in recipe_module("composing.command_line").agents_in(ROOT / "agents")]
+    folders = [ROOT / "agents" / name for name in agents.agents_in(ROOT / "agents")]
     for folder in folders:
         assert {path.name for path in folder.iterdir()} == set(FILES)
         assert OmegaConf.load(folder / "config.yaml").run_dir is None

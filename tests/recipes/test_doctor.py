@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from dreamer_racing import doctor
 from dreamer_racing.experience.replay import replay_bytes
 from dreamer_racing.modules import SIZES
 from tests.running_recipes import compose, recipe, recipe_module
 
-examination = recipe_module("composing.examination")
-Verdict = examination.Verdict
+Verdict = doctor.Verdict
 
 
 def test_it_looks_at_everything_and_says_so(tmp_path: Path) -> None:
@@ -36,29 +36,29 @@ def test_what_does_not_fit_is_wrong_and_ends_with_1(tmp_path: Path) -> None:
 
 def test_it_asks_for_what_a_default_run_takes() -> None:
     recipe_module("doctor")  # which has its own schema
-    run, doctor = compose("dreamer_v3", "tuned=race"), compose("doctor")
-    assert (doctor.replay.capacity, doctor.checkpoint.keep) == (run.replay.capacity, run.checkpoint.keep)
+    run, asked = compose("dreamer_v3", "tuned=race"), compose("doctor")
+    assert (asked.replay.capacity, asked.checkpoint.keep) == (run.replay.capacity, run.checkpoint.keep)
     size = SIZES["cpu_small"]
     context = 2 * size.belief + 2 * size.latents * size.classes  # as LatentFormat packs probabilities
-    assert pytest.approx(replay_bytes(1, numbers=21) + context, rel=0.03) == examination.RECORD_BYTES
+    assert pytest.approx(replay_bytes(1, numbers=21) + context, rel=0.03) == doctor.RECORD_BYTES
 
 
 def test_a_missing_and_an_old_package_are_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = {"torch": "2.3.0", "tqdm": None}
-    version_of = examination.version_of
-    monkeypatch.setattr(examination, "version_of", lambda name: versions.get(name, version_of(name)))
-    found = {finding.what: finding for finding in examination.packages()}
+    version_of = doctor.version_of
+    monkeypatch.setattr(doctor, "version_of", lambda name: versions.get(name, version_of(name)))
+    found = {finding.what: finding for finding in doctor.packages()}
     assert found["torch"].state is Verdict.wrong and found["torch"].remedy.startswith("pip install 'torch<2.14,>=2.11'")
     assert found["tqdm"][1:3] == (Verdict.wrong, "not installed")
     assert found["torchrl"].state is Verdict.fine
 
 
 def test_warp_is_looked_at_as_mujoco_warp_requires_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    (found,) = (finding for finding in examination.packages() if finding.what == "warp-lang")
-    assert found == examination.Diagnosis("warp-lang", Verdict.fine, version("warp-lang"))
-    version_of = examination.version_of
-    monkeypatch.setattr(examination, "version_of", lambda name: "0.9" if name == "warp-lang" else version_of(name))
-    (found,) = (finding for finding in examination.packages() if finding.what == "warp-lang")
+    (found,) = (finding for finding in doctor.packages() if finding.what == "warp-lang")
+    assert found == doctor.Diagnosis("warp-lang", Verdict.fine, version("warp-lang"))
+    version_of = doctor.version_of
+    monkeypatch.setattr(doctor, "version_of", lambda name: "0.9" if name == "warp-lang" else version_of(name))
+    (found,) = (finding for finding in doctor.packages() if finding.what == "warp-lang")
     assert found[1:3] == (Verdict.wrong, "0.9") and found.remedy.startswith("pip install 'warp-lang>=")
 
 
@@ -68,9 +68,9 @@ def test_without_mujoco_warp_it_is_that_which_is_missing(monkeypatch: pytest.Mon
             raise PackageNotFoundError(package)
         return ["mujoco-warp==1"]
 
-    monkeypatch.setattr(examination.importlib.metadata, "requires", requires)
-    monkeypatch.setattr(examination, "version_of", lambda name: None)
-    assert [(finding.what, finding.state) for finding in examination.packages()] == [
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", requires)
+    monkeypatch.setattr(doctor, "version_of", lambda name: None)
+    assert [(finding.what, finding.state) for finding in doctor.packages()] == [
         ("mujoco-warp", Verdict.wrong), ("extras", Verdict.fine),
     ]  # fmt: skip
 
@@ -78,31 +78,31 @@ def test_without_mujoco_warp_it_is_that_which_is_missing(monkeypatch: pytest.Mon
 def test_a_torch_without_cuda_beside_a_gpu_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = subprocess.CompletedProcess([], 0, stdout="NVIDIA H200, 570.1, 143771 MiB\n")
     monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: answer)
-    monkeypatch.setattr(examination, "cuda_of_torch", lambda: None)
-    gpu, cuda = examination.accelerator()
+    monkeypatch.setattr(doctor, "cuda_of_torch", lambda: None)
+    gpu, cuda = doctor.accelerator()
     assert gpu.found.startswith("NVIDIA H200") and cuda.state is Verdict.wrong and "whl" in cuda.remedy
-    monkeypatch.setattr(examination, "cuda_of_torch", lambda: "12.8")
-    assert len(list(examination.accelerator())) == 1
+    monkeypatch.setattr(doctor, "cuda_of_torch", lambda: "12.8")
+    assert len(list(doctor.accelerator())) == 1
 
 
 def test_the_cuda_of_torch_is_read_without_importing_it() -> None:
     import torch
 
-    assert examination.cuda_of_torch() == torch.version.cuda
+    assert doctor.cuda_of_torch() == torch.version.cuda
 
 
 @pytest.mark.parametrize("asked", ["512", "512,2"])
 def test_more_threads_than_cores_are_wrong(asked: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", asked)
-    threads = next(finding for finding in examination.cores() if finding.what == "threads")
+    threads = next(finding for finding in doctor.cores() if finding.what == "threads")
     assert threads.state is Verdict.wrong and "more threads than cores" in threads.remedy
 
 
 def test_without_opengl_the_ray_caster_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     program = "import sys; sys.exit('RendererUnavailableError: egl needs libEGL.so.1')"
-    monkeypatch.setattr(examination, "PROBE", program)
-    monkeypatch.setattr(examination, "loads", lambda library: False)
-    *_, last = examination.renderers({"egl": examination._start_probe("egl")})
+    monkeypatch.setattr(doctor, "PROBE", program)
+    monkeypatch.setattr(doctor, "loads", lambda library: False)
+    *_, last = doctor.renderers({"egl": doctor._start_probe("egl")})
     assert last.what == "ray caster" and "apt-get install" in last.remedy
 
 

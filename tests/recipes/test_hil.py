@@ -8,6 +8,7 @@ from contextlib import ExitStack, closing
 import pytest
 
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil import configuration as flights
 from dreamer_racing.hil.betaflight import print_settings
 from dreamer_racing.hil.chain import describe_inputs, describe_outputs
 from dreamer_racing.hil.links.udp import decode_command
@@ -15,7 +16,6 @@ from dreamer_racing.hil.recording import FILE, Flight, FlightRecorder
 from tests.running_recipes import ROOT, free_port, recipe, recipe_module
 
 hil = recipe_module("hil")
-flights = recipe_module("composing.flight")
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,10 @@ flights = recipe_module("composing.flight")
         ({"actor": "kidney", "pose": "ros2", "pose_port": 9200}, "pose_port=9200 is for poses over the network"),
         ({"actor": "kidney", "operator_port": 9200}, "operator_port=9200 is for operator=udp"),
         ({"replay": "x", "track": "circle"}, "track= is for flights, and replay= is of one that was flown"),
-        ({"report": "x", "limits": flights.LimitsConfig(speed_max=9.0)}, "limits= is for flights, and report= is of"),
+        (
+            {"report": "x", "limits": flights.LimitsConfig(speed_max=9.0)},
+            "limits= is for flights, and report= is of",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(changes, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 from functools import partial
@@ -26,7 +27,7 @@ plot = partial(recipe_process, "plot")
 @pytest.fixture(scope="module")
 def recipe() -> ModuleType:
     """What the recipe draws with."""
-    return recipe_module("composing.drawing")
+    return importlib.import_module("dreamer_racing.figures.plotting")
 
 
 @pytest.fixture
@@ -88,7 +89,7 @@ def cut(path: Path) -> str:
 
 
 @pytest.mark.parametrize("which", ["best", "last"])
-def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, capsys, which):
+def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, caplog, which):
     folder = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
     chosen, other = ("1", "2") if which == "best" else ("2", "1")
     cut(folder / f"00000{chosen}000_trajectory.csv")
@@ -97,7 +98,7 @@ def test_instead_of_half_a_flight_the_next_one_is_drawn(runs, recipe, figures, c
     warning = (
         f"dreamer_v3_circle_paper_seed0 without 00000{chosen}000_trajectory.csv: 00000{chosen}000_trajectory.csv was"
     )
-    assert warning in capsys.readouterr().out
+    assert warning in caplog.text
     assert (runs / "f" / "trajectories_left_out.txt").read_text().startswith(warning)
 
 
@@ -123,14 +124,15 @@ def test_instead_of_half_a_dream_the_one_before_it_is_shown(runs, recipe):
     assert shown()[0] == ["2000", "4000"]
 
 
-def test_nothing_but_half_files_costs_no_other_figure(runs, recipe, capsys):
+def test_nothing_but_half_files_costs_no_other_figure(runs, recipe, caplog):
+    caplog.set_level("INFO", "dreamer_racing")
     for path in (runs / "runs").rglob("*_dream.npz"):
         cut(path)
     for path in (runs / "runs").rglob("*_trajectory.csv"):
         cut(path)
     recipe.draw(recipe.PlotConfig(runs=str(runs / "runs"), output=str(runs / "figures")))
     assert {path.name for path in (runs / "figures").iterdir()} == {"learning_curves.png", "learning_curves.csv"}
-    out = capsys.readouterr().out
+    out = caplog.text
     assert "paper_seed0 without 000002000_trajectory.csv and 1 other: 000002000_trajectory.csv was cut short" in out
     assert "paper_seed0 without 000002000_dream.npz and 1 other: 000002000_dream.npz holds no dream" in out
 

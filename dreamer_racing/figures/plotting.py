@@ -1,12 +1,14 @@
-"""What `recipes/plot.py` draws, and an experiment at its end: figures of what runs have stored."""
+"""Figures of what runs have stored: what `recipes/plot.py` draws, and an experiment at its end."""
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from composing.schema import PlotConfig
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
@@ -26,8 +28,36 @@ from dreamer_racing.figures.runs import (
     group_runs,
     read_runs,
 )
-from dreamer_racing.settings import check_settings
+from dreamer_racing.settings import NOT_NEGATIVE, check_settings, setting
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
+
+
+class Aggregate(Enum):
+    """What stands for the seeds of a learning curve."""
+
+    mean = "mean"
+    iqm = "iqm"
+
+
+@dataclass
+class PlotConfig:
+    """`recipes/plot.py`."""
+
+    runs: Any = "runs"  # run directory, folder of some, pattern, or a list [a,b]; or a learning_curves.csv
+    figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
+    output: str = "figures"  # folder
+    quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
+    aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
+    axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
+    # of the curves' running mean, in units of their axis; null: 2 % of the longest run
+    window: float | None = setting(None, NOT_NEGATIVE)
+    flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
+    flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
+    over: str = "distance"  # axis of the speed profile: distance | time
+    dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
+
+
+logger = logging.getLogger(__name__)
 
 VIDEO_SLOWER = 2  # than the flight, so that one can look
 FLIGHTS = ("last", "best")  # of the evaluations of a run
@@ -54,7 +84,7 @@ def draw(config: PlotConfig) -> None:
     if [Path(str(place)).suffix for place in places] == [".csv"]:
         refuse_for_curves(config)
         draw_curves(read_curves(places[0]), output)
-        print("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
+        logger.info("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
     explicit = {"trajectories": config.flights, "imagined": config.dreams}.get(config.figure)
     asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
@@ -131,14 +161,14 @@ def draw_one(name: str, config: PlotConfig, output: Path, runs: list[RunData], p
     """Make a figure and say what it has left out; return whether there was anything to draw."""
     files, found = FIGURES[name].draw(config, output, runs, problems)
     warn([problem for problem in found if problem not in problems])
-    print(f"{name + ':':<17} {', '.join(files) or 'none of these runs has stored anything for it'}")
+    logger.info("%-17s %s", f"{name}:", ", ".join(files) or "none of these runs has stored anything for it")
     return bool(files)
 
 
 def warn(problems: list[str]) -> None:
-    """Print a line each."""
+    """Say a line each."""
     for problem in problems:
-        print(f"warning: {problem}")
+        logger.warning("warning: %s", problem)
 
 
 def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:

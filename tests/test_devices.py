@@ -5,14 +5,14 @@ import time
 import pytest
 import torch
 
-from tests.running_recipes import recipe_module
+from dreamer_racing import devices
 
 INSTRUCTIONS = {"avx512_bf16": True, "amx_bf16": False}
 
 
 @pytest.mark.parametrize("slow", [torch.float32, torch.bfloat16])
 def test_a_cpu_computes_in_bfloat16_where_that_is_faster(slow: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    devices, multiply = recipe_module("composing.devices"), torch.mm
+    multiply = torch.mm
 
     def as_slow_as_said(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         time.sleep(0.005 if left.dtype == slow else 0.0)
@@ -26,7 +26,6 @@ def test_a_cpu_computes_in_bfloat16_where_that_is_faster(slow: torch.dtype, monk
 
 
 def test_a_cpu_without_instructions_for_bfloat16_does_not_compute_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    devices = recipe_module("composing.devices")
     monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
     chosen = devices.choose_mixed_precision(torch.device("cpu"))
     assert chosen == (False, "this cpu device does not compute in bfloat16")

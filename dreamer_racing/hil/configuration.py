@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import ipaddress
+import logging
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from composing.command_line import existing_agent_path
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.envs.tracks import Track
 from dreamer_racing.hil.battery import BatteryConfig
 from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, check_ranges
+from dreamer_racing.hil.flyer import Flyer, check_contract, check_ranges
 from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
 from dreamer_racing.hil.operator import (
     PORT,
@@ -30,6 +30,8 @@ from dreamer_racing.hil.safety import SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.sticks import FIRST_SWITCH, ThrustMap
 from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
+
+logger = logging.getLogger(__name__)
 
 PILOT = "pilot"
 PILOT_RATE = 50.0  # Hz
@@ -194,25 +196,6 @@ def is_this_machine(host: str) -> bool:
         return host == "localhost"
 
 
-def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:
-    """Make who flies, and return its contract: of a pilot, what such an actor's would say of its commands.
-
-    Args:
-        config: Says who.
-        track: That a pilot is to fly; None: the one of its name.
-    """
-    assert config.actor is not None, "checked"
-    if config.actor == PILOT:
-        from dreamer_racing.plant.pilot import PilotFlyer  # needs torch, which actors do without
-
-        if config.track is None:
-            raise ValueError("track= is missing: actor=pilot has none of its own.")
-        rate = config.rate or PILOT_RATE
-        return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
-    flyer = ActorFlyer(existing_agent_path("actor", config.actor))
-    return flyer, flyer.contract
-
-
 def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> list[str]:
     """Refuse to fly where actor, track, limits and flight controller are not of one kind; arming comes after this.
 
@@ -359,7 +342,7 @@ def make_operator(config: HilConfig) -> OperatorSource:
     """Open where the operator's word comes from, and say which it is if that was left open."""
     name = operator_of(config)
     if config.operator == "auto":
-        print(f"operator: {name} (operator=auto, link={config.link})")
+        logger.info("operator: %s (operator=auto, link=%s)", name, config.link)
     if name == "udp":
         return UdpOperator(config.operator_port, config.operator_host)
     return TimedOperator() if name == "timed" else KeyboardOperator()
