@@ -9,8 +9,7 @@ differences of 255 from the image of `physics.render`, `worst` is the mean of th
 
 * `physics.render`: dm_control's own, with a camera and a scene made for each frame;
 * `kept camera`: one `Camera` for all frames, with a buffer of the image's size;
-* `ControlSuiteEnv`: the same with the detail of `dreamer_racing.envs.control_suite.DETAIL`;
-* in the tasks of `--parts`: `kept camera` with one thing changed, for what that thing costs.
+* `ControlSuiteEnv`: the same with the detail of `dreamer_racing.envs.control_suite.DETAIL`.
 """
 
 import argparse
@@ -29,16 +28,6 @@ from dreamer_racing.envs import dm_control_gl
 
 TASKS = ("cartpole_swingup", "walker_walk", "reacher_easy", "cheetah_run", "ball_in_cup_catch", "finger_spin",
          "hopper_hop", "quadruped_walk", "humanoid_walk")  # fmt: skip
-PARTS: dict[str, dict[str, float]] = {
-    "no shadows": {"shadow": 0},
-    "no reflections": {"reflection": 0},
-    "no sky": {"skybox": 0},
-    "1 sample a pixel": {"offsamples": 0},
-    "floors of one quad": {"grid": 1000.0},
-    "shadow map of 256": {"shadowsize": 256},
-    "16 x 8 facets": {"numslices": 16, "numstacks": 8},
-}
-"""By name: rendering flags of MuJoCo's scene, values of its `visual/quality`, and `grid`, m between a floor's lines."""
 COLUMNS = ("task", "way", "frames_per_s", "cpu_ms", "times", "mean", "worst", "max")
 STEPS = 5  # simulator steps between two states
 
@@ -51,17 +40,14 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="*", default=TASKS)
     parser.add_argument("--image-size", type=int, default=64, help="pixels")
     parser.add_argument("--frames", type=int, default=100, help="states drawn, at most 190")
-    parser.add_argument("--parts", nargs="*", default=TASKS[:3], help="tasks to measure part by part too")
     parser.add_argument("--json")
     arguments = parser.parse_args()
-    records = []
-    for task in arguments.tasks:
-        records += measure(task, arguments.image_size, arguments.frames, PARTS if task in arguments.parts else {})
+    records = [record for task in arguments.tasks for record in measure(task, arguments.image_size, arguments.frames)]
     print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
 
-def measure(task: str, size: int, frames: int, parts: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+def measure(task: str, size: int, frames: int) -> list[dict[str, Any]]:
     """Return the records of one task."""
     number = dmc.CAMERAS.get(dmc.TASKS[task][0], 0)
     reference = begun(task)
@@ -71,7 +57,6 @@ def measure(task: str, size: int, frames: int, parts: dict[str, dict[str, float]
         "physics.render": (reference, lambda: reference.physics.render(size, size, camera_id=number)),
         "kept camera": kept_camera(task, number, size),
         "ControlSuiteEnv": (world.env, world.observe),
-        **{name: kept_camera(task, number, size, **changes) for name, changes in parts.items()},
     }
     for _, draw in ways.values():
         draw()  # the first frame compiles shaders
@@ -121,25 +106,11 @@ def states(task: str, count: int) -> Iterator[np.ndarray]:
         yield env.physics.get_state()
 
 
-def kept_camera(task: str, number: int, size: int, **changes: float) -> tuple[Any, Draw]:
-    """The task, and a function that draws it with one camera, with changes to how it is drawn as in `PARTS`."""
+def kept_camera(task: str, number: int, size: int) -> tuple[Any, Draw]:
+    """Return the task, and a function that draws it with one camera."""
     env = begun(task)
-    model = env.physics.model
-    model.vis.global_.offwidth = model.vis.global_.offheight = size
-    flags = {}
-    for name, value in changes.items():
-        if name == "grid":
-            model.geom_size[model.geom_type == dmc.mujoco_bindings.mjtGeom.mjGEOM_PLANE, 2] = value
-        elif hasattr(model.vis.quality, name):
-            setattr(model.vis.quality, name, value)
-        else:
-            flags[name] = value
-    camera = dmc.mujoco.Camera(env.physics, size, size, number)
-
-    def draw() -> np.ndarray:
-        return camera.render(render_flag_overrides=dict(flags))
-
-    return env, draw
+    env.physics.model.vis.global_.offwidth = env.physics.model.vis.global_.offheight = size
+    return env, dmc.mujoco.Camera(env.physics, size, size, number).render
 
 
 if __name__ == "__main__":

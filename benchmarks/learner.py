@@ -5,7 +5,6 @@
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
     python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
-    python benchmarks/learner.py --in-turns --sizes cpu_small ssm_cpu_small --json results/learner_in_turns.json
     python benchmarks/learner.py --launches --sizes paper_large size12m --batch 64 16 --horizon 16
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
@@ -19,15 +18,9 @@ With `--launches` nothing is timed: the kernels that an update would launch on a
 on a CPU that stands in for it (`learners/launches.py`), with `few_kernels` and without, windows beginning warm. Their
 number depends on T, H and the size's layers, not on B and widths, so that networks are narrow here; RMS norms, which a
 CPU takes apart, count once as on CUDA. `casts` are those of them that change a type.
-
-With `--in-turns` all of it happens in one process, where the sizes take turns, so that what else a machine does meets
-all alike: medians of one whole update (`s`), of forward and backward of the world model's loss alone (`world_model`),
-of its RSSM's `observe` alone (`observe`), and of the same window through `observe_step` (`steps`). Each `ratio` is the
-median over the turns of the first size's time over this one's.
 """
 
 import argparse
-import functools
 import resource
 import statistics
 import time
@@ -62,8 +55,6 @@ COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters",
            "sample_share", "memory")  # fmt: skip
 LAUNCHES = ("size", "loss", "actor", "batch", "horizon", "few_kernels", "launches", "casts")
 NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
-IN_TURNS = ("size", "loss", "actor", "backend", "batch", "parameters", "s", "ratio", "world_model",
-            "world_model_ratio", "observe", "observe_ratio", "steps")  # fmt: skip
 
 
 def main() -> None:
@@ -84,15 +75,12 @@ def main() -> None:
     parser.add_argument("--return-freed-memory", action="store_true", help="leave out keep_freed_memory()")
     parser.add_argument("--few-kernels", action="store_true", help="as on a CUDA device by default")
     parser.add_argument("--launches", action="store_true", help="count what a CUDA device would launch instead")
-    parser.add_argument("--in-turns", action="store_true", help="compare the sizes, eager, in one process")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     if arguments.table:
         write_size_table(Path(arguments.table))
         return
-    if arguments.in_turns and (arguments.backends != ["eager"] or arguments.peers or arguments.return_freed_memory):
-        parser.error("--in-turns compares sizes: no --backends, no --peers and no --return-freed-memory with it.")
     if arguments.launches:
         print_launches(parser, arguments)
         return
@@ -103,16 +91,6 @@ def main() -> None:
         for loss in arguments.losses
         for actor in arguments.actor_losses
     ]
-    if arguments.in_turns:
-        keep_freed_memory()
-        records = [
-            record | {"threads": arguments.threads}
-            for setting in settings
-            for record in measure_in_turns(arguments.sizes, setting)
-        ]
-        print_table(records, IN_TURNS)
-        write_json(records, arguments.json)
-        return
     prepare = None if arguments.return_freed_memory else keep_freed_memory
     jobs: list[tuple[Callable[..., dict[str, Any]], tuple, Callable[[], Any] | None]] = [
         (measure, (size, backend, setting), prepare)
@@ -180,14 +158,6 @@ class Setting:
         losses, interface = LossConfig(world_model=self.loss, actor=self.actor), interface_of(self.image_size)
         return make_dreamer(size, interface, losses, config, horizon=self.horizon, device=self.device, seed=0)
 
-    def columns(self, size: str, learner: DreamerLearner, backend: str = "eager") -> dict[str, Any]:
-        """Say what a record is of."""
-        return {
-            "size": size, "loss": self.loss, "actor": self.actor,
-            "backend": backend + ("+bf16" if self.mixed_precision else ""), "batch": "x".join(map(str, self.batch)),
-            "horizon": self.horizon, "image_size": self.image_size, "parameters": parameters(learner),
-        }  # fmt: skip
-
 
 def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
     """Time updates of one configuration; return one record."""
@@ -208,80 +178,14 @@ def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
     limit = matmul_speed(device, torch.bfloat16 if setting.mixed_precision else torch.float32)
     flops = dry_update(size, setting.loss, setting.actor, setting.batch, setting.horizon, setting.image_size)[0]
     return {
-        "benchmark": "learner", **setting.columns(size, learner, backend),
+        "benchmark": "learner", "size": size, "loss": setting.loss, "actor": setting.actor,
+        "backend": backend + ("+bf16" if setting.mixed_precision else ""), "batch": "x".join(map(str, setting.batch)),
+        "horizon": setting.horizon, "image_size": setting.image_size, "parameters": parameters(learner),
         "s": median, "s_min": min(times), "s_first": first,
-        "calls": count_calls(learner, data) if backend == "eager" else None, "GFLOP": flops / 1e9,
+        "calls": count_calls(lambda: learner.update(data)) if backend == "eager" else None, "GFLOP": flops / 1e9,
         "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
         "sample_share": statistics.median(samples) / median, "memory": memory,
     }  # fmt: skip
-
-
-def measure_in_turns(sizes: list[str], setting: Setting) -> list[dict[str, Any]]:
-    """Time updates of several sizes, one of each after the other; return a record of each."""
-    device = setting.device
-    learners = {size: setting.learner(size) for size in sizes}
-    data = filled_replay(setting.batch, device, setting.image_size).sample()
-    parts: dict[str, Callable[[DreamerLearner], Any]] = {
-        "s": lambda learner: learner.update(data),
-        "world_model": lambda learner: differentiate_world_model(learner, data),
-        "observe": lambda learner: differentiate_observe(learner, data),
-        "steps": lambda learner: differentiate_steps(learner, data),
-    }
-    times: dict[tuple[str, str], list[float]] = {(size, part): [] for size in sizes for part in parts}
-    for _ in range(WARM_UP + setting.updates):
-        for part, run in parts.items():
-            for size, learner in learners.items():
-                times[size, part].append(seconds(functools.partial(run, learner), device))
-    return [
-        {
-            "benchmark": "learner_in_turns", **setting.columns(size, learners[size]), "updates": setting.updates,
-            **{part: statistics.median(times[size, part][WARM_UP:]) for part in parts},
-            **{
-                "ratio" if part == "s" else f"{part}_ratio": ratio(times[sizes[0], part], times[size, part])
-                for part in parts
-            },
-        }
-        for size in sizes
-    ]  # fmt: skip
-
-
-def differentiate_world_model(learner: DreamerLearner, data: Any) -> None:
-    """Compute the gradients of the world model's loss alone, and drop them."""
-    with learner.autocast():
-        found = learner.losses["world_model"](data)
-    torch.stack([value for key, value in found.items() if key.startswith("loss_")]).sum().backward()
-    learner.optimizer.zero_grad(set_to_none=True)
-
-
-def differentiate_observe(learner: DreamerLearner, data: Any) -> None:
-    """Compute the gradients of sums of what the RSSM makes of embeddings of zero, and drop them."""
-    model = learner.agent.world_model
-    embedding = torch.zeros(*data.batch_size, model.encoder.embedding_size, device=learner.device)
-    with learner.autocast():
-        posterior = model.rssm.observe(embedding, data["previous_action"], data["is_init"].squeeze(-1))
-    torch.stack([value.sum() for value in posterior]).sum().backward()
-    learner.optimizer.zero_grad(set_to_none=True)
-
-
-def differentiate_steps(learner: DreamerLearner, data: Any) -> None:
-    """Do what `differentiate_observe` does record by record, without logits."""
-    model = learner.agent.world_model
-    batch = len(data)
-    embedding = torch.zeros(batch, model.encoder.embedding_size, device=learner.device)
-    total = torch.zeros((), device=learner.device)
-    actions, resets = data["previous_action"].unbind(1), data["is_init"].squeeze(-1).unbind(1)
-    with learner.autocast():
-        belief, state = (value.expand(batch, -1) for value in model.rssm.initial())
-        for action, is_init in zip(actions, resets, strict=True):
-            belief, state = model.rssm.observe_step(embedding, action, is_init, belief, state)
-            total = total + belief.sum() + state.sum()
-    total.backward()
-    learner.optimizer.zero_grad(set_to_none=True)
-
-
-def ratio(first: list[float], other: list[float]) -> float:
-    """Return the median of one list over another, turn by turn, without warm-up."""
-    return statistics.median(one / two for one, two in list(zip(first, other, strict=True))[WARM_UP:])
 
 
 def interface_of(image_size: int) -> Interface:
@@ -341,15 +245,15 @@ def peak_memory(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def parameters(learner: DreamerLearner) -> int:
-    """Count what is trained."""
-    return sum(parameter.numel() for group in learner.optimizer.param_groups for parameter in group["params"])
+def parameters(trained: Any) -> int:
+    """Count what the optimizer of a learner, or of TorchRL's stepper, trains."""
+    return sum(parameter.numel() for group in trained.optimizer.param_groups for parameter in group["params"])
 
 
-def count_calls(learner: DreamerLearner, data: Any) -> int:
+def count_calls(update: Callable[[], Any]) -> int:
     """Count the ATen calls of an update."""
     with profile(activities=[ProfilerActivity.CPU]) as profiler:
-        learner.update(data)
+        update()
     return sum(event.count for event in profiler.key_averages() if event.key.startswith("aten::"))
 
 

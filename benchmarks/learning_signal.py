@@ -1,4 +1,4 @@
-"""What an actor learns from in imagination: how true its returns are, and how much of its gradient is signal.
+"""What an actor learns from: how true imagined returns are, how much of its gradient is signal, how its policy drifts.
 
     python benchmarks/learning_signal.py runs/circle --json learning_signal.json
 
@@ -11,6 +11,10 @@
 * `gradient`: of REINFORCE's objective at the present actor, from `starts` latents of the run's own replay as many as
   an update imagines from, and from eight times as many: `cosine` between gradients from independent draws, and
   `signal` power over noise power.
+* `drift`: how far the world model's learning moves a policy whose actor stands still, where records keep latents
+  (`replay.context=true`): the divergence, nats, of the policy at the latents that a record had when it was last trained
+  on, or flown, from the policy at what the model makes of it now; mean and quantiles, `of` windows of the newest
+  records (`replay.recent_share`) and of those drawn from all, which the model has mostly not seen for long.
 
 The trained weights are measured, not the averaged ones. Where the checkpoint holds no replay, as `best/`, say
 `--only returns`.
@@ -34,15 +38,17 @@ from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.losses.imagination import imagine, lambda_return
 from dreamer_racing.modules.world_model import join_features
 
+PARTS = ("returns", "gradient", "drift")
 EVERY = 8  # steps of a flight between two starts of imagination
 GRADIENTS, TIMES = 8, (1, 8)  # independent gradients, and from how many times an update's starts
+BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # of the drift
 
 
 def main() -> None:
     """Measure every checkpoint."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
-    parser.add_argument("--only", nargs="+", choices=("returns", "gradient"), default=("returns", "gradient"))
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
     parser.add_argument("--json")
@@ -67,12 +73,15 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
             raise SystemExit(f"--steps {steps}: at most {longest}, so that no time runs out, which is no crash.")
         flight = fly(learner, env, steps)
         yield {"measured": "returns", "num_envs": num_envs, "steps": steps, **compare_returns(learner, flight)}
-    if "gradient" in parts:
+    if "gradient" in parts or "drift" in parts:
         replay = restore_replay(trained)
+    if "gradient" in parts:
         starts = model.imagination_starts or model.batch_size * model.batch_length
         for times in TIMES:
             gradients = [gradient(learner, draw_starts(learner, replay, starts * times)) for _ in range(GRADIENTS)]
             yield {"measured": "gradient", "starts": starts * times, **noise_of(torch.stack(gradients))}
+    if "drift" in parts and trained.config.replay.context:
+        yield from drift(learner, replay)
 
 
 class Rollout(NamedTuple):
@@ -110,7 +119,7 @@ def compare_returns(learner: DreamerLearner, flight: TensorDict) -> dict[str, fl
         part = flight[k : k + horizon]
         world = Rollout(part["reward"], (~part["done"]).float(), value[k : k + horizon + 1])
         both = {"world": world, "imagined": imagined(learner, flight["belief"][k], flight["state"][k])[0]}
-        row = {}
+        row: dict[str, Tensor] = {}
         for name, rollout in both.items():
             reached = rollout.reached()
             row |= {
@@ -169,6 +178,25 @@ def noise_of(rows: Tensor) -> dict[str, float]:
     unit = F.normalize(rows, dim=1)
     cosine = ((unit @ unit.T).sum() - count) / (count * (count - 1))
     return {"cosine": cosine.item(), "signal": (signal / noise).item()}
+
+
+@torch.no_grad()
+def drift(learner: DreamerLearner, replay: StreamReplay) -> Iterator[dict[str, Any]]:
+    """Yield a record of the policy's drift for windows of the newest records and one for those of all."""
+    moved, recent = [], []
+    for _ in range(BATCHES):
+        batch = replay.sample()
+        seen = learner.losses["world_model"](batch)["replay_context"]
+        before, after, same = learner.then_and_now(seen, batch)
+        divergence, same = learner.agent.actor(before).divergence(learner.agent.actor(after)), same.squeeze(-1)
+        moved.append(divergence.squeeze(-1)[same])
+        recent.append(batch["recent"].reshape(len(same), -1)[:, :1].expand_as(same)[same])
+    of_all, newest = torch.cat(moved), torch.cat(recent)
+    for name, values in (("newest", of_all[newest]), ("all", of_all[~newest])):
+        if len(values):
+            quantiles = zip(QUANTILES, values.quantile(torch.tensor(QUANTILES)).tolist(), strict=True)
+            found = {f"q{100 * share:.0f}": value for share, value in quantiles}
+            yield {"measured": "drift", "of": name, "records": len(values), "mean": values.mean().item(), **found}
 
 
 if __name__ == "__main__":

@@ -8,17 +8,14 @@ Every row is a process of its own. `images` is `none` (state only, `vector`), a 
 (physics on CPU, images on CUDA) or `cuda` (all on CUDA). `steps/s` are control steps summed over N worlds:
 
 * `worlds`: `RaceWorlds` stepped, observed and reset where an episode ended, with random actions, in plain tensors;
-* `rollout`: `DroneRacingEnv.rollout`;
 * `collector`: a TorchRL `Collector` with a random policy;
-* `still`: the same around worlds that stand still, whose step returns stored tensors and never ends an episode: what
-  TorchRL takes however fast the worlds are;
 * `agent`: as `worlds`, with the networks and the recurrent state of a DreamerV3 policy of `--actor` size;
 * `actor`: a `Collector` with that policy.
 
 They are measured in turns, five times, and the best reported, because other load on the machine only ever slows.
-`lost` is the share of the worlds' speed that the collector loses, `actor_lost` the same of `agent` and `actor`, `least`
-what the collector would lose if TorchRL took no longer than around worlds that stand still. On CPU the milliseconds of
-a collected step are split into physics, race rules, rendering and TorchRL (specs, TensorDicts, resets, storing).
+`lost` is the share of the worlds' speed that the collector loses, `actor_lost` the same of `agent` and `actor`. On CPU
+the milliseconds of a collected step are split into physics, race rules, rendering and TorchRL (specs, TensorDicts,
+resets, storing).
 `memory` is the process's peak resident memory, or what is in use on the GPU, GiB.
 """
 
@@ -33,11 +30,10 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from measuring import print_table, write_json
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs.utils import RandomPolicy
@@ -52,9 +48,9 @@ from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
 
 PARTS = ("physics", "race", "render")
-MODES = ("worlds", "rollout", "collector", "still", "agent", "actor")
+MODES = ("worlds", "collector", "agent", "actor")
 MILLISECONDS = tuple(f"{part}_ms" for part in (*PARTS, "torchrl"))
-COLUMNS = ("images", "num_envs", *MODES, "lost", "least", "actor_lost", *MILLISECONDS, "memory_gib")
+COLUMNS = ("images", "num_envs", *MODES, "lost", "actor_lost", *MILLISECONDS, "memory_gib")
 ROLLOUT = 16  # control steps in a batch
 TURNS = 5
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
@@ -151,9 +147,7 @@ def measure(
     actor_rollouts = iter(Collector(remembering, policy, **options))
     modes: dict[str, Callable[[], Any]] = {
         "worlds": flying(env, lambda _: env.action_spec.rand()),
-        "rollout": lambda: env.rollout(ROLLOUT, break_when_any_done=False),
         "collector": lambda: next(rollouts),
-        "still": around_still_worlds(env, rollouts),
         "agent": flying(env, acting(policy, remembering.reset())),
         "actor": lambda: next(actor_rollouts),
     }
@@ -167,7 +161,6 @@ def measure(
         "benchmark": "simulation", "track": track, **settings, "images": images, "num_envs": num_envs,
         "image_size": image_size, "actor_size": actor, **rates,
         "lost": 1 - rates["collector"] / rates["worlds"],
-        "least": rates["worlds"] / (rates["worlds"] + rates["still"]),
         "actor_lost": 1 - rates["actor"] / rates["agent"], **split, "memory_gib": peak_gib(env.device),
     }  # fmt: skip
 
@@ -192,19 +185,6 @@ def flying(env: DroneRacingEnv, act: Callable[[dict[str, Tensor]], Tensor]) -> C
                     seen[key] = observe()
 
     return fly
-
-
-def around_still_worlds(env: DroneRacingEnv, rollouts: Iterator[Any]) -> Callable[[], None]:
-    """Collect rollouts while the worlds stand still: every step returns the same tensors, and nothing ends."""
-    after = env._step(TensorDict({"action": env.action_spec.zero()}, env.batch_size))
-    for key in ("done", "terminated", "truncated"):
-        after[key].zero_()
-
-    def collect() -> None:
-        with patch.object(env, "_step", lambda tensordict: after.copy()):
-            next(rollouts)
-
-    return collect
 
 
 def make_policy(env: DroneRacingEnv, size: str) -> DreamerPolicy:

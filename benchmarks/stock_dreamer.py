@@ -23,12 +23,11 @@ Reference: TorchRL 0.14, ``sota-implementations/dreamer_v3``.
 """
 
 import statistics
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from learner import matmul_speed, peak_memory, random_rollout, seconds
+from learner import count_calls, matmul_speed, parameters, peak_memory, random_rollout, seconds
 from tensordict import TensorDict
 from tensordict.nn import (
     InteractionType,
@@ -38,7 +37,6 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
-from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 from torchrl.data import Bounded, Composite, Unbounded
@@ -311,18 +309,6 @@ def make_sample(shape: StockShape, batch: tuple[int, int], device: str) -> Tenso
     following["pixels"] = records["next", "pixels"].movedim(-1, -3).contiguous()
     latents = {"state": torch.zeros(*batch, shape.state), "belief": torch.zeros(*batch, shape.belief)}
     return TensorDict({**records.select("action", "is_init"), **latents, "next": following}, batch).to(device)
-
-
-def parameters(stepper: DreamerV3OptimizationStepper) -> int:
-    """Count what is trained."""
-    return sum(parameter.numel() for group in stepper.optimizer.param_groups for parameter in group["params"])
-
-
-def count_calls(update: Callable[[], None]) -> int:
-    """Count the ATen calls of an update."""
-    with profile(activities=[ProfilerActivity.CPU]) as profiler:
-        update()
-    return sum(event.count for event in profiler.key_averages() if event.key.startswith("aten::"))
 
 
 class FlopCounter(TorchDispatchMode):
