@@ -74,8 +74,8 @@ def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:
         step, flight = make_step(agent, "mode"), record_flight(env, agent, MIN_STEPS)
     finally:
         env.close()
-    source = {"checkpoint": "initial weights", "env_steps": 0, "weights": "initial", "track": track, "preset": PRESET}
-    source["track_sha256"] = hash_track(load_track(track))
+    source: dict[str, Any] = {"checkpoint": "initial weights", "env_steps": 0, "weights": "initial"}
+    source |= {"track": track, "preset": PRESET, "track_sha256": hash_track(load_track(track))}
     contract = make_contract(step, env.worlds.parameters, env.worlds.camera, **source)
     folder.mkdir(parents=True, exist_ok=True)
     export_actor(step, contract, flight, folder / ACTOR, parts=True)
