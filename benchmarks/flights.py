@@ -51,11 +51,6 @@ def main() -> None:
             write_json(records, arguments.json)
 
 
-def given(options: list[str]) -> dict[str, str]:
-    """Return options by their names."""
-    return dict(option.split("=", 1) for option in options)
-
-
 def preset_of(actor: str) -> str:
     """Physics that an actor was trained on; of the pilot the easy ones."""
     if actor == PILOT:
@@ -73,7 +68,8 @@ def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> d
         RuntimeError: No flight came about; the message is the loop's own.
     """
     own = {"track": "circle" if actor == PILOT else Path(actor).name, "preset": preset_of(actor)}
-    plant = [f"{name}={value}" for name, value in (own | {"seed": seed} | given(arguments.plant)).items()]
+    given = dict(option.split("=", 1) for option in arguments.plant)
+    plant = [f"{name}={value}" for name, value in (own | {"seed": seed} | given).items()]
     hil = [f"actor={actor}", f"run_dir={folder}", *arguments.hil]
     if actor == PILOT:  # it has no contract that says so
         hil += [option for option in plant if option.startswith(("track=", "preset="))]

@@ -4,7 +4,6 @@
     python benchmarks/learner.py --sizes size12m paper_large --backends eager graph compile+graph --mixed-precision
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
-    python benchmarks/learner.py --sizes paper_large --batch 16 64 --horizon 16 --peers torchrl_large --updates 3
     python benchmarks/learner.py --launches --sizes paper_large size12m --batch 64 16 --horizon 16
     python benchmarks/learner.py --table docs/sizes.md      # parameters, FLOPs and memory of every size; no update runs
 
@@ -110,7 +109,6 @@ def main() -> None:
             how = {"threads": arguments.threads, "keeps_freed_memory": initializer is not None}
             records.append(process.submit(function, *values).result() | how)
             print_table(records[-1:], COLUMNS)
-    print_table(records, COLUMNS)
     write_json(records, arguments.json)
 
 
@@ -166,10 +164,7 @@ def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
     replay = filled_replay(setting.batch, device, setting.image_size)
     samples = [seconds(replay.sample, device) for _ in range(5)]
     data = replay.sample()
-    start = time.perf_counter()
-    learner.update(data)
-    synchronize(device)
-    first = time.perf_counter() - start
+    first = seconds(lambda: learner.update(data), device)
     for _ in range(WARM_UP - 1):
         learner.update(data)
     times = [seconds(lambda: learner.update(data), device) for _ in range(setting.updates)]
