@@ -511,46 +511,12 @@ def _axes(gate: Gate) -> torch.Tensor:
     return torch.tensor([gate.forward, gate.left, (0.0, 0.0, 1.0)], dtype=torch.float64)
 
 
-# ---------------------------------------------------------------- any file at all
-
-scalars = st.one_of(
-    st.none(), st.booleans(), st.integers(-10, 10), st.floats(), st.text(max_size=5), st.sampled_from(["race", "decoy"])
-)
-vectors = st.lists(st.one_of(st.floats(-10, 10), scalars), min_size=2, max_size=4)
-values = st.recursive(scalars, lambda inner: st.one_of(st.lists(inner, max_size=3), vectors), max_leaves=6)
-gates = st.one_of(
-    st.fixed_dictionaries(
-        {"position": st.one_of(st.tuples(*[st.floats(-9, 9)] * 3).map(list), values), "yaw_degrees": scalars},
-        optional={"kind": scalars, "color": values, "size": values},
-    ),
-    values,
-)
-contents = st.one_of(
-    values,
-    st.fixed_dictionaries(
-        {"gates": st.one_of(st.lists(gates, max_size=3), values)},
-        optional={
-            "name": scalars,
-            "laps": scalars,
-            "decoys": st.one_of(st.lists(gates, max_size=2), values),
-            "shape": st.one_of(values, st.dictionaries(st.sampled_from(["opening", "outer", "depth"]), scalars)),
-            "start": st.one_of(values, st.dictionaries(st.sampled_from(["position", "yaw_degrees"]), values)),
-            "bounds": st.one_of(values, st.fixed_dictionaries({"low": vectors, "high": vectors})),
-        },
-    ),
-)
+# ---------------------------------------------------------------- any file at all; tests/robustness spoils tracks
 
 
 @pytest.fixture(scope="module")
 def scratch_file(tmp_path_factory):
     return tmp_path_factory.mktemp("tracks") / "any.yaml"
-
-
-@given(content=contents)
-@settings(deadline=None)
-def test_any_content_is_a_track_or_a_refusal(scratch_file, content):
-    scratch_file.write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
-    _load_or_refuse(scratch_file)
 
 
 @given(text=st.text(alphabet="{}[]:-,&*!|>#'\"\n\t ab1.", max_size=60))
