@@ -38,7 +38,7 @@ from composing.schema import CollectorKind, DreamerConfig
 from composing.workers import make_own_env, make_rollouts
 
 from dreamer_racing.experience.ray_rollouts import RayRollouts
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.machine import available_cpus, keep_freed_memory
 from dreamer_racing.modules import Interface
 
@@ -147,7 +147,7 @@ def begin_together(barrier: Any) -> None:
 def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
     """Collect with one thread, at the same time as the other processes."""
     env = make_env(config, num_threads=1)
-    learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
+    learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
     collector = make_collector(config, env, learner.policy())
     rollouts = iter(collector)
     for _ in range(WARM_UP):
@@ -165,7 +165,7 @@ def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
 def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
     """Collect as the recipe does, with or without workers."""
     env = make_own_env(config)
-    learner = cast(DreamerLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
+    learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
     rollouts = make_rollouts(config, env, learner)
     for _ in range(WARM_UP):
         next(rollouts)

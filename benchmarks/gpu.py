@@ -220,7 +220,7 @@ def train_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     begin = ["tuned=gpu", "track=kidney", f"device={device}", f"run_dir={run_dir}", "checkpoint.minutes=3"]
     if tiny:
         begin += ["model=debug", "model.batch_size=4", "env.num_envs=4", "env.start_on_line=0", "budget=smoke"]
-        begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0", "loss.ppo.flown=128"]
+        begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0", "loss.ppo.steps=128"]
     begun = any((run_dir / "checkpoints").glob("checkpoint-*"))
     yield "kidney", 3600.0, ["recipes/dreamer_v3.py", *([f"resume={run_dir}"] if begun else begin)]
 
@@ -306,18 +306,15 @@ def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
     import copy
 
     import torch
-    from learner import filled_replay, interface_of
+    from learner import filled_replay, make_learner
 
     from dreamer_racing.evaluation.course import Course
     from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-    from dreamer_racing.learners.dreamer import make_dreamer
-    from dreamer_racing.learners.dreamer_config import LearnerConfig
-    from dreamer_racing.losses import LossConfig
+    from dreamer_racing.learners.config import LearnerConfig
 
     config = LearnerConfig(cuda_graph=device != "cpu", learning_rate=1e-3, warmup_updates=0, mixed_precision=True)
-    learner, other = (
-        make_dreamer(size, interface_of(64), LossConfig(), config, horizon=3, device=device, seed=0) for _ in range(2)
-    )
+    config.imagination_horizon = 3
+    learner, other = (make_learner(size, "reconstruction", "reinforce", config, device=device) for _ in range(2))
     replay = filled_replay((2, 8), device, streams=2)
     updates = 5 if tiny else 60
     losses = [learner.update(replay.sample())["loss_image"] for _ in range(updates)]

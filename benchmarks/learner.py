@@ -39,12 +39,14 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from dreamer_racing.experience.replay import make_replay
-from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
-from dreamer_racing.learners.dreamer_config import LearnerConfig
+from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.learners.latent_ppo import CRITICS, LatentPPO
 from dreamer_racing.learners.launches import launches
-from dreamer_racing.losses import LossConfig
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses
 from dreamer_racing.machine import keep_freed_memory
-from dreamer_racing.modules import SIZES, Interface, get_size, layers
+from dreamer_racing.modules import SIZES, Interface, ModelSize, get_size, layers
 
 PRIVILEGED_DIM = 21
 WARM_UP = 3  # updates that are not counted
@@ -143,7 +145,7 @@ class Setting:
     updates: int  # timed, after WARM_UP
     few_kernels: bool | None = None  # None: on a CUDA device
 
-    def learner(self, size: str, backend: str = "eager") -> DreamerLearner:
+    def learner(self, size: str, backend: str = "eager") -> WorldModelLearner:
         """Make the learner of a size."""
         torch.set_num_threads(self.threads)
         torch.set_float32_matmul_precision("high")
@@ -152,9 +154,21 @@ class Setting:
             compile="compile" in backend,
             cuda_graph="graph" in backend,
             few_kernels=self.few_kernels,
+            imagination_horizon=self.horizon,
         )
-        losses, interface = LossConfig(world_model=self.loss, actor=self.actor), interface_of(self.image_size)
-        return make_dreamer(size, interface, losses, config, horizon=self.horizon, device=self.device, seed=0)
+        return make_learner(size, self.loss, self.actor, config, self.image_size, self.device)
+
+
+def make_learner(
+    size: ModelSize | str, loss: str, actor: str, config: LearnerConfig, image_size: int = 64, device: str = "cpu"
+) -> WorldModelLearner:
+    """Make a learner of an objective of DreamerV3, or of latent PPO by what its critic sees: latent or state."""
+    interface = interface_of(image_size)
+    if actor in CRITICS:
+        of_ppo = LatentPPOLosses(world_model=loss, critic=actor)
+        return LatentPPO.make(size, interface, of_ppo, config, device=device, seed=0)
+    losses = DreamerV3Losses(world_model=loss, actor=actor)
+    return DreamerV3.make(size, interface, losses, config, device=device, seed=0)
 
 
 def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
@@ -258,9 +272,8 @@ def count_launches(
     """Count the kernels of an update on a CUDA device; return one record."""
     full = get_size(size)
     narrow = replace(full, **NARROW, cnn_depth=full.blocks, name=size)  # the decoder's channels divide among the blocks
-    config = LearnerConfig(mixed_precision=mixed, few_kernels=few_kernels)
-    losses = LossConfig(world_model=loss, actor=actor)
-    learner = make_dreamer(narrow, interface_of(64), losses, config, horizon=horizon, seed=0)
+    config = LearnerConfig(mixed_precision=mixed, few_kernels=few_kernels, imagination_horizon=horizon)
+    learner = make_learner(narrow, loss, actor, config)
     data = filled_replay((2, batch[1]), "cpu").sample()
     before = (torch.zeros(*data.batch_size, width) for width in (narrow.belief, narrow.state))
     data["context"] = learner.latent_format.pack(*before)  # windows begin warm
@@ -315,9 +328,8 @@ def dry_update(
     size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, image_size: int = 64
 ) -> tuple[int, int, int]:
     """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
-    losses = LossConfig(world_model=loss, actor=actor)
     with torch.device("meta"):
-        learner = make_dreamer(size, interface_of(image_size), losses, horizon=horizon, device="meta")
+        learner = make_learner(size, loss, actor, LearnerConfig(imagination_horizon=horizon), image_size, "meta")
         records: dict[Any, Tensor] = {
             "pixels": torch.empty(*batch, image_size, image_size, 3, dtype=torch.uint8),
             ("privileged", "vector"): torch.empty(*batch, PRIVILEGED_DIM),

@@ -34,8 +34,8 @@ from trained import Trained, fly, make_env, restore, restore_replay
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import correlation
 from dreamer_racing.experience.replay import StreamReplay
-from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.losses.imagination import imagine, lambda_return
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import choose_starts, imagine, lambda_return
 from dreamer_racing.modules.world_model import join_features
 
 PARTS = ("returns", "gradient", "drift")
@@ -91,10 +91,10 @@ class Rollout(NamedTuple):
     continuation: Tensor
     value: Tensor
 
-    def returns(self, learner: DreamerLearner) -> Tensor:
+    def returns(self, learner: WorldModelLearner) -> Tensor:
         """Return the λ-returns, ``(H, N, 1)``."""
-        loss = learner.actor_loss
-        return lambda_return(self.reward, self.value[1:], learner.discount * self.continuation, loss.lambda_)
+        discount = learner.discount * self.continuation
+        return lambda_return(self.reward, self.value[1:], discount, learner.loss_config.lambda_)
 
     def reached(self) -> Tensor:
         """Return the probability of getting to each step and to the end, ``(H + 1, N, 1)``."""
@@ -102,7 +102,7 @@ class Rollout(NamedTuple):
 
 
 @torch.no_grad()
-def imagined(learner: DreamerLearner, belief: Tensor, state: Tensor) -> tuple[Rollout, Tensor, Tensor]:
+def imagined(learner: WorldModelLearner, belief: Tensor, state: Tensor) -> tuple[Rollout, Tensor, Tensor]:
     """Imagine from latents ``(N, ...)``; return it with its features ``(H + 1, N, F)`` and actions ``(H, N, A)``."""
     model, actor, critic = learner.agent.world_model, learner.agent.actor, learner.agent.critic
     features, action = imagine(model.rssm, actor, belief, state, learner.horizon)
@@ -111,7 +111,7 @@ def imagined(learner: DreamerLearner, belief: Tensor, state: Tensor) -> tuple[Ro
 
 
 @torch.no_grad()
-def compare_returns(learner: DreamerLearner, flight: TensorDict) -> dict[str, float]:
+def compare_returns(learner: WorldModelLearner, flight: TensorDict) -> dict[str, float]:
     """Return the means and correlations that the module's docstring names, of a flight ``[K, N]``."""
     horizon, rows = learner.horizon, []
     value = learner.agent.critic.value(join_features(flight["belief"], flight["state"]))  # (K, N, 1)
@@ -130,7 +130,7 @@ def compare_returns(learner: DreamerLearner, flight: TensorDict) -> dict[str, fl
             }
         rows.append(row)
     found = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-    half, paid = len(flight) // 2, monte_carlo(flight, learner.discount)
+    half, paid = len(flight) // 2, monte_carlo(flight, float(learner.discount))
     return {name: numbers.mean().item() for name, numbers in found.items()} | {
         "return_correlation": correlation(found["return_imagined"].flatten(), found["return_world"].flatten()).item(),
         "value": value[:half].mean().item(),
@@ -149,17 +149,20 @@ def monte_carlo(flight: TensorDict, discount: float) -> Tensor:
 
 
 @torch.no_grad()
-def draw_starts(learner: DreamerLearner, replay: StreamReplay, number: int) -> TensorDict:
+def draw_starts(learner: WorldModelLearner, replay: StreamReplay, number: int) -> TensorDict:
     """Draw starts of imagination as updates do: belief, state, terminated, batch ``[number]``."""
     parts: list[TensorDict] = []
     while sum(map(len, parts)) < number:
         batch = replay.sample()
-        latents = learner.losses["world_model"](batch).pop("replay_context")
-        parts.append(learner.starts(latents, batch))
+        _, latents = learner.world_model_loss(batch)
+        number_of_each = learner.config.imagination_starts
+        belief, state = latents
+        starts = choose_starts(belief, state, batch["terminated"], batch["previous_action"], number_of_each)
+        parts.append(TensorDict(starts._asdict(), [len(starts.belief)]))
     return cast(TensorDict, torch.cat(cast(Any, parts)))[:number]
 
 
-def gradient(learner: DreamerLearner, starts: TensorDict) -> Tensor:
+def gradient(learner: WorldModelLearner, starts: TensorDict) -> Tensor:
     """Return the gradient of REINFORCE's objective, without entropy and scale, from starts ``[N]``: ``(P,)``."""
     actor = learner.agent.actor
     rollout, features, action = imagined(learner, starts["belief"], starts["state"])
@@ -181,12 +184,12 @@ def noise_of(rows: Tensor) -> dict[str, float]:
 
 
 @torch.no_grad()
-def drift(learner: DreamerLearner, replay: StreamReplay) -> Iterator[dict[str, Any]]:
+def drift(learner: WorldModelLearner, replay: StreamReplay) -> Iterator[dict[str, Any]]:
     """Yield a record of the policy's drift for windows of the newest records and one for those of all."""
     moved, recent = [], []
     for _ in range(BATCHES):
         batch = replay.sample()
-        seen = learner.losses["world_model"](batch)["replay_context"]
+        _, seen = learner.world_model_loss(batch)
         before, after, same = learner.then_and_now(seen, batch)
         divergence, same = learner.agent.actor(before).divergence(learner.agent.actor(after)), same.squeeze(-1)
         moved.append(divergence.squeeze(-1)[same])

@@ -43,7 +43,7 @@ from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.learners.dreamer import make_dreamer
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.machine import keep_freed_memory
 from dreamer_racing.modules import DreamerPolicy, Interface
 
@@ -189,7 +189,7 @@ def flying(env: DroneRacingEnv, act: Callable[[dict[str, Tensor]], Tensor]) -> C
 
 def make_policy(env: DroneRacingEnv, size: str) -> DreamerPolicy:
     """Make an untrained agent's policy."""
-    return make_dreamer(size, Interface.of(env), device=str(env.device)).policy()
+    return DreamerV3.make(size, Interface.of(env), device=str(env.device)).policy()
 
 
 def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[str, Tensor]], Tensor]:

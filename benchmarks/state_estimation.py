@@ -23,7 +23,7 @@ import argparse
 import gc
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, cast
 
 import torch
@@ -32,13 +32,12 @@ from measuring import print_table, write_json
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import LossModule
 from trained import DreamerConfig, Trained, fly, restore, restore_replay, size_of, worlds_of
 
 from dreamer_racing.envs import DroneRacingEnv
-from dreamer_racing.learners.dreamer_optimizer import make_optimizer
-from dreamer_racing.losses import WorldModelLoss, find_loss, make_losses
-from dreamer_racing.modules import Agent, ModelSize, join_features, symlog
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.losses import DreamerV3Losses, Latents, LossConfig, WorldModelLoss
+from dreamer_racing.modules import ModelSize, join_features, symlog
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.interface import PRIVILEGED, Interface
 from dreamer_racing.modules.layers import autocast
@@ -112,7 +111,7 @@ def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterat
     loss, optimizer = fresh(config, size, trained.learner.agent.interface)
     context, seconds = autocast(torch.device("cpu"), bool(config.model.mixed_precision)), 0.0
 
-    def observed(batch: TensorDictBase) -> TensorDictBase:
+    def observed(batch: TensorDictBase) -> tuple[dict[str, Tensor], Latents]:
         batch.pop(CONTEXT, None)  # the latents of the model that was trained mean nothing to a fresh one
         with context:
             return loss(batch)
@@ -120,7 +119,7 @@ def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterat
     for number in range(1, updates + 1):
         batch = replay.sample()
         begun = time.process_time()
-        metrics = observed(batch)
+        metrics, _ = observed(batch)
         torch.stack([value for name, value in metrics.items() if name.startswith("loss_")]).sum().backward()
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
@@ -128,12 +127,12 @@ def learning(trained: Trained, variant: str, updates: int, every: int) -> Iterat
         if number % every and number != updates:
             continue
         with torch.no_grad():
-            seen, batches = observed(held_out), [replay.sample() for _ in range(BATCHES)]
-            parts = [(latents_of(observed(each)), each[PRIVILEGED].flatten(0, 1)) for each in batches]
+            (seen, latents), batches = observed(held_out), [replay.sample() for _ in range(BATCHES)]
+            parts = [(flat(observed(each)[1]), each[PRIVILEGED].flatten(0, 1)) for each in batches]
         learned = cast(Shown, tuple(torch.cat(part) for part in zip(*parts, strict=True)))
         yield {
             "variant": variant, "updates": number, "seconds": seconds, "kl": seen["kl"].item(), **errors(seen),
-            **told(learned, (latents_of(seen), held_out[PRIVILEGED].flatten(0, 1))),
+            **told(learned, (flat(latents), held_out[PRIVILEGED].flatten(0, 1))),
         }  # fmt: skip
 
 
@@ -182,25 +181,22 @@ def linear_share(learned: Shown, measured: Shown) -> float:
     return (error / truth.var(0).mean()).item()
 
 
-def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple[LossModule, torch.optim.Optimizer]:
+def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple[WorldModelLoss, torch.optim.Optimizer]:
     """Make a world-model loss of initial weights, and what trains it."""
-    torch.manual_seed(0)
-    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
-    agent = Agent(size, interface, decodes, config.loss.min_std, config.loss.max_std)
-    losses = make_losses(agent, config.loss)
-    return losses["world_model"], make_optimizer(agent, losses, config.model)
+    losses = DreamerV3Losses(**{field.name: getattr(config.loss, field.name) for field in fields(LossConfig)})
+    learner = DreamerV3.make(size, interface, losses, config.model, seed=0)
+    return learner.world_model_loss, learner.optimizer
 
 
-def errors(metrics: TensorDictBase) -> dict[str, float]:
+def errors(metrics: dict[str, Tensor]) -> dict[str, float]:
     """Return what the loss's own decoders say, by column."""
     names = {"privileged_error": "error", "image_error": "image_error", "reward_error": "reward_error"}
-    return {column: error.item() for name, column in names.items() if (error := metrics.get(name, None)) is not None}
+    return {column: metrics[name].item() for name, column in names.items() if name in metrics}
 
 
-def latents_of(metrics: TensorDictBase) -> Tensor:
+def flat(latents: Latents) -> Tensor:
     """Return the latents that a world-model loss has found, `(M, F)`, without gradient."""
-    latents = metrics["replay_context"].detach()
-    return join_features(latents["belief"], latents["state"]).float().flatten(0, 1)
+    return latents.features.detach().float().flatten(0, 1)
 
 
 def varied(config: DreamerConfig, variant: str) -> tuple[DreamerConfig, ModelSize]:

@@ -18,7 +18,7 @@ from composing.saved import trained_config
 from composing.schema import DreamerConfig
 
 from dreamer_racing.experience.replay import StreamReplay
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.training.checkpoint import load_components
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -30,7 +30,7 @@ class Trained(NamedTuple):
     """A run's settings for a CPU, its learner with the trained weights (not the averaged ones), and where it was."""
 
     config: DreamerConfig
-    learner: DreamerLearner
+    learner: WorldModelLearner
     checkpoint: Path
     where: dict[str, Any]
 
@@ -49,7 +49,7 @@ def restore(path: str) -> Trained:
     config.device, config.replay.device = "cpu", "auto"
     learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
     where = {"run": run.path.name, "track": config.track, "actor": config.loss.actor, "seed": config.seed, **counters}
-    return Trained(config, cast(DreamerLearner, learner), checkpoint, where)
+    return Trained(config, cast(WorldModelLearner, learner), checkpoint, where)
 
 
 def restore_replay(trained: Trained, config: DreamerConfig | None = None) -> StreamReplay:
@@ -74,7 +74,7 @@ def restore_replay(trained: Trained, config: DreamerConfig | None = None) -> Str
 
 
 @torch.no_grad()
-def fly(learner: DreamerLearner, env: Environment, steps: int) -> TensorDict:
+def fly(learner: WorldModelLearner, env: Environment, steps: int) -> TensorDict:
     """Fly the stochastic policy for K steps of N worlds; return what came of it, batch ``[K, N]``.
 
     ``belief`` and ``state`` are the latents with which it acted, ``reward`` and ``done`` what the step led to, and

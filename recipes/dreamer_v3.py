@@ -20,13 +20,13 @@ from composing.building import (
     resolve_common,
     seed_generators,
 )
-from composing.checks import check_dreamer, steps_alone
+from composing.checks import check_dreamer
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, make_learner, make_schedule
+from composing.learners import begin_with, make_dreamer, make_schedule
 from composing.options import CONFIG_DIR
-from composing.schema import CollectorKind, DreamerConfig, register
-from composing.sharing import imagines, share_of
+from composing.schema import CollectorKind, DreamerConfig, imagines, learns_from_collected, register
+from composing.sharing import share_of
 from composing.tuned import changed_from_tuned
 from composing.workers import make_own_env, make_rollouts, place_worlds, resolve_workers
 from omegaconf import DictConfig, OmegaConf
@@ -39,8 +39,8 @@ from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics, world_model_metrics
 from dreamer_racing.experience.replay import StreamReplay
-from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.learners.saved_dreamer import LossState
+from dreamer_racing.learners.latent_ppo import LatentPPO
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.session import Session
@@ -177,7 +177,7 @@ def train(config: DreamerConfig, session: Session) -> None:
     check_dreamer(config)
     own = share_of(config)  # of several processes
     env = make_own_env(own)
-    learner = cast(DreamerLearner, make_learner(own, Interface.of(env), own.device, config.seed))
+    learner = make_dreamer(own, Interface.of(env), own.device, config.seed)
     if config.init_from and not config.resume:
         print(begin_with(learner, config, env))
     seed_generators(own.seed)
@@ -186,7 +186,7 @@ def train(config: DreamerConfig, session: Session) -> None:
     replay = make_sequence_replay(own, env, curriculum, learner.latent_format if config.replay.context else None)
     ratio = config.make_replay_ratio()
     schedule = make_schedule(config, env.track.num_gates if isinstance(env, DroneRacingEnv) else 0)
-    limit = config.schedule.wait_for_model if steps_alone(config.loss.actor) else None
+    limit = config.schedule.wait_for_model if learns_from_collected(config) else None
     lag = ModelLag(limit, config.schedule.wait_every)
     session.track(
         learner=learner,
@@ -208,7 +208,7 @@ def train(config: DreamerConfig, session: Session) -> None:
         # Replay what was collected; a resumed run first makes the updates that are due, from what it has.
         if rollout is not None:
             replay.extend(rollout)
-            learner.watch(rollout)
+            learner.collect(rollout)
             episodes = session.log_episodes(rollout)
             session.log(adapt_rewards(env, curriculum, episodes))
             session.log(schedule.observe(episodes, session.env_steps))
@@ -220,7 +220,8 @@ def train(config: DreamerConfig, session: Session) -> None:
         if (share := numbers.pop("start_on_line", None)) is not None:
             cast(DroneRacingEnv, env).worlds.start_on_line = share
         learner.adjust(**numbers)
-        learner.actor_waits = lag.waits
+        if isinstance(learner, LatentPPO):
+            learner.actor_waits = lag.waits
 
         # Update world model, actor and critic on the replay.
         for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
@@ -229,7 +230,7 @@ def train(config: DreamerConfig, session: Session) -> None:
             metrics = learner.update(batch, session.timed)
             session.log(metrics)
             lag.trained(metrics)
-            if config.replay.context:  # later windows go on from what the model makes of these records now
+            if config.replay.context and learner.latents is not None:  # later windows go on from the latents of now
                 replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
 
         # Evaluate, log and save.
@@ -247,16 +248,16 @@ def train(config: DreamerConfig, session: Session) -> None:
         session.save_if_due()
 
 
-def parts_of(curriculum: BodyRateCurriculum | None, learner: DreamerLearner) -> dict[str, Any]:
+def parts_of(curriculum: BodyRateCurriculum | None, learner: WorldModelLearner) -> dict[str, Any]:
     """Return the parts of a checkpoint that not every run has."""
     parts: dict[str, Any] = {} if curriculum is None else {"curriculum": curriculum}
-    if not parallel.is_first():  # what this process's worlds flew; of the first it is the learner's
-        parts["actor_loss"] = LossState(learner.losses["actor"], learner.agent)
+    if isinstance(learner, LatentPPO) and not parallel.is_first():  # that of the first is the learner's
+        parts["storage"] = learner.storage
     return parts
 
 
 def measure_lag(
-    session: Session, lag: ModelLag, learner: DreamerLearner, replay: StreamReplay, config: DreamerConfig
+    session: Session, lag: ModelLag, learner: WorldModelLearner, replay: StreamReplay, config: DreamerConfig
 ) -> dict[str, Tensor | float]:
     """Measure whether the model knows the records of the newest flights, before they are learned from."""
     length = config.model.batch_length
@@ -269,7 +270,7 @@ def measure_lag(
 
 
 def measure_held_out(
-    session: Session, learner: DreamerLearner, replay: StreamReplay, config: DreamerConfig
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, config: DreamerConfig
 ) -> dict[str, Tensor]:
     """Measure the world model on the newest records that it is never trained on; nothing, if there are none."""
     length = SEEN + config.model.imagination_horizon

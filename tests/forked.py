@@ -25,7 +25,7 @@ SERVER.set_forkserver_preload(
     [
         "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
         "torchrl.envs", "torchrl.record", "torchrl.trainers.algorithms", "warp", "dreamer_racing.envs",
-        "dreamer_racing.figures.loggers", "dreamer_racing.figures.report", "dreamer_racing.learners.dreamer",
+        "dreamer_racing.figures.loggers", "dreamer_racing.figures.report", "dreamer_racing.learners.latent_ppo",
         "dreamer_racing.training.session",
     ]
 )  # fmt: skip

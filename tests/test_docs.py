@@ -20,7 +20,8 @@ from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.rendering import HYBRID, RENDERERS
 from dreamer_racing.envs.worlds import RaceOptions
-from dreamer_racing.losses import ACTOR_LOSSES, CRITIC_LOSSES, WORLD_MODEL_LOSSES
+from dreamer_racing.learners.latent_ppo import CRITICS
+from dreamer_racing.losses import TARGETS
 from tests.running_recipes import module_of
 
 ROOT = Path(__file__).parents[1]
@@ -115,8 +116,8 @@ def test_names_that_are_chosen_from_are_all_on_their_pages(options):
     rows = dict(re.findall(r"^\| `([\w.]+)=` (.*)$", options.PAGE.read_text(encoding="utf-8"), re.M))
     for name in ("auto", *RENDERERS, HYBRID):
         assert re.search(rf"\b{name}\b", rows["env.renderer"]), name
-    for registry, setting in ((WORLD_MODEL_LOSSES, "world_model"), (ACTOR_LOSSES, "actor"), (CRITIC_LOSSES, "critic")):
-        for name in registry:
+    for names, setting in ((TARGETS, "world_model"), (("reinforce", "dynamics"), "actor"), (CRITICS, "critic")):
+        for name in names:
             assert f"`{name}`" in rows[f"loss.{setting}"], name
     for name in GYM_ENVIRONMENTS:
         assert re.search(rf"\b{name}\b", (ROOT / "README.md").read_text(encoding="utf-8")), name
@@ -152,7 +153,7 @@ def test_the_api_names_every_loss():
     named = set(
         re.findall(r"^::: dreamer_racing\.losses\.(\w+)$", (ROOT / "docs/api/losses.md").read_text("utf-8"), re.M)
     )
-    there = {path.stem for path in (ROOT / "dreamer_racing" / "losses").glob("*.py")} - {"__init__", "contract"}
+    there = {path.stem for path in (ROOT / "dreamer_racing" / "losses").glob("*.py")} - {"__init__"}
     assert there <= named, f"docs/api/losses.md lacks {sorted(there - named)}"
 
 

@@ -19,13 +19,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from dreamer_racing.losses import PrivilegedLoss
+from dreamer_racing.losses import State
 from dreamer_racing.modules.decoder import VectorDecoder
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.worlds import RaceWorlds
     from dreamer_racing.evaluation.trajectory import Trajectory
-    from dreamer_racing.learners.dreamer import DreamerLearner
+    from dreamer_racing.learners.update import WorldModelLearner
 
 Painter = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Images uint8 ``(B, T, H, W, 3)`` of beliefs ``(B, T, D)``, states ``(B, T, S)`` and target gates int64 ``(B, T)``."""
@@ -115,19 +115,20 @@ class BelievedView:
         return images.unflatten(0, belief.shape[:2])
 
 
-def find_painter(learner: DreamerLearner, worlds: RaceWorlds) -> Painter | None:
+def find_painter(learner: WorldModelLearner, worlds: RaceWorlds) -> Painter | None:
     """Return what shows a learner's latents: its image decoder, or a view from the pose that it decodes, or nothing."""
-    model, loss = learner.agent.world_model, learner.losses["world_model"]
+    model = learner.agent.world_model
     if model.decoder is not None:
         return lambda belief, state, _: model.images(belief, state)
-    if isinstance(loss, PrivilegedLoss):
-        return BelievedView(loss.privileged_decoder, worlds)
+    for target in learner.world_model_loss.targets.values():
+        if isinstance(target, State):
+            return BelievedView(target.decoder, worlds)
     return None
 
 
 @torch.no_grad()
 def dream(
-    learner: DreamerLearner, trajectory: Trajectory, painter: Painter, parts: list[slice], context: int | None = None
+    learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, parts: list[slice], context: int | None = None
 ) -> Tensor:
     """Let a world model see the first records of stretches of a flight, and predict the others from its actions.
 
@@ -154,7 +155,7 @@ def dream(
 
 
 def record_dream(
-    learner: DreamerLearner, trajectory: Trajectory, painter: Painter | None, windows: int = 1
+    learner: WorldModelLearner, trajectory: Trajectory, painter: Painter | None, windows: int = 1
 ) -> Dream | None:
     """Let a world model reconstruct and imagine stretches of a flight.
 

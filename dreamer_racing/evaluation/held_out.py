@@ -12,7 +12,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import imagine
 from dreamer_racing.modules.world_model import join_features
 
@@ -21,30 +22,30 @@ SEEN = 16
 
 
 @torch.no_grad()
-def world_model_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str, Tensor]:
+def world_model_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[str, Tensor]:
     """Measure the world model on records as an update would, and change nothing: neither networks nor random state.
 
     Args:
         learner: Whose world model is measured.
-        batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them.
+        batch: Records ``[W, T]`` as ``WorldModelLearner.update`` takes them.
 
     Returns:
         Losses and metrics of the world-model loss, scalars on the learner's device.
     """
     with _untouched(learner):
-        losses = learner.losses["world_model"](batch.to(learner.device))
-    return dict(losses.exclude("replay_context").items())
+        losses, _ = learner.world_model_loss(batch.to(learner.device))
+    return losses
 
 
 @torch.no_grad()
-def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str, Tensor]:
+def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[str, Tensor]:
     """Measure world model and imagination on records that were never trained on.
 
     The random state is left as it was, so that measuring does not change a run.
 
     Args:
         learner: Whose networks are measured; they are not changed.
-        batch: Records ``[W, T]`` as ``DreamerLearner.update`` takes them, T ≥ ``SEEN`` + horizon.
+        batch: Records ``[W, T]`` as ``WorldModelLearner.update`` takes them, T ≥ ``SEEN`` + horizon.
 
     Returns:
         Scalars on the learner's device.
@@ -70,19 +71,17 @@ def held_out_metrics(learner: DreamerLearner, batch: TensorDictBase) -> dict[str
 
 
 @contextmanager
-def _untouched(learner: DreamerLearner) -> Iterator[None]:
+def _untouched(learner: WorldModelLearner) -> Iterator[None]:
     """Run the learner's networks as updates do, and leave the random state as it was."""
     devices = [learner.device] if learner.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), learner.autocast():
         yield
 
 
-def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> dict[str, Tensor]:
+def _measure(learner: WorldModelLearner, batch: TensorDictBase, horizon: int) -> dict[str, Tensor]:
     model, critic = learner.agent.world_model, learner.agent.critic
-    losses = learner.losses["world_model"](batch)
-    context = losses.pop("replay_context")
+    losses, (belief, state) = learner.world_model_loss(batch)  # (W, T, ·)
     metrics = {f"held_out/{name}": value for name, value in losses.items()}
-    belief, state = context["belief"], context["state"]  # (W, T, ·)
     start = (belief[:, SEEN - 1], state[:, SEEN - 1])
     alive = (~batch["is_init"].squeeze(-1)[:, SEEN:]).cumprod(1).float()  # (W, H) of the start's episode
     alive = alive * (1 - batch["terminated"].squeeze(-1)[:, SEEN - 1 : SEEN].float())
@@ -96,9 +95,9 @@ def _measure(learner: DreamerLearner, batch: TensorDictBase, horizon: int) -> di
         metrics["held_out/open_loop_reward_error"] = (predicted - paid).abs().mean()
         metrics["held_out/open_loop_correlation"] = correlation(predicted, paid)
 
-    if not learner.imagines:
+    if not isinstance(learner, DreamerV3):
         return metrics
-    discount = learner.discount ** torch.arange(horizon + 1, device=reward.device)
+    discount = float(learner.discount) ** torch.arange(horizon + 1, device=reward.device)
     value = critic.value(join_features(belief[:, -1], state[:, -1])).squeeze(-1)
     goes_on = alive[:, -1] * (1 - batch["terminated"].squeeze(-1)[:, -1].float())
     real = (reward * discount[:-1]).sum(1) + discount[-1] * goes_on * value
@@ -120,12 +119,12 @@ def _comparable(batch: TensorDictBase, alive: Tensor, goes_on_at_first: Tensor) 
     return goes_on_at_first & ~cut_off
 
 
-def _imagined_return(learner: DreamerLearner, start: tuple[Tensor, Tensor], horizon: int, discount: Tensor) -> Tensor:
+def _imagined_return(learner: DreamerV3, start: tuple[Tensor, Tensor], horizon: int, discount: Tensor) -> Tensor:
     """Let the policy act in the model; return discounted rewards plus the value after them, ``(W,)``."""
     model = learner.agent.world_model
     features = imagine(model.rssm, learner.agent.actor, *start, horizon).features[1:]  # (H, W, F)
     continuation = model.continue_head.probability(features).squeeze(-1)  # (H, W)
-    if not learner.actor_loss.continuation:
+    if not learner.loss_config.continuation:
         continuation = torch.ones_like(continuation)
     reached = torch.cat((torch.ones_like(continuation[:1]), continuation[:-1])).cumprod(0)
     reward = model.reward_head.mean(features).squeeze(-1) * reached

@@ -21,8 +21,8 @@ from dreamer_racing.evaluation.trajectory import write_flight
 from dreamer_racing.figures.film import enlarge_to_watch, side_by_side, write_video
 from dreamer_racing.figures.hud import caption, dream_words, race_words, slow_motion
 from dreamer_racing.figures.top_down import plot_top_down
-from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Evaluable
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.training.directory import RunDirectory
 
 SEEN_STEPS, DREAMT_STEPS = 10, 40  # control steps the model sees, then predicts on its own, in the video
@@ -98,7 +98,7 @@ class EvaluationReport:
         if trajectory.pixels is None:
             return
         painter = None
-        if isinstance(self._learner, DreamerLearner):
+        if isinstance(self._learner, WorldModelLearner):
             painter = find_painter(self._learner, self._course.base.worlds)
             if (recorded := record_dream(self._learner, trajectory, painter)) is not None:
                 recorded.save(into.evaluations / f"{name}_dream.npz")
@@ -108,7 +108,7 @@ class EvaluationReport:
         """Write the flight, beside what the world model makes of it if there is a painter; slowly if it is short."""
         assert trajectory.pixels is not None
         count = min(len(trajectory.pixels), self.video_steps)
-        if painter is None or not isinstance(self._learner, DreamerLearner):
+        if painter is None or not isinstance(self._learner, WorldModelLearner):
             frames, right = enlarge_to_watch(trajectory.pixels[:count].numpy()), list[str]()
         else:
             frames = dream_beside_flight(self._learner, trajectory, painter, count).numpy()
@@ -212,7 +212,7 @@ class ReturnReport:
         self._env.close(raise_if_closed=False)
 
 
-def dream_beside_flight(learner: DreamerLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
+def dream_beside_flight(learner: WorldModelLearner, trajectory: Trajectory, painter: Painter, max_steps: int) -> Tensor:
     """Show the on-board view beside the world model's prediction, again and again: some context, then open loop.
 
     Args:

@@ -53,7 +53,7 @@ class Evaluable(Protocol):
 
 
 class Learner(Evaluable, Protocol):
-    """What every learner offers to recipes and evaluations: `DreamerLearner`, `PPOLearner` and `SACLearner` do.
+    """What every learner offers to recipes and evaluations: `DreamerV3`, `LatentPPO`, `PPOLearner` and `SACLearner` do.
 
     Attributes:
         updates: Those made so far.

@@ -1,6 +1,7 @@
-"""Rollouts inside the world model: where they begin, how they go, and the returns along them.
+"""Rollouts inside the world model: where they begin, and how they go.
 
-Shape legend: N starts, H horizon, F features, A action. Time comes first here, so that a step is one block of memory.
+Shape legend: B batch, T time, N starts, H horizon, D belief, S state, F = D + S features, A action. Of rollouts time
+comes first here, so that a step is one block of memory.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from dreamer_racing.modules.actor import Actor
@@ -29,29 +29,40 @@ class Imagination(NamedTuple):
     action: Tensor
 
 
+class Starts(NamedTuple):
+    """Where imagination begins, without gradient.
+
+    Attributes:
+        belief: ``(N, D)``.
+        state: ``(N, S)``.
+        terminated: Whether the episode ended there, bool ``(N, 1)``.
+        previous_action: That led there, ``(N, A)``.
+    """
+
+    belief: Tensor
+    state: Tensor
+    terminated: Tensor
+    previous_action: Tensor
+
+
 def choose_starts(
-    context: TensorDictBase, terminated: Tensor, number: int | None = None, recent: Tensor | None = None
-) -> TensorDict:
-    """Choose among the latents of a batch ``[B, T]`` those that imagination begins from.
+    belief: Tensor, state: Tensor, terminated: Tensor, previous_action: Tensor, number: int | None = None
+) -> Starts:
+    """Choose among the latents of a batch those that imagination begins from.
 
     Args:
-        context: ``belief``, ``state`` of its records.
-        terminated: Of its records, ``(B, T, 1)``.
+        belief: Of its records, ``(B, T, D)``.
+        state: ``(B, T, S)``.
+        terminated: ``(B, T, 1)``.
+        previous_action: ``(B, T, A)``.
         number: Of random ones; None for all, in order.
-        recent: Records that are chosen before others, ``(B, T, 1)``; None for none.
-
-    Returns:
-        ``belief``, ``state``, ``terminated``, batch size ``[N]``, detached.
     """
-    latents = {"belief": context.get("belief"), "state": context.get("state"), "terminated": terminated}
-    starts = TensorDict(latents, context.batch_size).detach().flatten()
+    starts = Starts(*(value.detach().flatten(0, 1) for value in (belief, state, terminated, previous_action)))
     if number is None:
         return starts
-    order = torch.rand(len(starts), device=terminated.device)
-    if recent is not None:
-        order = order + recent.flatten()
     # Not randperm, which a CUDA graph cannot capture.
-    return starts[order.topk(min(number, len(starts))).indices]
+    order = torch.rand(len(starts.belief), device=belief.device).topk(min(number, len(starts.belief))).indices
+    return Starts(*(value[order] for value in starts))
 
 
 def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
@@ -96,29 +107,3 @@ def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizo
         belief = rssm.imagine_low(belief, here, action, of_state, following)
         actions.append(action)
     return Imagination(features, torch.stack(actions))
-
-
-def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:
-    """Compute λ-returns, last step first.
-
-    ``G_t = reward_t + discount_t · ((1 − λ_t) · next_value_t + λ_t · G_{t+1})``, and ``G_H = next_value_{H−1}``.
-
-    Args:
-        reward: Received on leaving step t, ``(H, ...)``.
-        next_value: Value of where step t leads, ``(H, ...)``.
-        discount: γ times the continuation of where step t leads, ``(H, ...)``.
-        lambda_: λ, one number or ``(H, ...)``.
-
-    Returns:
-        Returns, ``(H, ...)``.
-
-    Reference: DreamerV3, Eq. 7.
-    """
-    carried = discount * lambda_
-    # reward + discount · (1 − λ) · next_value, of all steps at once
-    intermediate = torch.addcmul(reward, discount - carried, next_value)
-    current, returns = next_value[-1], []
-    for step, factor in zip(reversed(intermediate.unbind(0)), reversed(carried.unbind(0)), strict=True):
-        current = torch.addcmul(step, factor, current)
-        returns.append(current)
-    return torch.stack(returns[::-1])

@@ -6,7 +6,7 @@ Shape legend: N any batch, F features, A action.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -115,12 +115,6 @@ class Actor(nn.Module):
         self.shift = nn.Buffer(shift if state_std else shift[:action_dim], persistent=False)  # of the network's output
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = nn.Buffer(torch.tensor(float(max_std)))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Leave the bounds of the deviation as they are where older weights do not say."""
-        for name in ("min_std", "max_std"):
-            state_dict.setdefault(prefix + name, self.get_buffer(name))
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, features: Tensor) -> ActionDistribution:
         """Map ``(..., F)`` to a distribution over actions ``(..., A)``."""

@@ -41,8 +41,8 @@ from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
 
-OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "actor_loss")
-"""Parts that each of several processes has of its own; `actor_loss` keeps what its worlds flew."""
+OF_EACH_PROCESS = ("env", "tracker", "collector", "replay", "storage")
+"""Parts that each of several processes has of its own; `storage` keeps the steps of its worlds."""
 OF_WORLDS = ("env", "collector")
 """Parts that a run does not have where workers fly; where it goes on without them, its worlds begin anew."""
 

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
-from composing.schema import DreamerConfig, EnvConfig, RunConfig, is_race
+from composing.schema import CRITIC_OF_ACTOR, DreamerConfig, EnvConfig, RunConfig, is_race
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
 from dreamer_racing.figures.report import EvaluationReport, ReturnReport
 from dreamer_racing.learners.learner import Evaluable
-from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
+from dreamer_racing.losses import find_targets
+from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.training.session import Evaluator
 
 if TYPE_CHECKING:
@@ -105,11 +106,12 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
 
 def privileged_losses(config: DreamerConfig) -> list[str]:
     """Which losses of a run read the simulator's state, as on the command line."""
-    chosen: dict[str, Any] = {
-        f"loss.world_model={config.loss.world_model}": find_loss(WorldModelLoss, config.loss.world_model),
-        f"loss.actor={config.loss.actor}": find_loss(ActorLoss, config.loss.actor),
+    model, actor = config.loss.world_model, config.loss.actor
+    readers = {
+        f"loss.world_model={model}": any(PRIVILEGED in target.reads for target in find_targets(model)),
+        f"loss.actor={actor}": CRITIC_OF_ACTOR.get(actor) == "state",
     }
-    return [words for words, loss in chosen.items() if loss.reads_privileged]
+    return [words for words, reads in readers.items() if reads]
 
 
 def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:

@@ -25,7 +25,9 @@ from composing.schema import (
     SACRunConfig,
     Storage,
     WorkersConfig,
+    imagines,
     is_race,
+    learns_from_collected,
 )
 from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
@@ -35,27 +37,24 @@ from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
+from dreamer_racing.learners.ppo_update import KL_TOLERANCE
 from dreamer_racing.losses import (
-    ActorLoss,
-    ActorPPOConfig,
-    DecoderFreeLoss,
-    FlownPPOActorLoss,
-    LossConfig,
-    OwnCriticActorLoss,
-    PPOActorLoss,
-    PrivilegedLoss,
-    ReconstructionLoss,
-    WorldModelLoss,
-    find_loss,
+    Barlow,
+    DreamerV3Losses,
+    Image,
+    PPOUpdateConfig,
+    State,
+    Target,
+    find_objective,
+    find_targets,
 )
-from dreamer_racing.losses.clipped_actor import KL_TOLERANCE, ClippedActorLoss
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.schedule import RampClock
 
-PPO_ACTORS = "loss.actor=ppo, flown_ppo, latent_ppo or asymmetric_ppo"
+PPO_ACTORS = "loss.actor=latent_ppo or asymmetric_ppo"
 RACE_ONLY = (
     "env.control_rate",
     "env.camera_rate",
@@ -100,28 +99,27 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         ValueError: the message names the setting, and what it is for.
     """
-    actor, model = find_loss(ActorLoss, config.loss.actor), find_loss(WorldModelLoss, config.loss.world_model)
-    images = _is(model, ReconstructionLoss) and config.env.from_pixels
-    waits = config.schedule.wait_for_model is not None and _is(actor, ClippedActorLoss)
+    targets, ppo = find_targets(config.loss.world_model), learns_from_collected(config)
+    if not ppo:
+        find_objective(config.loss.actor)
+    images = _have(targets, Image) and config.env.from_pixels
+    waits = config.schedule.wait_for_model is not None and ppo
     drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
-        ("loss.ppo", _is(actor, ClippedActorLoss), PPO_ACTORS),
-        ("schedule.kl_target", _is(actor, ClippedActorLoss), PPO_ACTORS),
-        ("loss.ppo.updates", _is(actor, PPOActorLoss), "loss.actor=ppo"),
-        ("loss.ppo.flown", _is(actor, FlownPPOActorLoss), "loss.actor=flown_ppo, latent_ppo or asymmetric_ppo"),
-        ("loss.ppo.critic_learning_rate", _is(actor, OwnCriticActorLoss), "loss.actor=latent_ppo or asymmetric_ppo"),
+        ("loss.ppo", ppo, PPO_ACTORS),
+        ("schedule.kl_target", ppo, PPO_ACTORS),
         ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
         ("loss.image_share", images, "loss=reconstruction or informed, from images"),
-        ("loss.privileged_scale", _is(model, PrivilegedLoss), "loss=privileged or informed"),
-        ("loss.barlow_scale", _is(model, DecoderFreeLoss), "loss=decoder_free"),
-        ("model.imagination_starts", actor.imagines, "an actor that imagines, as loss.actor=reinforce"),
+        ("loss.privileged_scale", _have(targets, State), "loss=privileged or informed"),
+        ("loss.barlow_scale", _have(targets, Barlow), "loss=decoder_free"),
+        ("model.imagination_starts", not ppo, "an actor that imagines, as loss.actor=reinforce"),
         ("loss.drift_scale", drift, "records that keep latents, replay.context=true, as they are, model.sampled=false"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
-        ("schedule.wait_for_model", _is(actor, ClippedActorLoss), PPO_ACTORS),
-        ("schedule.wait_every", waits, "schedule.wait_for_model, of an actor that steps alone"),
+        ("schedule.wait_for_model", ppo, PPO_ACTORS),
+        ("schedule.wait_every", waits, "schedule.wait_for_model, of an actor that learns from what was collected"),
     ):
         for leaf in given:
             if not reads and (leaf == name or leaf.startswith(f"{name}.")):
@@ -131,9 +129,9 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
                 )
 
 
-def _is(loss: type, reading: type) -> bool:
-    """Whether a loss is one of those that read a setting, or may be, as one of a user's own."""
-    return issubclass(loss, reading) or not loss.__module__.startswith("dreamer_racing.")
+def _have(targets: Sequence[type[Target]], reading: type[Target]) -> bool:
+    """Whether a target is among those that read a setting, or may be, as one of a user's own."""
+    return any(issubclass(kind, reading) or not kind.__module__.startswith("dreamer_racing.") for kind in targets)
 
 
 def _leaves(config: DictConfig, name: str) -> list[str]:
@@ -348,34 +346,21 @@ OF_IMAGINATION = ("continuation", "return_decay")
 
 
 def check_imagination(config: DreamerConfig) -> None:
-    """Refuse to imagine from the newest windows where there are none, or from all records anyway.
-
-    And where nothing is imagined, numbers that nothing but imagination reads.
+    """Refuse an objective that there is not, and where nothing is imagined, numbers that only imagination reads.
 
     Raises:
         ValueError: the message names the settings.
     """
-    model, share = config.model, config.replay.recent_share
-    if not find_loss(ActorLoss, config.loss.actor).imagines:
-        unread = {f"loss.{name}": (getattr(config.loss, name), getattr(LossConfig, name)) for name in OF_IMAGINATION}
-        for name, (own, default) in {"model.imagine_recent": (model.imagine_recent, False), **unread}.items():
-            if own != default:
-                raise ValueError(
-                    f"{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it at "
-                    f"{str(default).lower()}, or choose another loss."
-                )
-    if not model.imagine_recent:
+    if imagines(config):
+        find_objective(config.loss.actor)
         return
-    if not round(share * model.batch_size):
-        raise ValueError(
-            f"model.imagine_recent=true, and replay.recent_share={share:g} draws none of model.batch_size="
-            f"{model.batch_size} windows from the newest records: raise the share, or set model.imagine_recent=false."
-        )
-    if model.imagination_starts is None:
-        raise ValueError(
-            "model.imagine_recent=true, and model.imagination_starts=null begins from all records of a batch: give a "
-            "number of them, or set model.imagine_recent=false."
-        )
+    for name in OF_IMAGINATION:
+        own, default = getattr(config.loss, name), getattr(DreamerV3Losses, name)
+        if own != default:
+            raise ValueError(
+                f"loss.{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it at "
+                f"{str(default).lower()}, or choose another actor."
+            )
 
 
 def check_schedule(config: DreamerConfig) -> None:
@@ -428,7 +413,7 @@ def check_deviations(config: DreamerConfig) -> None:
         raise ValueError(f"{low}={least[low]} must be below {high}={most[high]}: the bounds of the actions' deviation.")
 
 
-def check_kl(ppo: ActorPPOConfig, to: float | None) -> None:
+def check_kl(ppo: PPOUpdateConfig, to: float | None) -> None:
     """Refuse a target for the divergence that a stop below it would keep from ever being reached, also where it leads.
 
     Raises:
@@ -447,11 +432,6 @@ def check_kl(ppo: ActorPPOConfig, to: float | None) -> None:
                 f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before {name}={target} is seen to be exceeded: the "
                 f"stop must be at least {KL_TOLERANCE} times the target."
             )
-
-
-def steps_alone(actor_loss: str) -> bool:
-    """Whether the actor of a loss of this name learns in improvements of its own."""
-    return issubclass(find_loss(ActorLoss, actor_loss), ClippedActorLoss)
 
 
 def check_image_size(image_size: int, size: str) -> None:

@@ -1,23 +1,33 @@
 """The learner of a configuration, and what of it a schedule moves."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import Environment
-from composing.checks import steps_alone
 from composing.saved import read_yaml
-from composing.schema import LOSS_RAMPS, DreamerConfig, NetworkConfig, PPORunConfig, RunConfig, SACRunConfig
+from composing.schema import (
+    CRITIC_OF_ACTOR,
+    LOSS_RAMPS,
+    DreamerConfig,
+    NetworkConfig,
+    PPORunConfig,
+    RunConfig,
+    SACRunConfig,
+    learns_from_collected,
+)
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
 from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
 from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
-from dreamer_racing.learners.dreamer import DreamerLearner, make_dreamer
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.learners.learner import Learner
-from dreamer_racing.learners.saved_dreamer import check_size
-from dreamer_racing.losses import WorldModelLoss, find_loss
+from dreamer_racing.learners.saved import check_size
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, find_targets
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -28,14 +38,14 @@ IN_CHECKPOINTS = ("min_std", "max_std")
 
 
 def make_schedule(config: DreamerConfig, num_gates: int = 0) -> Schedule:
-    """Make the schedule of what `DreamerLearner.adjust` takes, by its names, and of `start_on_line`."""
+    """Make the schedule of what a learner's `adjust` takes, by its names, and of `start_on_line`."""
     schedule, loss = config.schedule, config.loss
     ramps = {"rates": (1.0, schedule.learning_rates), "world_model_rate": (1.0, schedule.world_model_rate)}
     for name in LOSS_RAMPS:
         ramp = getattr(schedule, name)
         if ramp.to is not None or name in IN_CHECKPOINTS:
             ramps[name] = (getattr(loss, name), ramp)
-    if (kl_target := loss.ppo.kl_target) is not None and steps_alone(loss.actor):
+    if (kl_target := loss.ppo.kl_target) is not None and learns_from_collected(config):
         ramps["kl_target"] = (kl_target, schedule.kl_target)
     if schedule.start_on_line.to is not None:
         ramps["start_on_line"] = (config.env.start_on_line, schedule.start_on_line)
@@ -49,11 +59,11 @@ def size_of(config: DreamerConfig) -> ModelSize:
 
 def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
     """Make the networks of a resolved configuration, with initial weights from torch's generator."""
-    decodes = find_loss(WorldModelLoss, config.loss.world_model).decodes
+    decodes = any(target.decodes for target in find_targets(config.loss.world_model))
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 
-def begin_with(learner: DreamerLearner, config: DreamerConfig, env: Environment) -> str:
+def begin_with(learner: WorldModelLearner, config: DreamerConfig, env: Environment) -> str:
     """Give a new learner the weights that ``init_from`` names; return a line on what that was.
 
     Raises:
@@ -92,21 +102,25 @@ def make_learner(
     """Make the learner of a recipe's configuration, with initial weights by its seed or another one."""
     seed = config.seed if seed is None else seed
     if isinstance(config, DreamerConfig):
-        model = config.model
-        return make_dreamer(
-            size_of(config),
-            interface,
-            config.loss,
-            model,
-            horizon=model.imagination_horizon,
-            device=device,
-            seed=seed,
-        )
+        return make_dreamer(config, interface, device, seed)
     if isinstance(config, PPORunConfig):
         return PPOLearner(network_size(config.network), interface, config.ppo, device, seed)
     if isinstance(config, SACRunConfig):
         return SACLearner(network_size(config.network), interface, config.sac, device, seed)
     raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
+
+
+def make_dreamer(
+    config: DreamerConfig, interface: Interface, device: torch.device | str, seed: int | None = None
+) -> DreamerV3 | LatentPPO:
+    """Make the learner that `loss.actor` chooses, with initial weights by the run's seed, or by another one."""
+    size, seed, loss = size_of(config), config.seed if seed is None else seed, vars(config.loss)
+    if learns_from_collected(config):
+        own = {field.name: loss[field.name] for field in fields(LatentPPOLosses)}
+        own |= {"actor": LatentPPOLosses.actor, "critic": CRITIC_OF_ACTOR[config.loss.actor]}
+        return LatentPPO.make(size, interface, LatentPPOLosses(**own), config.model, device=device, seed=seed)
+    losses = DreamerV3Losses(**{field.name: loss[field.name] for field in fields(DreamerV3Losses)})
+    return DreamerV3.make(size, interface, losses, config.model, device=device, seed=seed)
 
 
 def network_size(config: NetworkConfig) -> NetworkSize:

@@ -256,8 +256,18 @@ def names(recipe: str) -> list[str]:
     return list(found)
 
 
+RENAMED = {
+    "loss.ppo.flown": "it is called loss.ppo.steps now",
+    "loss.ppo.updates": "actors no longer learn by PPO from what they imagine",
+    "loss.kl_mode": "free nats apply to the sum over latents, as in the reference",
+}
+"""What became of settings that were there before."""
+
+
 def no_such_setting(name: str, recipe: str) -> str:
     """Say that there is no setting of a name, and which may be meant."""
+    if name in RENAMED:
+        return f"{name}: {RENAMED[name]}. docs/options.md has all settings."
     known = names(recipe)
     if name in known:  # a group that nothing is taken from where nobody says so
         return f"{name}: is added, with a plus: +{name}=..."

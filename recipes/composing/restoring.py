@@ -32,8 +32,8 @@ from dreamer_racing.export.shipped_agent import (
     is_agent,
     kept_weights,
 )
-from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import Evaluable, Learner
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
@@ -63,7 +63,7 @@ class Restored:
     @property
     def weights_sha256(self) -> str | None:
         """Of all that flies, as in an export's contract; None of the baselines."""
-        if isinstance(self.flyer, DreamerLearner):
+        if isinstance(self.flyer, WorldModelLearner):
             return hash_weights(ActorStep(self.flyer.flying_agent))
         return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
 
@@ -229,7 +229,7 @@ def restore_learner(
     # The networks bring theirs, which do not change if the run is made longer.
     left_out = (*IN_CHECKPOINTS, "start_on_line")
     numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
-    cast(DreamerLearner, learner).adjust(**numbers)
+    cast(WorldModelLearner, learner).adjust(**numbers)
     return learner, counters
 
 

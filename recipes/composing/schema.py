@@ -5,14 +5,14 @@ from enum import Enum
 from functools import cache
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig
 
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.figures.plotting import PlotConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
-from dreamer_racing.learners.dreamer_config import LearnerConfig
-from dreamer_racing.losses import LossConfig
+from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, setting
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import Ramp
@@ -66,6 +66,11 @@ class ModelConfig(LearnerConfig):
     imagination_starts: int | None = setting(MISSING, COUNT)
     learning_rate: float = setting(MISSING, POSITIVE)
     warmup_updates: int = setting(MISSING, NOT_NEGATIVE)
+
+
+@dataclass
+class LossesConfig(DreamerV3Losses, LatentPPOLosses):
+    """Losses of either algorithm, of which `actor` chooses: latent_ppo and asymmetric_ppo are PPO in latents."""
 
 
 @dataclass
@@ -245,7 +250,7 @@ class DreamerConfig(ReplayRunConfig):
     num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
+    loss: LossesConfig = field(default_factory=LossesConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
 
@@ -373,6 +378,20 @@ class ExportConfig:
     seed: int = setting(0, SEED)
 
 
+CRITIC_OF_ACTOR = {"latent_ppo": "latent", "asymmetric_ppo": "state"}
+"""What the critic of an actor sees that learns by PPO in latents, by `loss.actor`; the other actors imagine."""
+
+
+def learns_from_collected(config: DreamerConfig | DictConfig) -> bool:
+    """Whether the actor learns from what was collected, in updates of its own."""
+    return config.loss.actor in CRITIC_OF_ACTOR
+
+
+def imagines(config: DreamerConfig | DictConfig) -> bool:
+    """Whether the actor learns from what it imagines."""
+    return not learns_from_collected(config)
+
+
 def is_race(config: RunConfig) -> bool:
     """Whether the run races drones, rather than being tested on the Control Suite.
 
@@ -398,7 +417,7 @@ def register() -> None:
     for group, node in (
         ("env", EnvConfig),
         ("model", ModelConfig),
-        ("loss", LossConfig),
+        ("loss", LossesConfig),
         ("network", NetworkConfig),
         ("curriculum", CurriculumConfig),
         ("logger", LoggerConfig),

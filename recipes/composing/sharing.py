@@ -11,16 +11,13 @@ import os
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
-from composing.checks import steps_alone
-from composing.schema import DreamerConfig
+from composing.schema import DreamerConfig, imagines, learns_from_collected
 from dreamer_racing import parallel
-from dreamer_racing.losses import ActorLoss, find_loss
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
-OF_IMPROVEMENTS = ("loss.ppo.flown", "loss.ppo.minibatch")
-"""What is divided among the processes, and must be divisible; the latter of actors that step alone."""
+OF_PPO = ("loss.ppo.steps", "loss.ppo.minibatch")
+"""What is divided among the processes, and must be divisible; the latter of actors that learn on-policy."""
 ROUNDED_DOWN = ("replay.capacity", "replay.recent_records")
 """What is divided too, by worlds anyway."""
 SEEDS_APART = 1_000_000
@@ -39,7 +36,7 @@ def share_of(config: DreamerConfig) -> DreamerConfig:
     check_devices(config)
     check_captured(config)
     own = copy.deepcopy(config)
-    for name in DIVIDED + (OF_IMPROVEMENTS if steps_alone(config.loss.actor) else ()):
+    for name in DIVIDED + (OF_PPO if learns_from_collected(config) else ()):
         part, key = _place(own, name)
         whole = getattr(part, key)
         if whole is not None:
@@ -101,11 +98,6 @@ def check_captured(config: DreamerConfig) -> None:
             f"{parallel.count()} processes in the midst of an update. Set model.cuda_graph=false, or choose "
             "loss.actor=latent_ppo or asymmetric_ppo, which imagine nothing."
         )
-
-
-def imagines(config: DreamerConfig | DictConfig) -> bool:
-    """Whether the actor's loss does."""
-    return find_loss(ActorLoss, config.loss.actor).imagines
 
 
 def _own_device(device: str) -> str:

@@ -17,8 +17,8 @@ from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
 from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.rollouts import Rollouts
-from dreamer_racing.learners.dreamer import DreamerLearner
 from dreamer_racing.learners.learner import seeded
+from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.modules import DreamerPolicy, Interface
 
 NUM_WORKERS = 2
@@ -51,7 +51,7 @@ def make_own_env(config: DreamerConfig) -> Environment:
     return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
 
 
-def make_rollouts(config: DreamerConfig, env: Environment, learner: DreamerLearner) -> Rollouts:
+def make_rollouts(config: DreamerConfig, env: Environment, learner: WorldModelLearner) -> Rollouts:
     """Make what is collected.
 
     Raises:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.evaluation.held_out import SEEN, correlation, held_out_metrics, world_model_metrics
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.modules import Interface
 from tests.dreamers import learner_of
 
@@ -18,7 +18,7 @@ HORIZON, DISCOUNT = 2, 0.9
 REWARD, VALUE, CONTINUATION = 0.25, 10.0, 0.5  # what the constant heads predict
 
 
-def make_learner(**config) -> DreamerLearner:
+def make_learner(**config) -> DreamerV3:
     config = dict(horizon=HORIZON, discount=DISCOUNT, **config)
     return learner_of("debug", Interface(pixels=False, vector_dim=3), seed=0, **config)
 
@@ -43,7 +43,7 @@ def constant(value: float):
 
 
 @pytest.fixture
-def predictable(monkeypatch: pytest.MonkeyPatch) -> DreamerLearner:
+def predictable(monkeypatch: pytest.MonkeyPatch) -> DreamerV3:
     """A learner whose reward, continuation and value are the same everywhere."""
     learner = make_learner()
     model = learner.agent.world_model
@@ -81,7 +81,7 @@ FIRST, SECOND = SEEN, SEEN + 1  # records of the horizon
     ],
 )
 def test_real_returns_by_hand(
-    predictable: DreamerLearner, ends: dict[str, int], real: float | None, reward_error: float | None
+    predictable: DreamerV3, ends: dict[str, int], real: float | None, reward_error: float | None
 ) -> None:
     batch = make_batch(windows=1)
     batch["reward"][:, FIRST], batch["reward"][:, SECOND] = 1.0, 2.0
@@ -99,7 +99,7 @@ def test_real_returns_by_hand(
         assert metrics["held_out/open_loop_reward_error"].item() == pytest.approx(reward_error, abs=1e-5)
 
 
-def test_correlations_are_over_the_windows(predictable: DreamerLearner, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_correlations_are_over_the_windows(predictable: DreamerV3, monkeypatch: pytest.MonkeyPatch) -> None:
     batch = make_batch(windows=5)
     paid = torch.arange(5.0)
     batch["reward"][:, FIRST, 0] = paid

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from tests.dreamers import learner_of
 
 
@@ -29,7 +29,7 @@ def batch(device: str, windows: int = 2, steps: int = 4) -> TensorDict:
     return TensorDict(records, shape).to(device)
 
 
-def make(device: str, **settings: object) -> DreamerLearner:
+def make(device: str, **settings: object) -> DreamerV3:
     return learner_of(device=device, seed=0, horizon=3, **settings)
 
 
@@ -61,7 +61,7 @@ def test_a_cuda_graph_needs_a_cuda_device() -> None:
     "settings", [{}, {"mixed_precision": True}, {"imagination_starts": 3}, {"actor": "dynamics"}], ids=str
 )
 def test_graphed_updates_learn_as_eager_ones(settings: dict[str, object]) -> None:
-    settings = {"lr": 1e-3, "warmup_updates": 0, **settings}
+    settings = {"learning_rate": 1e-3, "warmup_updates": 0, **settings}
     batches = [batch("cuda"), batch("cuda").flip(0)]  # stale inputs would show
     first, last = [], []
     for cuda_graph in (False, True):

@@ -1,4 +1,4 @@
-"""The guard against losses that are not finite, alone; with a learner it is in ``test_dreamer.py``."""
+"""The guard against losses that are not finite, alone; with a learner it is in ``test_dreamer_v3.py``."""
 
 from __future__ import annotations
 

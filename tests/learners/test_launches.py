@@ -17,11 +17,12 @@ from torchrl.envs import TensorDictPrimer
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners import ppo_update
 from dreamer_racing.learners.launches import Launches, launches
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, clipped_actor
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import TARGETS
 from dreamer_racing.modules import Interface, get_size
-from tests.dreamers import learner_of
+from tests.dreamers import latent_ppo_of, learner_of
 
 PRIVILEGED = 5
 INTERFACE = Interface(privileged_dim=PRIVILEGED)
@@ -45,7 +46,6 @@ def records(device: str = "cpu", windows: int = 3, steps: int = 4) -> TensorDict
         return TensorDict(
             {
                 "pixels": torch.zeros(*shape, 64, 64, 3, dtype=torch.uint8),
-                "recent": torch.ones(*shape, dtype=torch.bool),
                 **flags,
                 **{name: torch.rand(*shape, width) for name, width in numbers.items()},
             },
@@ -54,7 +54,7 @@ def records(device: str = "cpu", windows: int = 3, steps: int = 4) -> TensorDict
         )
 
 
-def with_context(batch: TensorDict, learner: DreamerLearner) -> TensorDict:
+def with_context(batch: TensorDict, learner: WorldModelLearner) -> TensorDict:
     """Windows that go on from stored latents."""
     size, shape = learner.size, batch.batch_size
     belief, state = (torch.zeros(*shape, width, device=batch.device) for width in (size.belief, size.state))
@@ -66,10 +66,19 @@ def waits(seen: Launches) -> list[str]:
     return [place for place in seen.waits if not place.startswith("equal at modules/value_norm.py:")]
 
 
-def captured(learner: DreamerLearner, batch: TensorDict) -> Callable[[], object]:
-    """What a CUDA graph captures of an update; room for what the actor's loss keeps is made before."""
-    learner.losses["actor"].prepare(learner._number_of_starts(batch))
+def captured(learner: WorldModelLearner, batch: TensorDict) -> Callable[[], object]:
+    """What a CUDA graph captures of an update."""
     return lambda: learner._backward(batch)
+
+
+ACTORS = ("reinforce", "dynamics", "latent_ppo")
+
+
+def make_learner(actor: str, **options: Any) -> WorldModelLearner:
+    """With an actor that imagines, or by `latent_ppo`."""
+    if actor == "latent_ppo":
+        return latent_ppo_of("debug", INTERFACE, seed=0, critic="state", **options)
+    return learner_of("debug", INTERFACE, seed=0, horizon=3, actor=actor, **options)
 
 
 def test_kernels_waits_and_devices_are_told_apart() -> None:
@@ -92,13 +101,13 @@ def test_kernels_waits_and_devices_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("mixed_precision", [False, True], ids=["float32", "bfloat16"])
-@pytest.mark.parametrize(("world_model", "actor"), [*product(WORLD_MODEL_LOSSES, ACTOR_LOSSES)])
+@pytest.mark.parametrize(("world_model", "actor"), [*product(TARGETS, ACTORS)])
 def test_no_update_waits_for_the_device(
     monkeypatch: pytest.MonkeyPatch, world_model: str, actor: str, mixed_precision: bool
 ) -> None:
-    monkeypatch.setattr(clipped_actor, "masks_steps", lambda device: True)
-    kinds = {"world_model": world_model, "actor": actor, "drift_scale": 1.0, "mixed_precision": mixed_precision}
-    learner = learner_of("debug", INTERFACE, seed=0, horizon=3, **kinds)
+    monkeypatch.setattr(ppo_update, "masks_steps", lambda device: True)
+    kinds = {"world_model": world_model, "drift_scale": 1.0, "mixed_precision": mixed_precision}
+    learner = make_learner(actor, **kinds)
     batch = with_context(records(), learner)
     learner.update(batch)  # optimisers make their moments
     seen = launches(captured(learner, batch))
@@ -110,19 +119,18 @@ def test_no_update_waits_for_the_device(
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("options", [{}, {"imagination_starts": 5, "imagine_recent": True}], ids=["all", "recent"])
+@pytest.mark.parametrize("options", [{}, {"imagination_starts": 5}], ids=["all", "some"])
 def test_no_size_waits_for_the_device(size: str, options: dict[str, object]) -> None:
     learner = learner_of(SIZES[size], INTERFACE, seed=0, horizon=3, mixed_precision=True, average_rate=0.1, **options)
     seen = launches(captured(learner, with_context(records(), learner)))
     assert seen.count > 100 and (waits(seen), seen.mixed) == ([], [])
 
 
-@pytest.mark.parametrize(("world_model", "actor"), [*product(WORLD_MODEL_LOSSES, ACTOR_LOSSES)])
+@pytest.mark.parametrize(("world_model", "actor"), [*product(TARGETS, ACTORS)])
 def test_no_update_makes_tensors_on_another_device(world_model: str, actor: str) -> None:
     """On the meta device, which holds nothing: what is on the CPU beside it would be beside CUDA, too."""
     with torch.device("cpu"):  # the default of what forgets to say where
-        kinds = {"world_model": world_model, "actor": actor, "drift_scale": 1.0}
-        learner = learner_of("debug", INTERFACE, device="meta", horizon=3, **kinds)
+        learner = make_learner(actor, world_model=world_model, drift_scale=1.0, device="meta")
         batch = with_context(records("meta"), learner)
         seen = launches(captured(learner, batch))
     assert seen.count > 100 and seen.mixed == []

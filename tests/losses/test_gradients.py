@@ -7,16 +7,15 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from dreamer_racing.learners.dreamer import DreamerLearner
-from dreamer_racing.losses import ACTOR_LOSSES, WORLD_MODEL_LOSSES, ActorPPOConfig, DecoderFreeLoss
-from dreamer_racing.losses.actor import frozen
-from dreamer_racing.modules import Interface, WorldModel
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import TARGETS
+from dreamer_racing.modules import Interface
+from dreamer_racing.modules.frozen import frozen
 from dreamer_racing.modules.world_model import RSSMS
-from tests.dreamers import learner_of
+from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 
 PRIVILEGED_DIM = 5
-PPO = ActorPPOConfig(updates=1)
-CONFIG = {"horizon": 3, "learning_rate": 1e-3, "warmup_updates": 0, "free_nats": 0.0, "ppo": PPO}
+CONFIG = {"learning_rate": 1e-3, "warmup_updates": 0, "free_nats": 0.0}
 
 
 def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
@@ -38,8 +37,14 @@ def make_batch(batch: int = 3, time: int = 5) -> TensorDict:
     )
 
 
-def make_learner(**options) -> DreamerLearner:
-    learner = learner_of("debug", Interface(privileged_dim=PRIVILEGED_DIM), seed=0, **CONFIG | options)
+def make_learner(actor: str = "reinforce", **options) -> WorldModelLearner:
+    """With an actor that imagines, or by `latent_ppo`."""
+    numbers = CONFIG | options
+    if actor == "latent_ppo":
+        learner = latent_ppo_of("debug", Interface(privileged_dim=PRIVILEGED_DIM), seed=0, **numbers)
+    else:
+        interface = Interface(privileged_dim=PRIVILEGED_DIM)
+        learner = learner_of("debug", interface, seed=0, horizon=3, actor=actor, **numbers)
     torch.manual_seed(0)
     # Two-hot heads are zero at first, which would hide what lies below them.
     for head in (learner.agent.world_model.reward_head, learner.agent.critic.head):
@@ -65,84 +70,59 @@ def untouched(module: nn.Module) -> bool:
     return all(parameter.grad is None for parameter in module.parameters())
 
 
-@pytest.mark.parametrize("name", WORLD_MODEL_LOSSES)
+@pytest.mark.parametrize("name", TARGETS)
 def test_world_model_loss_trains_all_of_the_world_model_and_nothing_else(name):
     learner = make_learner(world_model=name)
-    losses = learner.losses["world_model"](make_batch())
+    losses, _ = learner.world_model_loss(make_batch())
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert reached(learner.agent.world_model) == trainable(learner.agent.world_model)
-    assert reached(learner.losses["world_model"]) == trainable(learner.losses["world_model"])
+    assert reached(learner.world_model_loss) == trainable(learner.world_model_loss)
     assert untouched(learner.agent.actor)
     assert untouched(learner.agent.critic)
 
 
-FLOWN = {"flown_ppo", "latent_ppo", "asymmetric_ppo"}  # which learn from rollouts: see their tests
-
-
-@pytest.mark.parametrize("name", sorted(ACTOR_LOSSES.keys() - FLOWN))
-def test_actor_loss_trains_all_of_the_actor_and_nothing_else(name):
-    learner = make_learner(actor=name)
-    agent = learner.agent
+def make_starts() -> tuple[Tensor, Tensor]:
     torch.manual_seed(0)
-    starts = TensorDict(
-        {
-            "belief": torch.randn(6, 32, requires_grad=True),
-            "state": torch.rand(6, 16, requires_grad=True),
-            "terminated": torch.zeros(6, 1, dtype=torch.bool),
-        },
-        [6],
-    )
-    loss = learner.losses["actor"]
-    losses = loss(starts)
-    if loss.optimizer is None:
-        losses["loss_actor"].backward()
-        assert reached(agent.actor) == trainable(agent.actor)
-    else:
-        before = {name: value.clone() for name, value in agent.actor.named_parameters()}
-        loss.improve(PPO.updates)
-        moved = {name for name, value in agent.actor.named_parameters() if not torch.equal(value, before[name])}
-        assert moved == trainable(agent.actor)
+    return torch.randn(6, 32, requires_grad=True), torch.rand(6, 16, requires_grad=True)
+
+
+@pytest.mark.parametrize("name", ["reinforce", "dynamics"])
+def test_actor_loss_trains_all_of_the_actor_and_nothing_else(name):
+    learner, (belief, state) = make_learner(name), make_starts()
+    agent = learner.agent
+    losses, trajectory = imagine_from(learner, belief, state)
+    losses["loss_actor"].backward()
+    assert reached(agent.actor) == trainable(agent.actor)
     assert untouched(agent.world_model)
     assert untouched(agent.critic)
-    assert starts["belief"].grad is None and starts["state"].grad is None
-    assert not any(value.requires_grad for value in losses["imagination"].values())
-    assert not any(losses[key].requires_grad for key in losses.keys() - {"loss_actor", "imagination"})
+    assert belief.grad is None and state.grad is None
+    assert not any(value.requires_grad for value in (trajectory.features, trajectory.weight, trajectory.advantage))
+    assert not any(value.requires_grad for key, value in losses.items() if not key.startswith("loss_"))
 
 
 def test_dynamics_gradient_comes_through_the_model_and_reinforce_does_without():
     """Without entropy, only the gradient through the dynamics needs a reward that depends on the action."""
-    starts = TensorDict(
-        {
-            "belief": torch.randn(6, 32),
-            "state": torch.rand(6, 16),
-            "terminated": torch.zeros(6, 1, dtype=torch.bool),
-        },
-        [6],
-    )
     for name, expected in (("dynamics", False), ("reinforce", True)):
         learner = make_learner(actor=name, entropy_scale=0.0, continuation=False)
         cell = learner.agent.world_model.rssm.cell
         cell.project_action = lambda action, project=cell.project_action: project(action.detach())
-        learner.losses["actor"](starts)["loss_actor"].backward()
+        imagine_from(learner, *make_starts())[0]["loss_actor"].backward()
         assert bool(reached(learner.agent.actor)) == expected
 
 
-def behaviour_losses(learner: DreamerLearner) -> dict[str, Tensor]:
+def behaviour_losses(learner: WorldModelLearner) -> dict[str, Tensor]:
     """The losses of actor and critic on latents that carry the world model's graph."""
-    batch = make_batch()
-    context = learner.losses["world_model"](batch)["replay_context"]
-    assert context["belief"].requires_grad and context["state"].requires_grad
-    return learner._behavior_losses(context, batch)
+    losses = learner.compute_losses(make_batch())
+    return {key: losses[key] for key in losses.keys() & {"loss_actor", "loss_critic", "loss_replay_critic"}}
 
 
-@pytest.mark.parametrize("actor_loss", ACTOR_LOSSES)
-def test_replayed_returns_train_the_world_model_only_if_asked_to(actor_loss):
-    learner = make_learner(actor=actor_loss, replay_value_gradient=False)
-    losses = behaviour_losses(learner)
-    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+@pytest.mark.parametrize("actor", ["reinforce", "dynamics", "latent_ppo"])
+def test_replayed_returns_train_the_world_model_only_if_asked_to(actor):
+    learner = make_learner(actor, replay_value_gradient=False)
+    sum(behaviour_losses(learner).values()).backward()
     assert untouched(learner.agent.world_model)
 
-    learner = make_learner(actor=actor_loss, replay_value_gradient=True)
+    learner = make_learner(actor, replay_value_gradient=True)
     behaviour_losses(learner)["loss_replay_critic"].backward()
     found = reached(learner.agent.world_model)
     # What makes the latents, not what is predicted from them.
@@ -174,37 +154,39 @@ def test_targets_of_the_critic_carry_no_gradient():
 def test_embedding_is_a_fixed_target_of_the_decoder_free_loss():
     """The loss reaches the encoder through the latents alone."""
     torch.manual_seed(0)
-    world_model = WorldModel("debug", decode=False)
-    loss, batch = DecoderFreeLoss(world_model), make_batch()
+    learner, batch = make_learner(world_model="decoder_free"), make_batch()
+    world_model, loss = learner.agent.world_model, learner.world_model_loss.targets["Barlow"]
     embedding = world_model.encoder(batch).detach().requires_grad_()
     features = torch.randn(3, 5, world_model.size.features, requires_grad=True)
-    loss.represent(None, features, embedding, batch)["loss_barlow"].backward()
+    loss(None, features, embedding, batch)["loss_barlow"].backward()
     assert embedding.grad is None
     assert features.grad.abs().sum() > 0
     assert loss.projector.weight.grad.abs().sum() > 0
     assert untouched(world_model)
 
-    loss(batch)["loss_barlow"].backward()
+    learner.world_model_loss(batch)[0]["loss_barlow"].backward()
     assert reached(world_model.encoder) == trainable(world_model.encoder)
     assert untouched(world_model.reward_head)
 
 
 @pytest.mark.parametrize(
     ("name", "own"),
-    [("privileged", "privileged_decoder"), ("informed", "privileged_decoder"), ("decoder_free", "projector")],
+    [("privileged", "State"), ("informed", "State"), ("decoder_free", "Barlow")],
 )
 def test_parameters_of_a_loss_are_trained_and_saved(name, own):
     learner = make_learner(world_model=name)
-    module = getattr(learner.losses["world_model"], own)
-    before = [parameter.detach().clone() for parameter in module.parameters()]
+    shared = set(map(id, learner.agent.parameters()))
+    module = learner.world_model_loss.targets[own]
+    before = {name: p.detach().clone() for name, p in module.named_parameters() if id(p) not in shared}
     for _ in range(2):
         learner.update(make_batch())
-    assert not any(torch.equal(old, new) for old, new in zip(before, module.parameters(), strict=True))
+    parameters = dict(module.named_parameters())
+    assert before and not any(torch.equal(old, parameters[name]) for name, old in before.items())
 
     restored = make_learner(world_model=name)
     restored.load_state_dict(learner.state_dict())
-    pairs = zip(module.parameters(), getattr(restored.losses["world_model"], own).parameters(), strict=True)
-    assert all(torch.equal(saved, loaded) for saved, loaded in pairs)
+    loaded = dict(restored.world_model_loss.targets[own].named_parameters())
+    assert all(torch.equal(parameters[name], loaded[name]) for name in before)
 
 
 def test_frozen_lets_gradient_through_and_restores_every_flag():

@@ -19,20 +19,12 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.model_based import DreamerEnv
 from torchrl.modules import WorldModelWrapper
 from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3ModelLoss, DreamerV3ValueLoss, SoftUpdate
-from torchrl.objectives.dreamer_v3 import categorical_kl_balanced
 from torchrl.objectives.utils import ValueEstimators
 
-from dreamer_racing.losses import (
-    CriticLoss,
-    DynamicsActorLoss,
-    LossConfig,
-    ReconstructionLoss,
-    ReinforceLoss,
-    kl_losses,
-)
+from dreamer_racing.losses import LossConfig, WorldModelLoss, critic_loss, replay_critic_loss
 from dreamer_racing.modules import SIZES, Critic, Interface, TwoHotHead, WorldModel, join_features
 from dreamer_racing.modules.agent import Agent
-from tests.dreamers import learner_of
+from tests.dreamers import imagine_from, learner_of
 
 SIZE = SIZES["debug"]
 HORIZON = 333
@@ -247,10 +239,10 @@ def assert_same_gradients(ours: nn.Module, stock: nn.Module, rtol: float = 1e-4)
 
 @pytest.mark.parametrize("free_nats", [0.0, 1.0])
 def test_world_model_loss(free_nats):
-    ours, batch = make_agent().world_model, make_batch(crashes=True)
-    stock = copy.deepcopy(ours)
+    agent, batch = make_agent(), make_batch(crashes=True)
+    ours, stock = agent.world_model, copy.deepcopy(agent.world_model)
     torch.manual_seed(2)
-    losses = ReconstructionLoss(ours, free_nats=free_nats)(batch)
+    losses, latents = WorldModelLoss(agent, LossConfig(free_nats=free_nats))(batch)
     torch.manual_seed(2)
     expected, posterior = stock_model_loss(stock, free_bits=free_nats)(stock_batch(batch))
     pairs = {
@@ -262,43 +254,11 @@ def test_world_model_loss(free_nats):
     }
     for key, stock_key in pairs.items():
         torch.testing.assert_close(losses[key], expected[stock_key].squeeze(), **TOLERANCE)
-    torch.testing.assert_close(losses["replay_context", "belief"], posterior["next", "belief"])
+    torch.testing.assert_close(latents.belief, posterior["next", "belief"])
     assert losses["kl"] > 0.1
     sum(losses[key] for key in pairs).backward()
     sum(expected[key] for key in pairs.values()).backward()
     assert_same_gradients(ours, stock)
-
-
-def test_per_latent_kl():
-    """TorchRL's ``"balanced"`` takes the mean over latents where we sum, and knows no uniform mixture."""
-    torch.manual_seed(0)
-    ours = [torch.randn(3, 5, 8, 4, requires_grad=True) for _ in range(2)]
-    stock = [logits.detach().clone().requires_grad_() for logits in ours]
-    dynamics, representation, _ = kl_losses(*ours, free_nats=4.0, unimix=0.0, mode="per_latent")
-    expected = 8 * categorical_kl_balanced(*stock, alpha=1.0, free_bits=0.5)
-    torch.testing.assert_close(dynamics.mean(), expected, **TOLERANCE)
-    torch.testing.assert_close(
-        representation.mean(), 8 * categorical_kl_balanced(*stock, alpha=0.0, free_bits=0.5), **TOLERANCE
-    )
-    (0.8 * dynamics + 0.2 * representation).mean().backward()
-    (8 * categorical_kl_balanced(*stock, alpha=0.8, free_bits=0.5)).backward()
-    for our, their in zip(ours, stock, strict=True):
-        torch.testing.assert_close(our.grad, their.grad, rtol=1e-4, atol=1e-6)
-        assert (our.grad == 0).all(-1).any()  # some latents lie below their share of the free nats
-
-
-def test_per_latent_world_model_loss():
-    """The loss module passes the mode on: as TorchRL's ``"balanced"`` but for the number of latents."""
-    ours, batch = make_agent().world_model, make_batch()
-    ours.rssm.unimix = 0.0
-    stock = copy.deepcopy(ours)
-    torch.manual_seed(2)
-    losses = ReconstructionLoss(ours, free_nats=1.0, kl_mode="per_latent")(batch)
-    torch.manual_seed(2)
-    expected, _ = stock_model_loss(stock, kl_mode="balanced", free_bits=1.0 / SIZE.latents, kl_alpha=1.0)(
-        stock_batch(batch)
-    )
-    torch.testing.assert_close(losses["loss_dynamics"], SIZE.latents * expected["loss_model_kl"].squeeze(), **TOLERANCE)
 
 
 def make_starts(count: int = 12) -> TensorDict:
@@ -310,48 +270,48 @@ def make_starts(count: int = 12) -> TensorDict:
 
 
 @pytest.mark.parametrize("entropy_scale", [3e-4, 0.3])
-@pytest.mark.parametrize(("loss_class", "use_reinforce"), [(ReinforceLoss, True), (DynamicsActorLoss, False)])
-def test_actor_loss(loss_class, use_reinforce, entropy_scale):
+@pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
+def test_actor_loss(actor, entropy_scale):
     """Imagination, λ-returns, weights, return range, estimator and entropy at once.
 
     Two updates: the second meets a moved return range.
     """
-    agent, starts = make_agent(), make_starts()
-    stock = copy.deepcopy(agent)
-    loss = loss_class(
-        agent.world_model, agent.actor, agent.critic, horizon=5, discount=DISCOUNT, entropy_scale=entropy_scale
+    learner, starts = (
+        learner_of(seed=0, horizon=5, discount=DISCOUNT, entropy_scale=entropy_scale, actor=actor),
+        make_starts(),
     )
+    stock = copy.deepcopy(stir(learner.agent))
+    use_reinforce = actor == "reinforce"
     oracle = stock_actor_loss(stock, starts["terminated"], use_reinforce=use_reinforce, entropy_bonus=entropy_scale)
-    for module in (loss.return_normalizer, oracle.retnorm):
+    for module in (learner.return_range, oracle.retnorm):
         module.high.fill_(2.5)  # above the floor, which would hide a wrong range
     for _ in range(2):
         torch.manual_seed(4)
-        losses = loss(starts)
+        losses, trajectory = imagine_from(learner, *starts.values())
         torch.manual_seed(4)
         oracle.__dict__["continuation_model"].asked = 0
         expected, imagined = oracle(starts)
         torch.testing.assert_close(losses["loss_actor"], expected["loss_actor"], **TOLERANCE)
         torch.testing.assert_close(losses["return_scale"], expected["return_scale"], **TOLERANCE)
         torch.testing.assert_close(losses["continuation"], expected["continuation_mean"], **TOLERANCE)
-        ours = losses["imagination"]
-        for key, stock_key in {"lambda_return": "lambda_target", "weight": "discount_weight"}.items():
-            torch.testing.assert_close(ours[key].transpose(0, 1), imagined[stock_key], **TOLERANCE)
+        for value, key in ((trajectory.lambda_return, "lambda_target"), (trajectory.weight, "discount_weight")):
+            torch.testing.assert_close(value.transpose(0, 1), imagined[key], **TOLERANCE)
         assert losses["return_scale"] > 1.5
     losses["loss_actor"].backward()
     expected["loss_actor"].backward()
-    assert_same_gradients(agent.actor, stock.actor)
+    assert_same_gradients(learner.agent.actor, stock.actor)
 
 
 def test_return_range_is_the_moving_percentiles_with_a_floor_of_one():
     """By hand, as TorchRL's normaliser is the one in use: no debiasing, from zero, 5th to 95th percentile."""
-    agent = make_agent()
-    loss = ReinforceLoss(agent.world_model, agent.actor, agent.critic, horizon=5, return_decay=0.5)
+    learner = learner_of(seed=0, horizon=5, return_decay=0.5)
+    stir(learner.agent)
     low = high = 0.0
     scales = []
     for seed in range(4):
         torch.manual_seed(seed)
-        losses = loss(make_starts())
-        returns = losses["imagination", "lambda_return"].numpy()
+        losses, trajectory = imagine_from(learner, *make_starts().values())
+        returns = trajectory.lambda_return.numpy()
         low = 0.5 * low + 0.5 * np.quantile(returns, 0.05)
         high = 0.5 * high + 0.5 * np.quantile(returns, 0.95)
         scales.append(max(1.0, high - low))
@@ -389,25 +349,31 @@ def test_critic_loss(slow_scale):
     agent = make_agent()
     stock = copy.deepcopy(agent.critic)
     inputs = make_critic_input(make_batch())
-    losses = CriticLoss(agent.critic, discount=DISCOUNT, slow_critic_scale=slow_scale)(inputs)
     imagination = inputs["imagination"]
+    regression, _ = critic_loss(agent.critic, imagination["features"], imagination["lambda_return"], slow_scale)
+    loss = (imagination["weight"] * regression).mean()
     belief, state = imagination["features"].split([SIZE.belief, SIZE.state], -1)
     stock_imagination = {"lambda_target": imagination["lambda_return"], "discount_weight": imagination["weight"]}
     oracle = stock_value_loss(stock, slow_scale)
     expected, _ = oracle(TensorDict({"belief": belief, "state": state, **stock_imagination}, [5, 12]))
-    torch.testing.assert_close(losses["loss_critic"], expected["loss_value"], **TOLERANCE)
-    losses["loss_critic"].backward()
+    torch.testing.assert_close(loss, expected["loss_value"], **TOLERANCE)
+    loss.backward()
     expected["loss_value"].backward()
     found = gradients(oracle.value_model_params)
     for name, gradient in gradients(agent.critic.head).items():
         torch.testing.assert_close(gradient, found[f"module.head.{name}"], rtol=1e-4, atol=1e-6)
 
 
+def replayed(agent: Agent, inputs: TensorDict, batch: TensorDict) -> Tensor:
+    features = join_features(inputs["belief"], inputs["state"])
+    return replay_critic_loss(agent.critic, features, batch, torch.tensor(DISCOUNT), 0.95, 1.0, inputs["bootstrap"])
+
+
 def test_replay_critic_loss_without_crashes():
     """TorchRL and the reference average over the T − 1 records that have a next one, we over all T."""
     agent, batch = make_agent(), make_batch()
     inputs = make_critic_input(batch)
-    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_value_scale=1.0)(inputs)["loss_replay_critic"]
+    ours = replayed(agent, inputs, batch)
     oracle = stock_value_loss(copy.deepcopy(agent.critic))
     expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
     torch.testing.assert_close(7 * ours, 6 * expected, **TOLERANCE)
@@ -417,7 +383,7 @@ def test_replay_critic_loss_with_crashes():
     """TorchRL leaves out records that end an episode; we teach the critic that a crash is worth zero from there on."""
     agent, batch = make_agent(), make_batch(crashes=True)
     inputs = make_critic_input(batch)
-    ours = CriticLoss(agent.critic, discount=DISCOUNT, replay_value_scale=1.0)(inputs)["loss_replay_critic"]
+    ours = replayed(agent, inputs, batch)
     oracle = stock_value_loss(copy.deepcopy(agent.critic))
     expected = oracle.replay_value_loss(stock_replay(inputs, batch), horizon=HORIZON, lmbda=0.95)["loss_replay_value"]
     crashed = batch["terminated"].squeeze(-1)

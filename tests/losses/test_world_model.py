@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.losses import ReconstructionLoss, kl_losses
-from dreamer_racing.modules import Interface, WorldModel
+from dreamer_racing.losses import LossConfig, WorldModelLoss, kl_losses
+from dreamer_racing.modules import SIZES, Agent, Interface
 from tests.dreamers import learner_of
 
 
@@ -80,38 +80,36 @@ def test_free_nats_bound_the_sum_over_latents():
 
 @pytest.mark.parametrize("image_size", [32, 64, 96])
 def test_losses_of_a_new_model(image_size):
-    world_model = WorldModel("debug", Interface(image_size=image_size))
     batch = make_batch(image_size=image_size)
-    loss = ReconstructionLoss(world_model)
-    losses = loss(batch)
-    assert set(loss.out_keys) == set(losses.keys())
+    loss = WorldModelLoss(Agent(SIZES["debug"], Interface(image_size=image_size)), LossConfig())
+    losses, latents = loss(batch)
     # Uniform over 255 bins, whatever the reward.
     assert losses["loss_reward"].item() == pytest.approx(math.log(255), rel=1e-5)
     torch.testing.assert_close(losses["loss_image"], losses["image_error"] * image_size**2 * 3)
     torch.testing.assert_close(losses["reward_error"], batch["reward"].abs().mean())
-    assert losses["replay_context"].batch_size == (2, 4)
-    assert losses["replay_context", "belief"].requires_grad
+    assert latents.belief.shape[:2] == (2, 4) and latents.belief.requires_grad
 
 
 def test_continue_target_is_one_minus_terminated():
-    world_model = WorldModel("debug")
-    output = world_model.continue_head.mlp.output
+    agent = Agent(SIZES["debug"], Interface())
+    output = agent.world_model.continue_head.mlp.output
     with torch.no_grad():
         output.weight.zero_()
         output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
     batch = make_batch()
     batch["truncated"][1, 1] = True
-    loss = ReconstructionLoss(world_model)(batch)["loss_continue"]
+    loss = WorldModelLoss(agent, LossConfig())(batch)[0]["loss_continue"]
     expected = -(7 * math.log(0.75) + 1 * math.log(0.25)) / 8
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("image_size", [32, 64, 96])
 def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
-    world_model = WorldModel("debug", Interface(image_size=image_size))
+    agent = Agent(SIZES["debug"], Interface(image_size=image_size))
+    world_model = agent.world_model
     with torch.no_grad():
         world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
-    losses = ReconstructionLoss(world_model, free_nats=0.0)(make_batch(image_size=image_size))
+    losses, _ = WorldModelLoss(agent, LossConfig(free_nats=0.0))(make_batch(image_size=image_size))
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in world_model.named_parameters():
         assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
@@ -119,15 +117,15 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
 
 def test_a_window_begins_with_the_first_records_context():
     from dreamer_racing.modules.stored_latents import CONTEXT
-    from tests.learners.test_dreamer import make_batch
+    from tests.learners.test_dreamer_v3 import make_batch
 
     learner = learner_of(seed=0)
-    loss, batch = learner.losses["world_model"], make_batch()
+    loss, batch = learner.world_model_loss, make_batch()
     batch["is_init"] = torch.zeros_like(batch["is_init"])
     belief, state = torch.rand(3, 6, 32) * 2 - 1, torch.eye(4)[torch.randint(4, (3, 6, 4))].flatten(2)
     batch[CONTEXT] = learner.latent_format.pack(belief, state)
     torch.manual_seed(1)
-    context = loss(batch)["replay_context"]
+    latents = loss(batch)[1]
     torch.manual_seed(1)
     rssm = learner.agent.world_model.rssm
     expected = rssm.observe(
@@ -136,9 +134,9 @@ def test_a_window_begins_with_the_first_records_context():
         batch["is_init"].squeeze(-1),
         initial=rssm.latent_format.unpack(batch[CONTEXT][:, 0]),
     )
-    torch.testing.assert_close(context["belief"], expected.belief)
-    cold = loss(batch.exclude(CONTEXT))["replay_context"]
-    assert not torch.allclose(context["belief"][:, 0], cold["belief"][:, 0])
+    torch.testing.assert_close(latents.belief, expected.belief)
+    cold = loss(batch.exclude(CONTEXT))[1]
+    assert not torch.allclose(latents.belief[:, 0], cold.belief[:, 0])
 
 
 def test_a_refreshed_context_is_what_the_next_window_begins_with():

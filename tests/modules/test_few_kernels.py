@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
 
-from dreamer_racing.learners.dreamer import DreamerLearner
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses.imagination import Imagination, imagine
 from dreamer_racing.modules import ModelSize, cast_weights, get_size
@@ -18,9 +17,8 @@ from dreamer_racing.modules.few_kernels import GatedUpdate, gate_shift
 from dreamer_racing.modules.layers import LayerNorm, RMSNorm, autocast
 from dreamer_racing.modules.recurrent_cells import gated_update
 from dreamer_racing.modules.rssm import sample_one_hot
-from tests.dreamers import learner_of
-from tests.learners.test_dreamer import make_batch
-from tests.losses.test_asymmetric_ppo_actor import STATE, make_seen_batch
+from tests.dreamers import imagine_from, latent_ppo_of, learner_of
+from tests.learners.test_dreamer_v3 import make_batch
 
 SMALL = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4, "units": 16}
 SIZES = {  # mostly of states that are not drawn: noise drawn ahead is other noise
@@ -31,7 +29,7 @@ SIZES = {  # mostly of states that are not drawn: noise drawn ahead is other noi
 }
 
 
-def gradients(learner: DreamerLearner, loss: str = "loss") -> dict[str, Tensor]:
+def gradients(learner: DreamerV3, loss: str = "loss") -> dict[str, Tensor]:
     """Gradients of all losses, by the parameter's name, and the loss."""
     torch.manual_seed(0)
     metrics = learner._backward(make_batch())
@@ -50,7 +48,7 @@ def same_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "randn", lambda *shape, **_: noise(torch.Size(shape[1:])).expand(shape))
 
 
-def make_pair(size: ModelSize, **settings: object) -> list[DreamerLearner]:
+def make_pair(size: ModelSize, **settings: object) -> list[DreamerV3]:
     learners = [learner_of(size, few_kernels=few, horizon=3, seed=0, **settings) for few in (False, True)]
     for learner in learners:  # its first output is zero, and so would be the gradients of what reads it
         nn.init.normal_(learner.agent.critic.head.mlp.output.weight, generator=torch.Generator().manual_seed(0))
@@ -99,15 +97,11 @@ def relative_error(found: dict[str, Tensor], exact: dict[str, Tensor], part: str
 
 
 def test_samples_are_drawn_by_the_same_noise() -> None:
-    few, plain = (
-        learner_of(SIZES["sampled"], seed=0, few_kernels=few, actor="asymmetric_ppo", interface=STATE)
-        for few in (True, False)
-    )
+    few, plain = (latent_ppo_of(SIZES["sampled"], seed=0, few_kernels=few) for few in (True, False))
     of_each = []
     for learner in (few, plain):
         torch.manual_seed(0)
-        batch = make_seen_batch()
-        learner._backward(batch)
+        learner._backward(make_batch())
         of_each.append((learner.latents, [p.grad for p in learner.agent.world_model.parameters()]))
     torch.testing.assert_close(of_each[0][0]["state"], of_each[1][0]["state"], rtol=0, atol=1e-6)
     for one, other in zip(of_each[0][1], of_each[1][1], strict=True):
@@ -192,10 +186,8 @@ def test_norms_keep_the_type_that_comes_in_where_autocast_would_not(norm: type[n
 @pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
 def test_the_actors_loss_moves_nothing_but_the_actor(actor: str) -> None:
     learner = learner_of("debug", seed=0, horizon=3, actor=actor, few_kernels=True, mixed_precision=True)
-    starts = {"belief": torch.zeros(4, 32), "state": torch.zeros(4, 16), "terminated": torch.zeros(4, 1).bool()}
     with learner.autocast(), learner._weights():
-        loss = learner.losses["actor"](TensorDict(starts, [4]))["loss_actor"]
-        loss.backward()
+        imagine_from(learner, torch.zeros(4, 32), torch.zeros(4, 16))[0]["loss_actor"].backward()
     touched = {name for name, part in learner.agent.named_children() for p in part.parameters() if p.grad is not None}
     assert touched == {"actor"}
 

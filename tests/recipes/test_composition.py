@@ -12,7 +12,6 @@ from torchrl.envs.transforms import Transform
 
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.runs import flatten
-from dreamer_racing.losses import ActorLoss, WorldModelLoss, find_loss
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.schedule import RampClock
 from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
@@ -169,7 +168,7 @@ def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize(
-    "override", ["loss.actor=dynamics", "loss.actor=reinforce", "loss.actor=ppo", "replay.held_out=0"]
+    "override", ["loss.actor=dynamics", "loss.actor=reinforce", "loss.actor=latent_ppo", "replay.held_out=0"]
 )
 def test_what_races_goes_with_other_actors(override: str) -> None:
     config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
@@ -193,8 +192,8 @@ def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
     images, race = (compose("dreamer_v3", f"tuned={name}") for name in ("images", "race"))
     assert (images.loss.world_model, images.loss.actor) == ("reconstruction", "latent_ppo")
     assert (images.env.start_on_line, images.env.start_at_gate, images.schedule.start_on_line.to) == (0, 0.5, None)
-    assert not find_loss(WorldModelLoss, images.loss.world_model).reads_privileged
-    assert not find_loss(ActorLoss, images.loss.actor).reads_privileged
+    arena = recipe_module("composing.arena")
+    assert not arena.privileged_losses(images) and len(arena.privileged_losses(race)) == 2
     changed = set(flatten(OmegaConf.to_container(images))) ^ set(flatten(OmegaConf.to_container(race)))
     assert {name for name, _ in changed} == {
         "tuned", "total_env_steps", "env.start_on_line", "env.start_at_gate", "model.replay_ratio",
@@ -230,7 +229,7 @@ def test_what_races_goes_with_a_state_space_model() -> None:
 def test_dreamer_as_published_is_one_word_away() -> None:
     """Every number of losses, model and schedule as in the reference, or as its size says."""
     faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
-    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.LossConfig))
+    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.LossesConfig))
     assert OmegaConf.to_container(faithful.env) | {"num_envs": None} == OmegaConf.to_container(
         OmegaConf.structured(schema.EnvConfig(num_envs=1))
     ) | {"num_envs": None}
@@ -302,7 +301,7 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
     learner.adjust(**end)
     assert "kl_target" not in end  # there is none to begin at
-    assert float(learner.losses["actor"].entropy_scale) == learner.discount == 0.5
+    assert float(learner.entropy_scale) == float(learner.discount) == 0.5
 
 
 def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
@@ -333,10 +332,11 @@ def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(
     made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
     begun = run.learner.state_dict()
     run.close()
-    assert begun["losses"]["world_model"] and begun["losses"]["actor"], "the losses have weights of their own"
-    for part in ({"agent": begun["agent"]}, begun["losses"]):
+    own = begun["own_networks"]
+    assert own["world_model_loss"] and own["state_critic"], "there are weights that are no part of the agent"
+    for part in ({"agent": begun["agent"]}, own):
         for home, weights in part.items():
-            other = made["agent"] if home == "agent" else made["losses"][home]
+            other = made["agent"] if home == "agent" else made["own_networks"][home]
             assert weights.keys() == other.keys()
             for name, value in weights.items():
                 assert torch.equal(value, other[name]), f"{home}: {name}"
@@ -404,11 +404,11 @@ def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> Non
     recipe = recipe_module("dreamer_v3")
     recipe.resolve(compose("dreamer_v3", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
     assert "as asked for" not in capsys.readouterr().out
-    changed = ["loss=reconstruction", "loss.actor=flown_ppo", "schedule.kl_target.to=null", "replay.context=false"]
+    changed = ["loss=reconstruction", "loss.actor=latent_ppo", "schedule.kl_target.to=null", "replay.context=false"]
     recipe.resolve(compose("dreamer_v3", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
     for words in (
-        "loss.world_model=reconstruction (privileged)", "loss.actor=flown_ppo (asymmetric_ppo)",
+        "loss.world_model=reconstruction (privileged)", "loss.actor=latent_ppo (asymmetric_ppo)",
         "schedule.kl_target.to=null (0.004)", "replay.context=false (true)", "loss.drift_scale=0.0 (1.0)",
     ):  # fmt: skip
         assert words in line

@@ -55,7 +55,7 @@ COMMON = [
     "total_env_steps=1200",
 ]  # fmt: skip
 SCHEDULES = [
-    "loss.ppo.flown=160", "loss.ppo.minibatch=64", "loss.ppo.kl_target=0.0005", "schedule.kl_target.to=0.0003",
+    "loss.ppo.steps=160", "loss.ppo.minibatch=64", "loss.ppo.kl_target=0.0005", "schedule.kl_target.to=0.0003",
     "schedule.kl_target.by=run", "schedule.world_model_rate.by=run", "schedule.max_std.by=run",
     "schedule.max_std.begin=0",
 ]  # fmt: skip

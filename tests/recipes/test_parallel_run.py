@@ -18,7 +18,7 @@ from tests.running_recipes import ROOT, TINY, compose, recipe, recipe_module, ro
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "prefill=256",
-    "loss.ppo.flown=128", "loss.ppo.minibatch=64", "logger.every=64",
+    "loss.ppo.steps=128", "loss.ppo.minibatch=64", "logger.every=64",
 ]  # fmt: skip
 
 

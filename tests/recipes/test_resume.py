@@ -116,10 +116,9 @@ RACE = [
     "tuned",
     [
         ["tuned=none"],
-        [*RACE, "loss.actor=ppo", "loss.ppo.updates=7", "model.imagination_starts=8"],
-        [*RACE, "loss.ppo.flown=200", "model=ssm_debug"],
+        [*RACE, "loss.ppo.steps=200", "model=ssm_debug"],
     ],
-    ids=["none", "race in imagination", "state space"],
+    ids=["none", "race in a state-space model"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(tuned: list[str], tmp_path: Path) -> None:
     train(tmp_path, *SETTINGS, *tuned, "track=circle", "env=faithful", "run_dir=whole")

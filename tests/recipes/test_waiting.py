@@ -11,7 +11,7 @@ from dreamer_racing.training.model_lag import LOOKS
 from tests.running_recipes import TINY, open_session, prepared, recipe_module
 
 SETTINGS = [
-    *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.flown=32",
+    *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.steps=32",
     "loss.ppo.minibatch=32", "env.start_on_line=0", "schedule.start_on_line.to=null", "schedule.wait_every=32",
 ]  # fmt: skip
 
@@ -31,7 +31,7 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
         looked.append(learner.updates)
         return {"privileged_error": torch.tensor(1e3 if session.env_steps <= 12 * 32 else 0.0)}
 
-    def watched(self, batch, timed, update=dreamer.DreamerLearner.update):
+    def watched(self, batch, timed, update=dreamer.LatentPPO.update):
         before = [parameter.clone() for parameter in self.agent.actor.parameters()]
         if looked and looked[-1] == self.updates:  # the first update after a look
             waited.append(self.actor_waits)
@@ -42,7 +42,7 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
         return metrics
 
     monkeypatch.setattr(dreamer, "world_model_metrics", measure)
-    monkeypatch.setattr(dreamer.DreamerLearner, "update", watched)
+    monkeypatch.setattr(dreamer.LatentPPO, "update", watched)
     dreamer.train(config, session)
     session.close()
     assert True in waited and waited[-1] is False and waited == sorted(waited, reverse=True)

@@ -13,7 +13,7 @@ from dreamer_racing.training.directory import latest_checkpoint
 from tests.running_recipes import TINY, open_session, recipe, recipe_module, rows
 
 SETTINGS = [
-    *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.flown=64",
+    *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.steps=64",
     "loss.ppo.minibatch=32", "logger.every=32", "env.start_on_line=0", "schedule.start_on_line.to=null",
     "workers.patience=120",
 ]  # fmt: skip

@@ -1,9 +1,10 @@
-"""Every number of a `DreamerLearner`'s update, beside those of its losses."""
+"""Numbers of an update with a world model, beside those of the losses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dreamer_racing.losses.config import HORIZON
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
 
 
@@ -12,9 +13,8 @@ class LearnerConfig:
     """Numbers of an update, beside those of its losses.
 
     Attributes:
+        imagination_horizon: H, imagined actions from each start; also how far ahead the world model is measured.
         imagination_starts: Imagine from a random subset of so many records of the batch; None from all of them.
-        imagine_recent: Imagine from the batch's newest windows only, as far as they go, so that the actor learns where
-            it flies now; the batch must say which they are (``recent``), as the replay does.
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         slow_critic_rate: Fraction by which the slow critic moves at each update.
@@ -36,8 +36,8 @@ class LearnerConfig:
     Reference: danijar/dreamerv3, ``configs.yaml``.
     """
 
+    imagination_horizon: int = setting(HORIZON, COUNT)
     imagination_starts: int | None = setting(None, COUNT)
-    imagine_recent: bool = False
     average_rate: float | None = setting(None, POSITIVE_SHARE)
     slow_critic_rate: float = setting(0.02, SHARE)
     compile: bool = False

@@ -6,19 +6,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.learners.dreamer import make_dreamer
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.learners.learner import seeded
-from dreamer_racing.losses import (
-    ACTOR_LOSSES,
-    WORLD_MODEL_LOSSES,
-    LossConfig,
-    ReconstructionLoss,
-    ReinforceLoss,
-    make_losses,
-)
-from dreamer_racing.modules import SIZES, Agent, Interface, get_size
-from tests.dreamers import learner_of
+from dreamer_racing.learners.optimizer import gradient_norms
+from dreamer_racing.losses import TARGETS, DreamerV3Losses, Target
+from dreamer_racing.losses.targets import Image
+from dreamer_racing.modules import SIZES, Agent, Interface
+from dreamer_racing.modules.interface import PRIVILEGED
+from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 
 CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
 
@@ -121,10 +117,10 @@ def test_resume_equals_never_having_stopped():
 
 def test_return_normaliser_is_saved():
     learner = learner_of(seed=0, **CONFIG)
-    learner.losses["actor"].return_normalizer.high.fill_(7.0)
+    learner.return_range.high.fill_(7.0)
     resumed = learner_of(seed=0, **CONFIG)
     resumed.load_state_dict(learner.state_dict())
-    assert resumed.losses["actor"].return_normalizer.scale().item() == 7.0
+    assert resumed.return_range.scale().item() == 7.0
 
 
 def test_state_survives_a_file(tmp_path):
@@ -143,7 +139,7 @@ def test_state_of_another_size_is_refused_with_what_to_do():
 
 
 def made_with(world_model_loss, seed, **interface):
-    if WORLD_MODEL_LOSSES[world_model_loss].reads_privileged:
+    if any(PRIVILEGED in target.reads for target in TARGETS[world_model_loss]):
         interface["privileged_dim"] = 21
     return learner_of("debug", Interface(**interface), seed=seed, **CONFIG | {"world_model": world_model_loss})
 
@@ -156,8 +152,8 @@ def assert_refused(saved, learner, words):
     after = learner.state_dict()
     for name, value in before["agent"].items():
         assert torch.equal(value, after["agent"][name]), name
-    for name, loss in before["losses"].items():
-        assert all(torch.equal(value, after["losses"][name][key]) for key, value in loss.items()), name
+    for name, own in before["own_networks"].items():
+        assert all(torch.equal(value, after["own_networks"][name][key]) for key, value in own.items()), name
     assert after["updates"] == 0
 
 
@@ -184,8 +180,8 @@ def test_state_of_another_environment_is_refused(there, here):
     assert_refused(made_with("reconstruction", 1, **there), made_with("reconstruction", 2, **here), "environment")
 
 
-def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
-    """Names and shapes of all that depends on the images' size, as checkpoints have them since the first."""
+def test_names_and_shapes_of_networks_stay_those_that_agents_ship_with():
+    """Of all that depends on the images' size."""
     learner = learner_of(seed=1, **CONFIG)
     saved = learner.state_dict()
     shapes = {key: list(value.shape) for key, value in saved["agent"].items() if value.ndim > 1}
@@ -202,21 +198,12 @@ def test_networks_of_the_default_image_size_are_those_of_older_checkpoints():
     for key, shape in expected.items():
         assert shapes[f"world_model.{key}"] == shape, key
     assert not [key for key in shapes if ".encoder." in key or ".decoder." in key if key[12:] not in expected]
-    del saved["image_size"]  # which older checkpoints do not have
-    resumed = learner_of(seed=2, **CONFIG)
-    resumed.load_state_dict(saved)
-    for key, value in resumed.agent.state_dict().items():
-        assert torch.equal(value, saved["agent"][key]), key
 
 
 @pytest.mark.parametrize("loss", ["reconstruction", "decoder_free"])
 def test_state_of_another_image_size_is_refused(loss):
     small, large = made_with(loss, 1, image_size=32), made_with(loss, 2, image_size=96)
     assert_refused(small, large, "images of 32 × 32 pixels, not 96 × 96: choose env.image_size=32")
-    older = small.state_dict() | {"agent": made_with(loss, 3).agent.state_dict()}
-    del older["image_size"]
-    with pytest.raises(ValueError, match="64 × 64 pixels, not 96 × 96"):
-        large.load_state_dict(older)
 
 
 @pytest.mark.parametrize("image_size", [32, 96])
@@ -227,7 +214,7 @@ def test_every_image_size_updates(image_size):
     metrics = learner.update(batch)
     assert metrics["loss"].isfinite()
     torch.testing.assert_close(metrics["loss_image"], metrics["image_error"] * image_size**2 * 3)
-    images = learner.agent.world_model.images(*learner.open_loop(batch, context=2))
+    images = learner.agent.world_model.images(*learner.open_loop(batch, num_observed=2))
     assert images.shape == (3, 6, image_size, image_size, 3)
 
 
@@ -242,28 +229,43 @@ def test_seed_fixes_the_weights_and_leaves_the_global_generator_alone():
         assert torch.equal(value, second.agent.state_dict()[name]), name
 
 
+def watch(learner):
+    """The trajectories that the learner's objective sees from here on."""
+    seen, objective = [], learner.objective
+    learner.objective = lambda trajectory, **numbers: seen.append(trajectory) or objective(trajectory, **numbers)
+    return seen
+
+
 def test_imagination_may_start_from_a_subset():
     learner = learner_of(seed=0, **CONFIG | {"imagination_starts": 5})
-    seen = []
-    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    seen = watch(learner)
     metrics = learner.update(make_batch())
-    assert seen[0].batch_size == (4, 5)
+    assert seen[0].weight.shape == (4, 5, 1)
     assert metrics["loss_replay_critic"].isfinite()
 
 
 def test_every_terminal_record_is_a_start_of_no_weight():
     learner = learner_of(seed=0, **CONFIG)
-    seen = []
-    learner.losses["actor"].register_forward_hook(lambda _, inputs, output: seen.append(output["imagination"]))
+    seen = watch(learner)
     learner.update(make_batch())
-    weight = seen[0]["weight"].view(4, 3, 6)
+    weight = seen[0].weight.view(4, 3, 6)
     assert torch.equal(weight[0], 1.0 - make_batch()["terminated"].squeeze(-1).float())
     assert torch.equal(weight[:, 0, 2], torch.zeros(4))
 
 
+def test_imagined_steps_know_the_action_before_them():
+    """That which led to the record at the first step, then those that the policy took, as they were clipped."""
+    learner, batch = learner_of(seed=0, **CONFIG), make_batch()
+    seen = watch(learner)
+    learner.update(batch)
+    (trajectory,) = seen
+    assert torch.equal(trajectory.previous_action[0], batch["previous_action"].flatten(0, 1))
+    assert torch.equal(trajectory.previous_action[1:], trajectory.action[:-1].clamp(-1.0, 1.0))
+
+
 def test_open_loop_video():
     learner = learner_of(seed=0, **CONFIG)
-    belief, state = learner.open_loop(make_batch(), context=2)
+    belief, state = learner.open_loop(make_batch(), num_observed=2)
     images = learner.agent.world_model.images(belief, state)
     assert images.shape == (3, 6, 64, 64, 3)
     assert images.dtype == torch.uint8
@@ -303,19 +305,17 @@ def test_policy_shares_the_parameters():
     assert policy.rssm is learner.agent.world_model.rssm
 
 
-def test_losses_are_chosen_by_name(monkeypatch):
-    class BoldActorLoss(ReinforceLoss):
-        """Has ten times the entropy."""
-
-        def forward(self, tensordict):
-            self.entropy_scale.fill_(3e-3)
-            return super().forward(tensordict)
-
-    monkeypatch.setitem(ACTOR_LOSSES, "bold", BoldActorLoss)
-    learner = learner_of(seed=0, **CONFIG | {"actor": "bold"})
-    assert isinstance(learner.losses["actor"], BoldActorLoss)
-    learner.update(make_batch())
-    with pytest.raises(ValueError, match="'timid'.*reinforce"):
+def test_an_objective_of_ones_own_is_what_the_actor_minimises(tmp_path, monkeypatch):
+    (tmp_path / "bold.py").write_text(
+        "from dreamer_racing.losses import reinforce\n"
+        "def bold(trajectory, *, entropy_scale, **numbers):\n"
+        "    loss, metrics = reinforce(trajectory, entropy_scale=10 * entropy_scale, **numbers)\n"
+        "    return loss, {**metrics, 'boldness': loss.detach()}\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    metrics = learner_of(seed=0, **CONFIG | {"actor": "bold:bold"}).update(make_batch())
+    torch.testing.assert_close(metrics["boldness"], metrics["loss_actor"])
+    with pytest.raises(ValueError, match=r"'timid'.*reinforce"):
         learner_of(**CONFIG | {"actor": "timid"})
 
 
@@ -364,55 +364,105 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
     learner = learner_of(seed=0, **CONFIG | {"learning_rate": 1e-3, "behavior_learning_rate": 4e-4})
 
     def settings() -> list[float]:
-        actor, critic = learner.losses["actor"], learner.losses["critic"]
         rates = [group["lr"] for group in learner.optimizer.param_groups]
-        return [*rates, learner.discount, float(actor.discount), float(critic.discount), float(actor.entropy_scale)]
+        return [*rates, float(learner.discount), float(learner.entropy_scale)]
 
     learner.adjust(rates=0.5, discount=0.9, entropy_scale=0.1)
-    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.1])
     learner.update(make_batch())
     learner.adjust()
-    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.9, 0.9, 0.1])
+    assert settings() == pytest.approx([5e-4, 2e-4, 0.9, 0.1])
     learner.adjust(rates=0.5, world_model_rate=0.1)
     assert settings()[:2] == pytest.approx([5e-5, 2e-4])
     learner.adjust(rates=1.0)
-    assert settings() == pytest.approx([1e-3, 4e-4, 0.9, 0.9, 0.9, 0.1])
-    with pytest.raises(TypeError, match=r"adjust\(discont=...\): LossConfig has no such number"):
+    assert settings() == pytest.approx([1e-3, 4e-4, 0.9, 0.1])
+    with pytest.raises(TypeError, match=r"adjust\(discont=...\): a learner of dreamer_v3 has no such number"):
         learner.adjust(discont=0.5)
+    with pytest.raises(ValueError, match=r"world_model_rate=0\.1\) is a share of rates"):
+        learner.adjust(world_model_rate=0.1)
 
 
-def test_every_number_that_a_loss_has_moves_under_the_name_in_the_configuration():
-    learner = learner_of(seed=0, **CONFIG)
-    homes = {
-        "world_model": ("dynamics_scale", "representation_scale", "free_nats"),
-        "actor": ("discount", "lambda_", "entropy_scale"),
-        "critic": ("discount", "lambda_", "slow_critic_scale", "replay_value_scale", "replay_value_gradient"),
-    }
-    moved = {name: 0.25 for names in homes.values() for name in names}
-    learner.adjust(**moved)
-    for home, names in homes.items():
-        found = {name: float(getattr(learner.losses[home], name)) for name in names}
-        assert found == dict.fromkeys(names, 0.25), home
+def make_starts(count=6, terminated=()):
+    flags = torch.zeros(count, 1, dtype=torch.bool)
+    flags[list(terminated)] = True
+    return torch.randn(count, 32, requires_grad=True), torch.zeros(count, 16, requires_grad=True), flags
 
 
-@pytest.mark.parametrize("name", ["return_decay", "barlow_scale", "kl_target", "world_model", "ppo"])
-def test_a_number_that_no_loss_has_is_refused(name):
-    """What only a constructor reads, what another loss would have, and what is no number."""
-    learner = learner_of(seed=0, **CONFIG)
-    with pytest.raises(
-        ValueError, match=rf"adjust\({name}=...\): none of ReconstructionLoss, ReinforceLoss, CriticLoss"
-    ):
-        learner.adjust(**{name: 0.5})
+def always_continue(agent, probability=1.0):
+    output = agent.world_model.continue_head.mlp.output
+    with torch.no_grad():
+        output.weight.zero_()
+        output.bias.fill_(1e4 if probability == 1.0 else math.log(probability / (1 - probability)))
 
 
 def test_a_discount_of_zero_leaves_only_the_next_reward():
     learner = learner_of(seed=0, **CONFIG)
     torch.nn.init.normal_(learner.agent.world_model.reward_head.mlp.output.weight)
     learner.adjust(discount=0.0)
-    context = learner.losses["world_model"](make_batch()).pop("replay_context")
-    imagined = learner.losses["actor"](learner.starts(context, make_batch()))
-    returns = imagined["imagination"]["lambda_return"]
-    assert returns.mean().item() == pytest.approx(imagined["imagined_reward"].item(), abs=1e-5)
+    metrics, trajectory = imagine_from(learner, *make_starts())
+    assert trajectory.lambda_return.mean().item() == pytest.approx(metrics["imagined_reward"].item(), abs=1e-5)
+
+
+def test_terminal_starts_get_no_weight_by_their_true_continuation():
+    """However sure the model is that the episode goes on, a start that was terminal counts for nothing."""
+    learner = learner_of(seed=0, **CONFIG)
+    always_continue(learner.agent)
+    _, trajectory = imagine_from(learner, *make_starts(terminated=(0, 3)))
+    assert torch.equal(trajectory.weight[:, [0, 3]], torch.zeros(4, 2, 1))
+    assert (trajectory.weight[:, [1, 2, 4, 5]] > 0.98).all()
+
+
+def test_weight_is_the_discounted_chance_of_getting_there():
+    learner = learner_of(seed=0, **CONFIG | {"discount": 0.9})
+    always_continue(learner.agent, 0.5)
+    _, trajectory = imagine_from(learner, *make_starts())
+    expected = torch.tensor([0.45**step for step in range(4)]).view(4, 1, 1).expand(4, 6, 1)
+    torch.testing.assert_close(trajectory.weight, expected)
+
+
+def test_return_range_moves_towards_the_percentiles_and_is_at_least_one():
+    learner = learner_of(seed=0, **CONFIG)
+    assert learner.return_range.scale().item() == 1.0
+    learner.return_range.update(torch.linspace(0, 1000, 101).view(-1, 1))
+    # One percent of the way from 0 to 50 and to 950.
+    assert learner.return_range.scale().item() == pytest.approx(9.0, rel=1e-3)
+
+
+def test_actor_loss_is_minus_the_entropy_bonus_where_nothing_is_to_be_gained():
+    learner = learner_of(seed=0, **CONFIG | {"entropy_scale": 0.5, "discount": 1.0})  # reward and critic are zero
+    always_continue(learner.agent)
+    metrics, _ = imagine_from(learner, *make_starts())
+    torch.testing.assert_close(metrics["loss_actor"], -0.5 * metrics["entropy"])
+
+
+def test_reinforcing_moves_the_policy_to_the_rewarded_action():
+    """With a reward that grows with the first action's mean effect, that mean rises."""
+    torch.manual_seed(0)
+    learner = learner_of(seed=0, horizon=5)
+    agent = learner.agent
+    always_continue(agent)
+    # The reward head reads the belief's first unit, which here is the action's first dimension.
+    agent.world_model.rssm.cell.project_action = lambda action: action
+    agent.world_model.rssm.cell.forward = lambda belief, state, action: torch.cat((action, belief[:, 4:]), -1)
+    agent.world_model.reward_head.mean = lambda features: features[..., :1]
+    optimizer = torch.optim.Adam(agent.actor.parameters(), lr=1e-2)
+    belief, state, _ = make_starts(64)
+    for _ in range(60):
+        optimizer.zero_grad()
+        imagine_from(learner, belief, state)[0]["loss_actor"].backward()
+        optimizer.step()
+    mean = agent.actor(torch.cat((belief, state), -1)).mean.mean(0)
+    assert mean[0] > 0.5
+    assert mean[1:].abs().max() < mean[0]
+
+
+def test_norms_are_of_all_gradients_of_a_network_and_of_none_without():
+    stepped, still = torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(1))
+    stepped.grad = torch.tensor([3.0, 4.0])
+    other = torch.nn.Parameter(torch.zeros(1))
+    other.grad = torch.tensor([12.0])
+    norms = gradient_norms({"world_model": [stepped, still, other], "actor": [still]})
+    assert {name: norm.item() for name, norm in norms.items()} == {"gradient_norm/world_model": 13.0}
 
 
 def test_another_learner_s_weights_are_those_that_flew_and_nothing_that_it_kept():
@@ -421,33 +471,46 @@ def test_another_learner_s_weights_are_those_that_flew_and_nothing_that_it_kept(
         saved.update(make_batch())
     saved.adjust(max_std=0.3)
     learner = learner_of(seed=1, **CONFIG | {"average_rate": 0.25})
-    kept = {name: value.clone() for name, value in learner.losses.named_buffers()}
+    kept = {name: value.clone() for name, value in learner.return_range.named_buffers()}
     learner.adopt(copy.deepcopy(saved.state_dict()))
     flew = dict(saved.averaged.named_parameters())
     for agent in (learner.agent, learner.averaged):
         assert all(torch.equal(value, flew[name]) for name, value in agent.named_parameters())
-    assert all(torch.equal(value, kept[name]) for name, value in learner.losses.named_buffers())
+    assert all(torch.equal(value, kept[name]) for name, value in learner.return_range.named_buffers())
     assert learner.updates == 0 and not learner.optimizer.state
 
 
-@pytest.mark.parametrize(("first", "second"), [("reinforce", "ppo"), ("ppo", "reinforce")])
-def test_state_of_an_actor_that_learned_otherwise_is_refused_before_anything_changes(first, second):
-    saved, learner = (learner_of(seed=seed, **CONFIG | {"actor": kind}) for seed, kind in ((0, first), (1, second)))
-    saved.update(make_batch())
-    assert_refused(saved, learner, r"loss.actor that it was trained with, or begin a run with its weights \(init_from=")
+KINDS = {
+    "imagined": (learner_of, {}),
+    "latent": (latent_ppo_of, {"critic": "latent"}),
+    "state": (latent_ppo_of, {"critic": "state"}),
+}
 
 
-OWN_CRITICS = {"latent_ppo": "latent_critic", "asymmetric_ppo": "state_critic"}
+def made(kind, seed):
+    make, numbers = KINDS[kind]
+    return make("debug", Interface(privileged_dim=7), seed=seed, **numbers)
 
 
-@pytest.mark.parametrize("first", ["reinforce", "ppo", "flown_ppo", *OWN_CRITICS])
-@pytest.mark.parametrize("second", ["reinforce", "ppo", "flown_ppo", *OWN_CRITICS])
-def test_weights_are_taken_over_whatever_the_actor_learned_by(first, second):
-    interface = Interface(privileged_dim=7)
-    saved, learner = (
-        make_dreamer("debug", interface, LossConfig(actor=kind), seed=seed) for seed, kind in ((0, first), (1, second))
-    )
-    begins, is_left = ([OWN_CRITICS[kind]] if kind in OWN_CRITICS else [] for kind in (second, first))
+@pytest.mark.parametrize(("first", "second"), [("imagined", "latent"), ("latent", "imagined")])
+def test_state_of_another_algorithm_is_refused_before_anything_changes(first, second):
+    assert_refused(made(first, 0), made(second, 1), r"trained by .* begin a run with its weights \(init_from=")
+
+
+def test_state_of_another_critic_is_refused_before_anything_changes():
+    assert_refused(made("latent", 0), made("state", 1), "trained with another loss")
+
+
+def test_state_of_before_this_format_is_refused():
+    with pytest.raises(ValueError, match="format that this version does not read"):
+        made("latent", 0).load_state_dict({"size": {}, "agent": {}, "losses": {}})
+
+
+@pytest.mark.parametrize("first", KINDS)
+@pytest.mark.parametrize("second", KINDS)
+def test_weights_are_taken_over_whatever_the_algorithm(first, second):
+    saved, learner = made(first, 0), made(second, 1)
+    begins, is_left = ([] if kind == "imagined" else [f"{kind}_critic"] for kind in (second, first))
     unmatched = learner.adopt(copy.deepcopy(saved.state_dict()))
     assert unmatched.anew == ([] if first == second else begins)
     assert unmatched.left == ([] if first == second else is_left)
@@ -455,35 +518,43 @@ def test_weights_are_taken_over_whatever_the_actor_learned_by(first, second):
     assert all(torch.equal(value, flew[name]) for name, value in learner.agent.named_parameters())
 
 
-class CriticOfItsOwn(ReconstructionLoss):
-    """With a network under a name that the agent's networks have, too."""
+class CriticOfItsOwn(Image):
+    """A target with a network under a name that the agent's networks have, too."""
 
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
+    def __init__(self, agent, config):
+        super().__init__(agent, config)
         self.critic = torch.nn.Linear(self.world_model.size.features, 1)
         self.scale = torch.nn.Parameter(torch.rand(()))
 
-    def represent(self, posterior, features, embedding, tensordict):
-        losses = super().represent(posterior, features, embedding, tensordict)
+    def forward(self, posterior, features, embedding, batch):
+        losses = super().forward(posterior, features, embedding, batch)
         return losses | {"loss_own": self.scale * self.critic(features).square().mean()}
 
 
-def test_a_loss_s_own_network_is_saved_under_whatever_name(monkeypatch):
-    monkeypatch.setitem(WORLD_MODEL_LOSSES, "own", CriticOfItsOwn)
+def test_a_target_s_own_network_is_saved_under_whatever_name(monkeypatch):
+    monkeypatch.setitem(TARGETS, "own", (CriticOfItsOwn,))
     saved, learner = (learner_of(seed=seed, **CONFIG | {"world_model": "own"}) for seed in (0, 1))
     saved.update(make_batch())
     learner.load_state_dict(copy.deepcopy(saved.state_dict()))
-    here, there = (of.losses["world_model"].critic.weight for of in (learner, saved))
-    assert torch.equal(here, there)
+    here, there = (of.world_model_loss.targets["CriticOfItsOwn"] for of in (learner, saved))
+    assert torch.equal(here.critic.weight, there.critic.weight)
     begun = learner_of(seed=2, **CONFIG | {"world_model": "own"})
     assert begun.adopt(copy.deepcopy(saved.state_dict())) == ([], [])
-    assert torch.equal(begun.losses["world_model"].scale, saved.losses["world_model"].scale)
+    assert torch.equal(begun.world_model_loss.targets["CriticOfItsOwn"].scale, there.scale)
+    plain = learner_of(seed=2, **CONFIG)
+    assert plain.adopt(copy.deepcopy(saved.state_dict())) == ([], ["CriticOfItsOwn"])
 
 
-def test_a_loss_that_is_no_scalar_is_refused_by_name():
-    learner = learner_of(seed=0, **CONFIG)
-    compute = learner.losses["critic"].forward
-    learner.losses["critic"].forward = lambda *args: compute(*args).set("loss_mine", torch.zeros(2, 3))
+class NoScalar(Target):
+    """Forgets to take the mean."""
+
+    def forward(self, posterior, features, embedding, batch):
+        return {"loss_mine": torch.zeros(2, 3)}
+
+
+def test_a_loss_that_is_no_scalar_is_refused_by_name(monkeypatch):
+    monkeypatch.setitem(TARGETS, "own", (NoScalar,))
+    learner = learner_of(seed=0, **CONFIG | {"world_model": "own"})
     with pytest.raises(ValueError, match=r"losses must be scalars, .*'loss_mine': \(2, 3\)"):
         learner.update(make_batch())
 
@@ -529,18 +600,6 @@ def test_without_averages_the_trained_weights_fly():
     assert learner.averaged is None and learner.evaluation_policy().actor is learner.agent.actor
 
 
-def test_imagination_begins_in_the_newest_windows_where_it_is_told_to():
-    config = dict(CONFIG, imagination_starts=8, imagine_recent=True)
-    learner, batch = learner_of(seed=0, **config), make_batch(batch=4, time=6)
-    batch["recent"] = torch.tensor([False, False, True, True]).unsqueeze(-1).expand(4, 6)
-    latents = TensorDict({"belief": torch.zeros(4, 6, 32), "state": torch.zeros(4, 6, 16)}, [4, 6])
-    latents["belief"][2:] = 1.0
-    for _ in range(10):
-        assert learner.starts(latents, batch)["belief"].min() == 1.0
-    learner.config = replace(learner.config, imagination_starts=20)  # more than the 12 there are: the others fill up
-    assert learner.starts(latents, batch)["belief"][:, 0].sum() == 12
-
-
 def test_the_smallest_deviation_is_scheduled_saved_and_flown():
     learner = learner_of(seed=0, **CONFIG | {"min_std": 0.4, "average_rate": 0.1})
     features = torch.zeros(1, 48)
@@ -553,26 +612,18 @@ def test_the_smallest_deviation_is_scheduled_saved_and_flown():
     restored.load_state_dict(copy.deepcopy(learner.state_dict()))
     for agent in (restored.agent, restored.averaged):
         assert agent.actor.min_std.item() == pytest.approx(0.2)
-    older = learner.state_dict()
-    del older["agent"]["actor.min_std"]
-    other = learner_of(seed=1, **CONFIG | {"min_std": 0.4})
-    other.load_state_dict(older)
-    assert other.agent.actor.min_std.item() == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize("actor", ["reinforce", "ppo"])
-def test_composing_by_names_draws_the_weights_that_composing_by_hand_does(actor):
-    """In the order networks, world-model loss, actor's, critic's: seeds mean the same in recipes and in the library."""
-    config = LossConfig(world_model="informed", actor=actor)
-    interface = Interface(privileged_dim=7)
-    named = make_dreamer("debug", interface, config, seed=3)
+def test_composing_by_hand_draws_the_weights_that_make_does():
+    """In the order networks, world-model loss: seeds mean the same in recipes and in the library."""
+    losses, interface = DreamerV3Losses(world_model="informed"), Interface(privileged_dim=7)
+    made = DreamerV3.make("debug", interface, losses, seed=3)
     with seeded(3):
-        agent = Agent(get_size("debug"), interface, decode=True)
-        losses = make_losses(agent, config)
-    for name, value in named.agent.state_dict().items():
-        assert torch.equal(value, agent.state_dict()[name]), name
-    drawn = losses["world_model"].privileged_decoder.state_dict()
-    for name, value in named.losses["world_model"].privileged_decoder.state_dict().items():
+        by_hand = DreamerV3(Agent(SIZES["debug"], interface, decode=True), losses)
+    for name, value in made.agent.state_dict().items():
+        assert torch.equal(value, by_hand.agent.state_dict()[name]), name
+    drawn = by_hand.world_model_loss.state_dict()
+    for name, value in made.world_model_loss.state_dict().items():
         assert torch.equal(value, drawn[name]), name
 
 
@@ -590,8 +641,9 @@ def test_a_seed_is_of_the_cpu_s_generator_alone(monkeypatch):
 @pytest.mark.skipif(torch.__version__ < "2.13", reason="trunc_normal_ of torch before 2.13 draws other numbers")
 def test_a_seed_means_the_weights_that_it_has_always_meant():
     """Sums of all weights' magnitudes, so that runs begun with one seed at different versions compare."""
-    learner = make_dreamer("debug", Interface(privileged_dim=7), LossConfig(world_model="informed"), seed=3)
-    drawn = {**dict(learner.agent.named_children()), "decoder": learner.losses["world_model"].privileged_decoder}
+    learner = learner_of("debug", Interface(privileged_dim=7), world_model="informed", seed=3)
+    decoder = learner.world_model_loss.targets["State"].decoder
+    drawn = {**dict(learner.agent.named_children()), "decoder": decoder}
     sums = {
         name: sum(p.detach().double().abs().sum().item() for p in home.parameters()) for name, home in drawn.items()
     }

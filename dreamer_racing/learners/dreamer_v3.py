@@ -1,0 +1,171 @@
+"""DreamerV3: a world model learns from replayed records, and the policy learns in it, by what it imagines.
+
+Shape legend: B batch, T time, N starts, H horizon, F features, A action. Imagined steps have time first.
+
+Reference: Hafner et al. 2025, "Mastering diverse control tasks through world models".
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.modules import PercentileValueNorm
+
+from dreamer_racing import parallel
+from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.learner import Timer, untimed
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import (
+    DreamerV3Losses,
+    Trajectory,
+    choose_starts,
+    critic_loss,
+    find_objective,
+    gradient_of_actions,
+    imagine,
+    lambda_return,
+    replay_critic_loss,
+)
+from dreamer_racing.modules import Agent
+from dreamer_racing.modules.actor import ActionDistribution
+
+
+class DreamerV3(WorldModelLearner):
+    """Trains world model, actor and critic in one gradient step; `compute_losses` is the algorithm.
+
+    Args:
+        agent: The networks, on the device where updates run.
+        losses: Numbers of the losses; ``actor`` is the objective.
+        config: Numbers of the update.
+
+    Example:
+        >>> learner = DreamerV3.make("debug", seed=0)
+        >>> learner.policy().in_keys
+        ['pixels', 'is_init', 'belief', 'state', 'previous_action']
+    """
+
+    algorithm = "dreamer_v3"
+    behavior = ("actor", "critic")
+    Losses = DreamerV3Losses
+    loss_config: DreamerV3Losses
+
+    def __init__(
+        self, agent: Agent, losses: DreamerV3Losses | None = None, config: LearnerConfig | None = None
+    ) -> None:
+        losses = losses or DreamerV3Losses()
+        self.objective = find_objective(losses.actor)
+        device = next(agent.parameters()).device
+        self.return_range = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - losses.return_decay, min_scale=1.0).to(
+            device
+        )
+        super().__init__(agent, losses, config)
+
+    def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Make one gradient step of all networks; as `WorldModelLearner.update`."""
+        metrics = self.gradient_step(batch, timed)
+        self.average_weights()
+        return metrics
+
+    def compute_losses(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
+        """Return the losses of world model, actor and critic, which carry gradient, and metrics.
+
+        Args:
+            batch: Replayed records ``[B, T]``.
+            timed: Context manager by activity.
+        """
+        numbers, agent = self.loss_config, self.agent
+        model, actor, critic = agent.world_model, agent.actor, agent.critic
+
+        # World model: infer the latents of the records, predict from them rewards, ends and targets (Eq. 4, 5).
+        with timed("world_model"):
+            losses, latents = self.world_model_loss(batch)
+            losses |= self.drift_losses(latents, batch)
+        self.note_latents(latents)
+
+        with timed("imagine"):
+            # Imagination: from latents of the records on, the policy acts H times in the model.
+            starts = choose_starts(
+                latents.belief,
+                latents.state,
+                batch["terminated"],
+                batch["previous_action"],
+                self.config.imagination_starts,
+            )
+            with gradient_of_actions(self.objective, model, critic):
+                imagined, action = imagine(model.rssm, actor, starts.belief, starts.state, self.horizon)
+
+                # What it leads to (H, N, 1): rewards, the chance that the episode goes on, and λ-returns (Eq. 7).
+                value = critic.value(imagined)  # (H + 1, N, 1)
+                reward = model.reward_head.mean(imagined[1:])
+                goes_on = self._continuation(imagined[1:])
+                discount = self.discount * goes_on
+                returns = lambda_return(reward, value[1:], discount, numbers.lambda_)
+
+            # A step counts for the discounted probability of getting there: 0 behind a record that ended an episode.
+            start = 1.0 - starts.terminated.to(discount.dtype).unsqueeze(0)
+            weight = torch.cat((start, discount[:-1].detach())).cumprod(0)
+            self.return_range.update(parallel.gathered(returns.detach(), dim=1))
+            scale = self.return_range.scale()
+
+            # Actor: the objective on the imagined steps, at features without gradient (Eq. 11).
+            features = imagined[:-1].detach()  # (H, N, F)
+            policy = actor(features)
+            trajectory = Trajectory(
+                policy=policy,
+                features=features,
+                action=action,
+                previous_action=torch.cat((starts.previous_action.unsqueeze(0), action[:-1].clamp(-1.0, 1.0))),
+                behavior=ActionDistribution(policy.mean.detach(), policy.std.detach()),
+                lambda_return=returns,
+                value=value[:-1],
+                advantage=((returns - value[:-1]) / scale).detach(),
+                weight=weight,
+                scale=scale,
+            )
+            losses["loss_actor"], metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
+            losses |= metrics
+
+            # Critic: two-hot regression of the λ-returns that were replayed, and of those imagined (Eq. 10). If every
+            # record was a start, its first imagined return is a better value than the critic's.
+            shape = batch["terminated"].shape
+            bootstrap = returns[0].detach().reshape(shape) if self.config.imagination_starts is None else None
+            replayed = latents.features if numbers.replay_value_gradient else latents.features.detach()
+            losses["loss_replay_critic"] = numbers.replay_value_scale * replay_critic_loss(
+                critic, replayed, batch, self.discount, numbers.lambda_, numbers.slow_critic_scale, bootstrap
+            )
+            regression, logits = critic_loss(critic, features, returns.detach(), numbers.slow_critic_scale)
+            losses["loss_critic"] = (weight * regression).mean()
+
+        with torch.no_grad():
+            expected = critic.two_hot.decode(logits)
+            return losses | {
+                "return_mean": returns.mean(),
+                "return_scale": scale.squeeze(-1),
+                "imagined_reward": reward.mean(),
+                "continuation": goes_on.mean(),
+                "value_mean": expected.mean(),
+                "value_error": (expected - returns).abs().mean(),
+            }
+
+    def _continuation(self, features: Tensor) -> Tensor:
+        """Return the probability ``(..., 1)`` that the episode goes on after features ``(..., F)``."""
+        if not self.loss_config.continuation:
+            return features.new_ones((*features.shape[:-1], 1), dtype=torch.float32)
+        return self.agent.world_model.continue_head.probability(features)
+
+    @property
+    def modules(self) -> nn.ModuleDict:
+        """All that a gradient step reads and writes."""
+        return nn.ModuleDict({**super().modules, "return_range": self.return_range})
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, but for the global random generators."""
+        return {**super().state_dict(), "return_range": self.return_range.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned; as `WorldModelLearner.load_state_dict`."""
+        super().load_state_dict(state_dict)
+        self.return_range.load_state_dict(state_dict["return_range"])

@@ -1,0 +1,163 @@
+"""What a saved learner holds, and whether it fits the learner that loads it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any, NamedTuple
+
+from torch import Tensor, nn
+
+from dreamer_racing.modules import Agent, ModelSize
+
+VARIANTS = ("sampled", "state_std")
+"""What of a `ModelSize` the command line chooses beside the size, as ``model.sampled=false``."""
+Parts = dict[str, tuple[dict[str, Tensor], dict[str, Tensor]]]
+"""What is wanted of a part of a learner, and what is found, by the part's name."""
+
+
+def own_state(network: nn.Module, agent: Agent) -> dict[str, Tensor]:
+    """Return a network's state without that of the agent's networks, which it holds under whatever names."""
+    shared = {id(tensor) for tensor in agent.state_dict(keep_vars=True).values()}
+    state = network.state_dict(keep_vars=True)
+    return {key: tensor.detach() for key, tensor in state.items() if id(tensor) not in shared}
+
+
+def check_saved(saved: dict[str, Any], algorithm: str, agent: Agent, own_networks: Mapping[str, nn.Module]) -> None:
+    """Refuse what another learner saved.
+
+    Args:
+        saved: ``state_dict()`` of a learner.
+        algorithm: Of the one that is to load it.
+        agent: Its networks.
+        own_networks: And those that are no part of the agent.
+
+    Raises:
+        ValueError: If it is that of another algorithm, of a model of another size, of other losses or of another
+            environment.
+    """
+    check_format(saved)
+    if saved["algorithm"] != algorithm:
+        raise ValueError(
+            f"The checkpoint was trained by {saved['algorithm']}, and this learner is of {algorithm}: choose the one "
+            "that it was trained with, or begin a run with its weights (init_from=)."
+        )
+    check_size(saved["size"], agent.size)
+    parts: Parts = {"networks": (agent.state_dict(), saved["agent"])}
+    for name, network in own_networks.items():
+        parts[name] = own_state(network, agent), saved["own_networks"].get(name, {})
+    _check_parts(parts, saved, agent)
+
+
+class Unmatched(NamedTuple):
+    """Networks that are no part of an agent, by name, that only one of two learners has."""
+
+    anew: list[str]
+    """Those of the learner that takes weights over: they begin anew."""
+    left: list[str]
+    """Those of the saved one: they are left behind."""
+
+
+def check_weights(saved: dict[str, Any], agent: Agent, own_networks: Mapping[str, nn.Module]) -> Unmatched:
+    """Refuse what another learner saved, if the agent's networks are not in it.
+
+    Args:
+        saved: ``state_dict()`` of a learner.
+        agent: The networks that are to load it.
+        own_networks: Those that are no part of it; of them those that are there must be of the same shapes.
+
+    Returns:
+        The own networks that only one of the two has.
+
+    Raises:
+        ValueError: If it is that of a model of another size or of another environment.
+    """
+    check_format(saved)
+    check_size(saved["size"], agent.size)
+    parts: Parts = {"networks": (agent.state_dict(), saved["agent"])}
+    here = {name: own_state(network, agent) for name, network in own_networks.items()}
+    there = saved["own_networks"]
+    ours, theirs = _names(here), _names(there)
+    for name, state in here.items():
+        wanted = {key: value for key, value in state.items() if _name(name, key) in theirs}
+        parts[name] = wanted, {key: there[name][key] for key in wanted if key in there[name]}
+    _check_parts(parts, saved, agent)
+    return Unmatched(sorted(ours - theirs), sorted(theirs - ours))
+
+
+def check_format(saved: dict[str, Any]) -> None:
+    """Refuse the state of a learner as it was saved before the format of this version.
+
+    Raises:
+        ValueError: If it is one.
+    """
+    if "own_networks" not in saved:
+        raise ValueError("The checkpoint was saved in a format that this version does not read: train anew.")
+
+
+def load_parameters(module: nn.Module, saved: Mapping[str, Tensor]) -> None:
+    """Load the parameters of a module from a state, and leave its buffers alone."""
+    own = dict(module.named_parameters())
+    module.load_state_dict({name: value for name, value in saved.items() if name in own}, strict=False)
+
+
+def check_size(checkpoint: dict[str, Any], size: ModelSize) -> None:
+    """Refuse the state of a model of another size.
+
+    Args:
+        checkpoint: ``state_dict()["size"]`` of a learner.
+        size: The size of the learner that loads it.
+
+    Raises:
+        ValueError: If they differ in anything but the name; the message says in what, and what to do.
+    """
+    wanted = asdict(size)
+    names = [field.name for field in fields(size) if field.name != "name"]
+    other = [name for name in names if _plain(checkpoint.get(name)) != _plain(wanted[name])]
+    if other:
+        differences = "; ".join(f"{name} {checkpoint.get(name)} there, {wanted[name]} here" for name in other)
+        variants = [f"model.{name}={str(checkpoint.get(name)).lower()}" for name in other if name in VARIANTS]
+        start = " ".join([f"model={checkpoint.get('name')}", *variants])
+        raise ValueError(
+            f"The checkpoint holds a model of size {checkpoint.get('name')!r}, but this learner was made with size "
+            f"{size.name!r} ({differences}). Weights cannot be converted between sizes: start with {start} to use this "
+            f"checkpoint, or train size {size.name!r} from the beginning."
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Return tuples as lists, as files keep them."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _name(network: str, key: str) -> str:
+    """Return what is said to be one network: a critic as a whole, of the world-model loss each target."""
+    return key.partition(".")[2].partition(".")[0] if key.startswith("targets.") else network
+
+
+def _names(states: Mapping[str, Mapping[str, Tensor]]) -> set[str]:
+    return {_name(network, key) for network, state in states.items() for key in state}
+
+
+def _check_parts(parts: Parts, saved: dict[str, Any], agent: Agent) -> None:
+    """Refuse parts of other parameters than these."""
+    there, here = saved["image_size"], agent.interface.image_size
+    where = (
+        "in an environment of other observations or actions"
+        if there == here
+        else f"on images of {there} × {there} pixels, not {here} × {here}: choose env.image_size={there}"
+    )
+    for part, (wanted, found) in parts.items():
+        lacking, surplus = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
+        if lacking or surplus:
+            raise ValueError(
+                f"The checkpoint's {part} has {', '.join(surplus[:2]) or 'nothing'} beyond this learner's, and "
+                f"lacks {', '.join(lacking[:2]) or 'nothing'}: it was trained with another loss, or in an "
+                "environment of other observations. Choose those it was trained with."
+            )
+        for key, value in wanted.items():
+            if value.shape != found[key].shape:
+                raise ValueError(
+                    f"The checkpoint's {part} has {key} of shape {list(found[key].shape)}, this learner's of "
+                    f"{list(value.shape)}: it was trained {where}."
+                )

@@ -1,0 +1,102 @@
+"""λ-returns, of rollouts and of replayed windows.
+
+Shape legend: B batch, T time, H steps of a rollout.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:
+    """Compute λ-returns, last step first.
+
+    ``G_t = reward_t + discount_t · ((1 − λ_t) · next_value_t + λ_t · G_{t+1})``, and ``G_H = next_value_{H−1}``.
+
+    Args:
+        reward: Received on leaving step t, ``(H, ...)``.
+        next_value: Value of where step t leads, ``(H, ...)``.
+        discount: γ times the continuation of where step t leads, ``(H, ...)``.
+        lambda_: λ, one number or ``(H, ...)``.
+
+    Returns:
+        Returns, ``(H, ...)``.
+
+    Reference: DreamerV3, Eq. 7.
+    """
+    carried = discount * lambda_
+    # reward + discount · (1 − λ) · next_value, of all steps at once
+    intermediate = torch.addcmul(reward, discount - carried, next_value)
+    current, returns = next_value[-1], []
+    for step, factor in zip(reversed(intermediate.unbind(0)), reversed(carried.unbind(0)), strict=True):
+        current = torch.addcmul(step, factor, current)
+        returns.append(current)
+    return torch.stack(returns[::-1])
+
+
+@torch.no_grad()
+def replay_return(
+    reward: Tensor,
+    bootstrap: Tensor,
+    is_init: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    discount: float | Tensor,
+    lambda_: float,
+) -> tuple[Tensor, Tensor]:
+    """Compute λ-returns along windows that may hold several episodes.
+
+    The return at record t uses the reward received on arriving at t + 1. Nothing crosses an episode's end: the return
+    at a terminated record is 0, and that at any other last record is its bootstrap, as at the window's end.
+
+    Args:
+        reward: Received on arriving at each record, ``(B, T, 1)``.
+        bootstrap: Value of each record, ``(B, T, 1)``.
+        is_init: Whether each record is its episode's first, bool ``(B, T, 1)``.
+        terminated: bool ``(B, T, 1)``.
+        truncated: bool ``(B, T, 1)``.
+        discount: γ, a number or a scalar.
+        lambda_: λ.
+
+    Returns:
+        Returns ``(B, T, 1)``, and weights ``(B, T, 1)``: 0 at records whose return is only their bootstrap, else 1.
+    """
+    followed_by_init = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), 1)
+    last = followed_by_init | terminated | truncated
+    value = bootstrap.masked_fill(terminated, 0.0)
+    # With λ = 0 on arriving at a last record, the return stops there; the discount stays γ, as its value is 0 if it
+    # was terminated. Time first: (T - 1, B, 1).
+    kept = lambda_ * (~last[:, 1:]).float()
+    steps = lambda_return(
+        reward[:, 1:].transpose(0, 1),
+        value[:, 1:].transpose(0, 1),
+        (discount * torch.ones_like(kept)).transpose(0, 1),
+        kept.transpose(0, 1),
+    )
+    returns = torch.cat((steps.transpose(0, 1), value[:, -1:]), 1)
+    return torch.where(last, value, returns), (~last | terminated).float()
+
+
+@torch.no_grad()
+def rollout_return(
+    reward: Tensor, value: Tensor, done: Tensor, terminated: Tensor, discount: Tensor, lambda_: float
+) -> Tensor:
+    """Compute λ-returns along rollouts of an environment that may hold several episodes, time first.
+
+    What comes after a step at which time ran out, or after the last step, was not seen: the value of the step itself
+    stands for it.
+
+    Args:
+        reward: Received on leaving each step, ``(T, N, 1)``.
+        value: Of each step, ``(T, N, 1)``.
+        done: Whether the episode ended there, bool ``(T, N, 1)``.
+        terminated: Whether nothing follows, bool ``(T, N, 1)``.
+        discount: γ, a scalar.
+        lambda_: λ.
+
+    Returns:
+        Returns ``(T, N, 1)``.
+    """
+    following = torch.where(done, value, torch.cat((value[1:], value[-1:])))
+    return lambda_return(reward, following, discount * (~terminated).float(), lambda_ * (~done).float())

@@ -1,0 +1,92 @@
+"""What is kept of collected rollouts, in which order, and what is forgotten."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dreamer_racing.experience.rollout_storage import RolloutStorage
+from dreamer_racing.modules import symlog
+
+N, T, P = 3, 4, 5
+
+
+def make_rollout(number: int = N, steps: int = T) -> TensorDict:
+    """As a collector yields it; nothing ends."""
+    shape = (number, steps)
+    flags = torch.zeros(2, *shape, 1, dtype=torch.bool)
+    came = {"reward": torch.randn(*shape, 1), "done": flags[0], "terminated": flags[1]}
+    after = {"belief": torch.randn(*shape, 6), "state": torch.rand(*shape, 2), **came}
+    root = {name: torch.rand(*shape, 4) for name in ("action", "previous_action", "loc", "scale")}
+    return TensorDict({**root, "privileged": {"vector": torch.randn(*shape, P)}, "next": after}, shape)
+
+
+def test_steps_are_kept_time_first_and_the_newest_where_it_is_full():
+    storage = RolloutStorage(2 * N * T, privileged=True)
+    assert not storage.full
+    rollouts = [make_rollout() for _ in range(3)]
+    for number, rollout in enumerate(rollouts):
+        storage.extend(rollout)
+        assert storage.full == (number > 0)
+    assert storage.steps.batch_size == (2 * T, N)
+    for place, rollout in ((slice(0, T), rollouts[1]), (slice(T, 2 * T), rollouts[2])):
+        kept, came = storage.steps[place], rollout.transpose(0, 1)
+        assert torch.equal(kept["reward"], came["next", "reward"])
+        assert torch.equal(kept["action"], came["action"])
+        assert torch.equal(kept["previous_action"], came["previous_action"])
+        assert torch.equal(kept["features"], torch.cat((came["next", "belief"], came["next", "state"]), -1))
+        assert torch.equal(kept["behavior"], torch.cat((came["loc"], came["scale"]), -1))
+        assert torch.equal(kept["privileged"], symlog(came["privileged", "vector"]))
+    storage.clear()
+    assert not storage.full and "privileged" not in _stored(privileged=False)
+
+
+def _stored(privileged: bool) -> TensorDict:
+    storage = RolloutStorage(N * T, privileged=privileged)
+    storage.extend(make_rollout())
+    return storage.steps
+
+
+def test_an_episode_that_was_broken_off_ends_at_its_last_step():
+    """As of a lost worker, whose worlds begin anew with the next rollout; here of the second environment."""
+    storage, begins = RolloutStorage(8), torch.zeros(2, 2, 1, dtype=torch.bool)
+    storage.extend(make_rollout(2, 2).set("is_init", begins))
+    storage.extend(make_rollout(2, 2).set("is_init", begins.index_fill(0, torch.tensor(1), True)))
+    assert storage.steps["done"][:, :, 0].tolist() == [[False, False], [False, True], [False, False], [False, False]]
+
+
+def test_another_number_of_environments_begins_anew():
+    storage = RolloutStorage(2 * N * T)
+    storage.extend(make_rollout(3))
+    storage.extend(make_rollout(6))
+    assert storage.steps.batch_size == (4, 6) and storage.full
+
+
+def test_another_length_begins_anew_where_rollouts_do_not_add_up_to_whole_ones():
+    storage = RolloutStorage(2 * N * T)
+    storage.extend(make_rollout(steps=4))
+    storage.extend(make_rollout(steps=8))  # room for 8 steps either way, and 4 are kept
+    assert storage.full and storage.count == 8
+
+
+def test_a_saved_storage_goes_on_as_if_never_saved():
+    storage, restored = RolloutStorage(2 * N * T), RolloutStorage(2 * N * T)
+    restored.load_state_dict(copy.deepcopy(storage.state_dict()))  # of one that is empty
+    assert restored.steps is None
+    first, second = make_rollout(), make_rollout()
+    storage.extend(first)
+    restored.load_state_dict(copy.deepcopy(storage.state_dict()))
+    for each in (storage, restored):
+        each.extend(second)
+        assert each.full
+    assert (storage.steps == restored.steps).all()
+
+
+def test_a_rollout_that_lacks_something_is_refused_by_name():
+    with pytest.raises(KeyError, match=r"The rollout lacks \['loc'\], which on-policy learning needs"):
+        RolloutStorage(8).extend(make_rollout().exclude("loc"))
+    with pytest.raises(KeyError, match=r"lacks \[\('privileged', 'vector'\)\]"):
+        RolloutStorage(8, privileged=True).extend(make_rollout().exclude("privileged"))

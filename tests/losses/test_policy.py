@@ -1,0 +1,168 @@
+"""Objectives of the policy by hand, on trajectories that are given; and how one is found by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from dreamer_racing.losses import (
+    OBJECTIVES,
+    Trajectory,
+    clipped_surrogate,
+    dynamics,
+    find_objective,
+    normalized,
+    policy_drift,
+    reinforce,
+)
+from dreamer_racing.modules import Actor
+from dreamer_racing.modules.actor import ActionDistribution
+
+H, N, A, F = 3, 4, 2, 5
+
+
+def make_trajectory(**changes: object) -> Trajectory:
+    generator = torch.Generator().manual_seed(0)
+    mean = (torch.rand(H, N, A, generator=generator) - 0.5).requires_grad_()
+    std = torch.rand(H, N, A, generator=generator) * 0.5 + 0.3
+    one = torch.rand(H, N, 1, generator=generator)
+    trajectory = Trajectory(
+        policy=ActionDistribution(mean, std),
+        features=torch.randn(H, N, F, generator=generator),
+        action=torch.rand(H, N, A, generator=generator) - 0.5,
+        previous_action=torch.zeros(H, N, A),
+        behavior=ActionDistribution(mean.detach(), std),
+        lambda_return=one + 1.0,
+        value=one,
+        advantage=torch.randn(H, N, 1, generator=generator),
+        weight=torch.rand(H, N, 1, generator=generator),
+        scale=torch.tensor(2.0),
+    )
+    return dataclasses.replace(trajectory, **changes)
+
+
+def log_density(policy: ActionDistribution, action: Tensor) -> Tensor:
+    normal = torch.distributions.Normal(policy.mean, policy.std)
+    return normal.log_prob(action).sum(-1, keepdim=True)
+
+
+def entropy_of(policy: ActionDistribution) -> Tensor:
+    return torch.distributions.Normal(policy.mean, policy.std).entropy().sum(-1, keepdim=True)
+
+
+def test_reinforce_by_hand():
+    trajectory = make_trajectory()
+    loss, metrics = reinforce(trajectory, entropy_scale=torch.tensor(0.3))
+    gain = log_density(trajectory.policy, trajectory.action) * trajectory.advantage
+    expected = -(trajectory.weight * (gain + 0.3 * entropy_of(trajectory.policy))).sum() / (H * N)
+    torch.testing.assert_close(loss, expected)
+    torch.testing.assert_close(metrics["entropy"], entropy_of(trajectory.policy).mean())
+
+
+def test_dynamics_by_hand():
+    returns = make_trajectory().lambda_return.requires_grad_()
+    trajectory = make_trajectory(lambda_return=returns)
+    loss, _ = dynamics(trajectory, entropy_scale=torch.tensor(0.3))
+    expected = -(trajectory.weight * (returns / 2.0 + 0.3 * entropy_of(trajectory.policy))).sum() / (H * N)
+    torch.testing.assert_close(loss, expected)
+    loss.backward()
+    torch.testing.assert_close(returns.grad, -trajectory.weight / 2.0 / (H * N))
+    assert dynamics.through_dynamics and not hasattr(reinforce, "through_dynamics")
+
+
+def test_the_surrogate_is_the_advantage_before_the_first_step():
+    """The ratio is one: nothing is clipped, and the gradient is that of the plain policy gradient."""
+    trajectory = make_trajectory()
+    loss, metrics = clipped_surrogate(trajectory, entropy_scale=torch.tensor(0.0), clip_epsilon=0.2)
+    torch.testing.assert_close(loss, -(trajectory.weight * trajectory.advantage).mean())
+    assert metrics["ppo/clipped"] == 0.0
+
+
+@pytest.mark.parametrize(("ratio", "advantage", "gain"), [(1.5, 1.0, 1.2), (0.5, 1.0, 0.5), (0.5, -1.0, -0.8)])
+def test_a_ratio_beyond_the_clip_gains_nothing_more(ratio, advantage, gain):
+    """By hand: the log-probability of the old policy is lower by log(ratio), through its deviation alone."""
+    trajectory = make_trajectory()
+    policy, shape = trajectory.policy, (H, N, A)
+    apart = math.log(ratio) / A  # of each dimension
+    action = policy.mean.detach()
+    old = ActionDistribution(action, policy.std * math.exp(apart))  # density at the mean is 1 / std
+    taken = dataclasses.replace(
+        trajectory,
+        policy=ActionDistribution(action, policy.std),
+        behavior=old,
+        action=action,
+        advantage=torch.full((H, N, 1), advantage),
+        weight=torch.ones(H, N, 1),
+    )
+    loss, metrics = clipped_surrogate(taken, entropy_scale=torch.tensor(0.0), clip_epsilon=0.2)
+    assert action.shape == shape and loss.item() == pytest.approx(-gain, rel=1e-5)
+    assert metrics["ppo/clipped"] == 1.0
+
+
+@pytest.mark.parametrize("mean", [-1.0, 0.3, 0.95])
+@pytest.mark.parametrize("std", [0.05, 0.4, 1.0])
+def test_the_probability_of_clipped_actions_adds_up_to_one(mean, std):
+    policy = ActionDistribution(torch.full((1, 1), mean).double(), torch.full((1, 1), std).double())
+    inside = torch.linspace(-1, 1, 200_001).double()[1:-1, None]
+    density = policy.log_prob_clipped(inside).exp()
+    bounds = policy.log_prob_clipped(torch.tensor([[-1.0], [1.0]]).double()).exp()
+    assert (density.sum() * 1e-5 + bounds.sum()).item() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_the_probability_of_a_clipped_action_has_a_gradient_far_beyond_the_bound():
+    mean = torch.full((1, 1), -9.0, requires_grad=True)
+    ActionDistribution(mean, torch.full((1, 1), 0.1)).log_prob_clipped(torch.ones(1, 1)).backward()
+    assert mean.grad.isfinite().all() and mean.grad.item() > 0
+
+
+def test_normalized_advantages_have_mean_zero_and_deviation_one_under_their_weights():
+    advantage, weight = torch.randn(50, 1) * 7 + 3, torch.rand(50, 1)
+    found = normalized(advantage, weight)
+    share = weight / weight.sum()
+    assert (share * found).sum().item() == pytest.approx(0.0, abs=1e-5)
+    assert (share * found.square()).sum().item() == pytest.approx(1.0, rel=1e-4)
+
+
+def test_drift_is_the_divergence_of_the_two_policies_and_trains_the_latents_alone():
+    torch.manual_seed(0)
+    actor = Actor(F, A, layers=1, units=8)
+    torch.nn.init.normal_(actor.mlp.output.weight)
+    before, after = torch.randn(2, 3, F, requires_grad=True), torch.randn(2, 3, F, requires_grad=True)
+    weight = torch.tensor([[[1.0], [0.0], [1.0]], [[1.0], [1.0], [0.0]]])
+    drift = policy_drift(actor, before, after, weight)
+    old, new = (torch.distributions.Normal(*actor(features)) for features in (before, after))
+    divergence = torch.distributions.kl_divergence(old, new).sum(-1, keepdim=True)
+    torch.testing.assert_close(drift, (weight * divergence).sum() / 6)  # of all records, as other losses
+    drift.backward()
+    assert before.grad is None and after.grad.abs().sum() > 0
+    assert all(parameter.grad is None and parameter.requires_grad for parameter in actor.parameters())
+    assert policy_drift(actor, before, after, torch.zeros_like(weight)) == 0.0
+
+
+def test_an_objective_is_found_by_its_name_or_in_a_module_of_ones_own(tmp_path, monkeypatch):
+    assert find_objective("reinforce") is reinforce and set(OBJECTIVES) == {"reinforce", "dynamics", "clipped"}
+    with pytest.raises(ValueError, match=r"Unknown objective 'reinforced' \(did you mean reinforce\?\).*: reinforce"):
+        find_objective("reinforced")
+    (tmp_path / "my_objectives.py").write_text("from dreamer_racing.losses import reinforce as mine\nother = 3\n")
+    monkeypatch.chdir(tmp_path)  # not on PYTHONPATH: the folder that one starts from is enough
+    assert find_objective("my_objectives:mine") is reinforce
+    with pytest.raises(ValueError, match="module 'my_objectives' has no 'missing'"):
+        find_objective("my_objectives:missing")
+    with pytest.raises(ValueError, match="'my_objectives:other' is no function of a Trajectory"):
+        find_objective("my_objectives:other")
+
+
+def test_an_objective_that_is_not_found_says_where_it_was_looked_for_and_what_to_set(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", "/somewhere")
+    with pytest.raises(ValueError, match=rf"there is no nowhere\.py in {tmp_path}, nor on PYTHONPATH \(/somewhere\)"):
+        find_objective("nowhere:mine")
+    with pytest.raises(ValueError, match="set PYTHONPATH to that folder"):
+        find_objective("nowhere:mine")
+    (tmp_path / "imports_nothing.py").write_text("import that_is_not_there\n")
+    with pytest.raises(ValueError, match="cannot be imported: No module named 'that_is_not_there'"):
+        find_objective("imports_nothing:mine")
