@@ -3,6 +3,7 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
     python recipes/plant.py track=circle preset=easy                      # in one terminal: a vehicle
     python recipes/hil.py actor=circle arm=true laps=3                    # in another: an agent flies it
     python recipes/hil.py actor=pilot track=circle preset=easy arm=true laps=3   # or the scripted pilot
+    python recipes/hil.py actor=identify track=circle arm=true     # or small steps, for recipes/identification.py
     python recipes/hil.py actor=kidney arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
         mass=0.62 full_thrust=17 reference_voltage=15.2 voltage=15.8      # or a real vehicle, by a radio's receiver
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
@@ -31,8 +32,10 @@ from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.hil.battery import STALE
 from dreamer_racing.hil.chain import FlightChain, Outputs, describe_outputs, read_inputs
 from dreamer_racing.hil.configuration import (
+    IDENTIFY,
     PILOT,
     PILOT_RATE,
+    SPARE,
     HilConfig,
     check,
     check_flight,
@@ -44,6 +47,7 @@ from dreamer_racing.hil.configuration import (
     stamping_of,
 )
 from dreamer_racing.hil.flyer import ActorFlyer, Flyer, trained_track
+from dreamer_racing.hil.identify import IdentificationFlyer
 from dreamer_racing.hil.links import make_link
 from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
@@ -84,6 +88,12 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
             raise ValueError("track= is missing: actor=pilot has none of its own.")
         rate = config.rate or PILOT_RATE
         return PilotFlyer(track or load_track(config.track), config.preset, rate), pilot_contract(config)
+    if config.actor == IDENTIFY:
+        if config.track is None:
+            raise ValueError("track= is missing: actor=identify begins at its start, and stays within its bounds.")
+        steps = IdentificationFlyer()
+        config.duration = config.duration or steps.duration + SPARE
+        return steps, pilot_contract(config)
     flyer = ActorFlyer(existing_agent_path("actor", config.actor))
     return flyer, flyer.contract
 

@@ -77,6 +77,7 @@ def make_contract(
             "collective_thrust": "along body +z, thrust divided by mass",
         },
         "action": _describe_action(parameters),
+        "rate_loop": describe_rate_loop(parameters),
     }
 
 
@@ -159,6 +160,23 @@ def _describe_action(parameters: QuadrotorParameters) -> dict[str, Any]:
         "trained_mass_kg": parameters.mass,
         "trained_command_delay_s": parameters.command_delay if widths is None else [0.0, widths.delay_max],
         **({} if widths is None else {"trained_half_widths": _half_widths(widths)}),
+    }
+
+
+def describe_rate_loop(parameters: QuadrotorParameters) -> dict[str, Any]:
+    """Return what a contract says of the flight controller that an actor was trained with."""
+    firmware, widths = parameters.betaflight, parameters.randomisation
+    if firmware is None:
+        return {"kind": "proportional", "gain_per_s": parameters.rate_gain}
+    gains = {name: list(getattr(firmware, name)) for name in ("p", "i", "d")}
+    return {
+        "kind": "betaflight",
+        **gains,
+        "motor_time_constant_s": parameters.motor_time_constant,
+        "trained_half_widths": {
+            "gains": widths.gains if widths else 0.0,
+            "motor_lag": widths.motor_lag if widths else 0.0,
+        },
     }
 
 

@@ -15,7 +15,7 @@ from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import Flyer, check_contract, check_ranges
+from dreamer_racing.hil.flyer import Flyer, check_contract, check_ranges, check_rate_loop
 from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
 from dreamer_racing.hil.operator import (
     PORT,
@@ -33,11 +33,12 @@ from dreamer_racing.settings import POSITIVE, Range, check_settings, setting
 
 logger = logging.getLogger(__name__)
 
-PILOT = "pilot"
+PILOT, IDENTIFY = "pilot", "identify"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
 OPERATORS = ("keyboard", "udp", "timed")
 MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages that have none
+SPARE = 5.0  # s that the flight of actor=identify has beyond its steps, for its take-off
 MOST = 1e4  # rad/s: as good as no limit
 
 
@@ -55,7 +56,9 @@ LimitsConfig = make_dataclass(
 class HilConfig:
     """`recipes/hil.py`."""
 
-    actor: str | None = None  # pilot, an agent that ships by its name, or the path of an .onnx file or an agent
+    # pilot, identify (small steps, for recipes/identification.py), an agent that ships by its name, or the path of an
+    # .onnx file or an agent
+    actor: str | None = None
     track: str | None = None  # built-in track, or path to a YAML file; null: what the actor was trained on
     arm: bool = False  # whether the vehicle may be armed at all
     laps: int | None = setting(None, Range(1))  # after which it is DISARMED in the air; null: when the operator says so
@@ -91,6 +94,9 @@ class HilConfig:
     device: str | None = None  # serial port
     baud: int | None = setting(None, Range(1))  # null: the protocol's own
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
+    # what the vehicle is, a preset or the file of recipes/identification.py: an actor of another rate loop is refused
+    vehicle: str | None = None
+    force: bool = False  # fly what vehicle= refuses all the same
     betaflight_dump: str | None = None  # what `dump all` gave; settings that are not the actor's: nothing is armed
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
@@ -160,7 +166,9 @@ def check_read(config: HilConfig) -> None:
     message = config.pose_message or {"ros2": "PoseStamped"}.get(config.pose)
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
-        (("renderer",), config.actor != PILOT, "an actor that sees"),
+        (("renderer",), config.actor not in (PILOT, IDENTIFY), "an actor that sees"),
+        (("force",), config.vehicle is not None, "vehicle="),
+        (("vehicle",), config.actor not in (PILOT, IDENTIFY), "an actor that was trained"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
         (("arm_channel",), config.link in BETAFLIGHT, f"link={', '.join(BETAFLIGHT)}"),
@@ -207,7 +215,9 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
         OSError: There is no such dump.
     """
     notes = []
-    if config.actor != PILOT and (note := check_contract(contract, track, config.rate)):
+    if config.actor not in (PILOT, IDENTIFY) and (note := check_contract(contract, track, config.rate)):
+        notes.append(note)
+    if config.vehicle is not None and (note := check_rate_loop(contract, config.vehicle, config.force)):
         notes.append(note)
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
     if config.betaflight_dump is not None:
@@ -246,7 +256,7 @@ def pilot_contract(config: HilConfig) -> dict[str, Any]:
     ]
     scale = drone.collective_thrust_scale
     thrust = {"name": "collective_thrust", "unit": "m/s^2", "offset": scale, "scale": scale}
-    source = {"track": config.track, "preset": config.preset}
+    source = {"track": config.track, **({"preset": config.preset} if config.actor == PILOT else {})}
     return {"source": source, "action": {"channels": [thrust, *channels]}}
 
 
@@ -261,12 +271,13 @@ def make_chain(config: HilConfig, flyer: Flyer, track: Track) -> FlightChain:
 
 
 def tolerances_of(config: HilConfig) -> dict[str, float]:
-    """Return limits of safety that follow from where poses come from, unless they are given.
+    """Return limits of safety that follow from where poses come from, and from who flies, unless they are given.
 
-    Body rates that are made from attitudes cannot contradict them, but lag behind.
+    Body rates that are made from attitudes cannot contradict them, but lag behind. Who hovers is not stranded.
     """
     made = config.pose_message in MADE_RATES or (config.pose == "ros2" and config.pose_message is None)
-    return {"rate_tolerance": MOST} if made else {}
+    hovers = {"still_time": 3600.0} if config.actor == IDENTIFY else {}
+    return {**({"rate_tolerance": MOST} if made else {}), **hovers}
 
 
 def stamping_of(config: HilConfig) -> Stamping:

@@ -8,12 +8,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, hash_track, load_track, read_track
 from dreamer_racing.export.onnx_actor import OnnxActor
 from dreamer_racing.hil.camera import camera_of
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Pose, Setpoint
+
+TOLERANCE = 0.1
+"""Share by which gains and motors may differ from those of training, beyond the widths of that [choice]."""
 
 
 class Flyer(Protocol):
@@ -126,6 +130,60 @@ def check_contract(contract: dict[str, Any], track: Track, rate: float | None = 
         raise ValueError(f"The actor's contract does not fit: {'; '.join(differing)}.")
     if geometry is None:
         return f"the contract has no source.track_sha256: {track.name} was compared by its name only, not by its gates"
+    return None
+
+
+def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str | None:
+    """Refuse an actor that was trained with another rate loop than the vehicle has.
+
+    Args:
+        contract: Of the actor.
+        vehicle: A preset, or the file of a drone that was identified.
+        force: Whether to fly it all the same.
+
+    Returns:
+        What differs, in words, where it is forced; None if nothing does, or the contract, an older one, says nothing.
+
+    Raises:
+        ValueError: They differ; the message names both. Or there is no such vehicle.
+    """
+    trained, there = contract.get("rate_loop"), load_preset(vehicle)
+    if trained is None:
+        preset = contract.get("source", {}).get("preset")
+        trained = {"kind": "proportional"} if preset in ("easy", "faithful") else None
+    if trained is None:
+        return f"the contract says nothing of a rate loop: it was not compared with vehicle={vehicle}"
+    if (misfit := _unlike_loop(trained, there)) is None:
+        return None
+    words = f"The actor was trained with {misfit[0]}, and vehicle={vehicle} has {misfit[1]}"
+    if force:
+        return f"{words}; it flies all the same (force=true)"
+    raise ValueError(
+        f"{words}: it would not answer as the actor has learned. Train with env=betaflight env.preset={vehicle}, or "
+        "add force=true to fly all the same."
+    )
+
+
+def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[str, str] | None:
+    """Return what a contract says of its rate loop, and what a vehicle has instead; None if it is within its widths."""
+    kinds = {"proportional": "a proportional rate loop", "betaflight": "a Betaflight's rate loop"}
+    kind = "proportional" if there.betaflight is None else "betaflight"
+    if trained["kind"] != kind:
+        return kinds.get(trained["kind"], str(trained["kind"])), kinds[kind]
+    if there.betaflight is None:
+        return None
+    widths = trained.get("trained_half_widths", {})
+    rows = [
+        (f"{name} of {axis}", trained[name][index], getattr(there.betaflight, name)[index], widths.get("gains", 0.0))
+        for name in ("p", "d")
+        for index, axis in enumerate(("roll", "pitch", "yaw"))
+    ]
+    lag = trained["motor_time_constant_s"]
+    rows.append(("motors of", lag, there.motor_time_constant, widths.get("motor_lag", 0.0)))
+    for name, known, other, width in rows:
+        if abs(other - known) > (width + TOLERANCE) * known + 1e-9:
+            unit = " s" if name == "motors of" else ""
+            return f"{name} {known:g}{unit} (± {width:.0%})", f"{name} {other:g}{unit}"
     return None
 
 

@@ -28,6 +28,7 @@ PLAIN = {
 TEXTS = (
     "run_dir", "resume", "init_from", "checkpoint", "output", "name", "directory", "runs", "commit", "agent", "actor",
     "track", "evaluation", "run", "against", "beside", "picture", "replay", "report", "betaflight_dump",
+    "flight", "vehicle",
 )  # fmt: skip
 """Settings that are no numbers, whatever they look like."""
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dreamer_racing.envs import tracks
+from dreamer_racing.envs.drone.parameters import load_preset, save_drone
 from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.flyer import check_contract, check_ranges
+from dreamer_racing.hil.flyer import check_contract, check_ranges, check_rate_loop
 from dreamer_racing.hil.safety_limits import SafetyLimits
 
 AGENTS = Path(__file__).parents[2] / "agents"
@@ -74,3 +77,46 @@ def test_what_safety_would_clip_is_refused_unless_it_is_meant():
         check_ranges(contract, replace(limits, rate_max=(16.0, 16.0, 6.4)))
     said = check_ranges(contract, limits, meant=("rate_max", "thrust_max"))
     assert [words.partition("=")[0] for words in said] == ["limits.rate_max", "limits.thrust_max"]
+
+
+def trained_with(preset: str, **changed: Any) -> dict[str, Any]:
+    """What a contract says of an actor of a preset."""
+    return {"rate_loop": describe_rate_loop(replace(load_preset(preset), **changed))}
+
+
+def test_an_actor_of_another_rate_loop_is_refused_with_both_and_flies_if_forced(tmp_path):
+    words = r"trained with a proportional rate loop, and vehicle=betaflight has a Betaflight's rate loop.*force=true"
+    with pytest.raises(ValueError, match=words):
+        check_rate_loop(trained_with("faithful"), "betaflight", force=False)
+    with pytest.raises(ValueError, match="trained with a Betaflight's rate loop, and vehicle=easy has a proportional"):
+        check_rate_loop(trained_with("betaflight"), "easy", force=False)
+    forced = check_rate_loop(trained_with("faithful"), "betaflight", force=True)
+    assert forced is not None and forced.endswith("it flies all the same (force=true)")
+    assert check_rate_loop(trained_with("easy"), "faithful", force=False) is None
+    assert check_rate_loop(trained_with("betaflight"), "betaflight", force=False) is None
+    old = {"source": {"preset": "easy"}}
+    with pytest.raises(ValueError, match="trained with a proportional rate loop"):
+        check_rate_loop(old, "betaflight", force=False)
+    unknown = check_rate_loop({"source": {"preset": "mine"}}, "betaflight", force=False)
+    assert unknown is not None and "says nothing of a rate loop" in unknown
+
+
+@pytest.mark.parametrize(
+    ("gains", "lag", "words"),
+    [
+        ((45.0, 47.0 * 1.25, 30.0), 0.03, None),  # within the widths of training, and what is allowed beyond them
+        ((45.0, 47.0 * 1.35, 30.0), 0.03, r"p of pitch 47 \(± 20%\), and vehicle=.* has p of pitch 63.45"),
+        ((45.0, 47.0, 30.0), 0.05, r"motors of 0.03 s \(± 30%\), and vehicle=.* has motors of 0.05 s"),
+    ],
+)
+def test_gains_and_motors_may_differ_as_far_as_those_of_training_did(gains, lag, words, tmp_path):
+    nominal = load_preset("betaflight")
+    vehicle = replace(nominal, motor_time_constant=lag, betaflight=replace(nominal.betaflight, p=gains))
+    save_drone(tmp_path / "drone.yaml", vehicle, {})
+    contract, file = trained_with("betaflight"), str(tmp_path / "drone.yaml")
+    if words is None:
+        assert check_rate_loop(contract, file, force=False) is None
+        return
+    with pytest.raises(ValueError, match=words):
+        check_rate_loop(contract, file, force=False)
+    assert check_rate_loop(contract, file, force=True) is not None

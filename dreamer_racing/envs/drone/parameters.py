@@ -6,9 +6,13 @@ against.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 from dreamer_racing.envs.drone.betaflight import BetaflightParameters
+from dreamer_racing.envs.drone.variations import SUFFIXES, differing, read_variation, vary, write_variation
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -157,17 +161,43 @@ PRESETS: dict[str, QuadrotorParameters] = {
 
 
 def load_preset(preset: str | QuadrotorParameters) -> QuadrotorParameters:
-    """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), or the given parameters themselves.
+    """Return the parameters of a named preset (`easy`, `faithful`, `betaflight`), of a drone's file, or those given.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: unknown name, or a file that is no drone.
     """
     if isinstance(preset, QuadrotorParameters):
         return preset
+    if isinstance(preset, str) and preset.endswith(SUFFIXES):
+        return _read_drone(Path(preset))
     if not isinstance(preset, str) or preset not in PRESETS:
         there = ", ".join(sorted(PRESETS))
         raise ValueError(f"preset={preset}: there is no such physics; there are {there}{suggestion(preset, PRESETS)}.")
     return PRESETS[preset]
+
+
+def _read_drone(path: Path) -> QuadrotorParameters:
+    """Read the drone of a file, see `variations`."""
+    base, changes = read_variation(path)
+    if base not in PRESETS:
+        there = ", ".join(sorted(PRESETS))
+        raise ValueError(f"{path}: preset: {quoted(base)} is none of {there}{suggestion(base, PRESETS)}.")
+    try:
+        return vary(PRESETS[base], changes)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def save_drone(path: Path, drone: QuadrotorParameters, about: Mapping[str, Any]) -> None:
+    """Write a drone as a file that `load_preset` reads: what of it differs from the preset of its kind.
+
+    Args:
+        path: The file, which ends in .yaml; one that is there is replaced.
+        drone: The drone; its randomisation is that of the preset.
+        about: Where its numbers come from, plain values.
+    """
+    base = "faithful" if drone.betaflight is None else "betaflight"
+    write_variation(path, base, differing(PRESETS[base], drone), about)
 
 
 MIN_CONTROL_RATE = 10.0

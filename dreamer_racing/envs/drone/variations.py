@@ -1,0 +1,91 @@
+"""Drones as YAML files: what `preset=` takes in place of a name, written by whoever has measured one.
+
+preset: betaflight          # of which the drone is a variation; the widths of its randomisation stay
+parameters:                 # fields of `QuadrotorParameters`, in SI units
+  mass: 0.62
+  betaflight:               # fields of `BetaflightParameters`
+    p: [45, 47, 30]
+about: {}                   # where the numbers come from; not read
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from dreamer_racing.settings import quoted, suggestion
+
+T = TypeVar("T")
+SUFFIXES = (".yaml", ".yml")
+"""With which the names of such files end."""
+KEPT = "randomisation"
+"""Field that a variation does not change."""
+
+
+def write_variation(path: Path, preset: str, changes: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Write a drone.
+
+    Args:
+        path: The file; one that is there is replaced.
+        preset: Of which it is a variation.
+        changes: As `differing` returns them.
+        about: Where its numbers come from, plain values.
+    """
+    content = {"preset": preset, "parameters": dict(changes), "about": dict(about)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100), encoding="utf-8")
+
+
+def differing(base: Any, changed: Any) -> dict[str, Any]:
+    """Return the fields in which one dataclass differs from another, as plain values."""
+    fields = {}
+    for name in (field.name for field in dataclasses.fields(base)):
+        before, now = getattr(base, name), getattr(changed, name)
+        if before == now or name == KEPT:
+            continue
+        inner = dataclasses.is_dataclass(before) and dataclasses.is_dataclass(now)
+        fields[name] = differing(before, now) if inner else list(now) if isinstance(now, tuple) else now
+    return fields
+
+
+def read_variation(path: Path) -> tuple[Any, dict[str, Any]]:
+    """Return the preset of which a file's drone is a variation, and its changes.
+
+    Raises:
+        ValueError: There is no such file, or it is no drone.
+    """
+    if not path.is_file():
+        raise ValueError(f"preset={path}: there is no such file.")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no YAML: {error}") from error
+    changes = content.get("parameters", {}) if isinstance(content, dict) else None
+    if not isinstance(changes, dict):
+        raise ValueError(f"{path} is no drone: it must have preset:, a name, and parameters:, fields and their values.")
+    return content.get("preset"), changes
+
+
+def vary(base: T, changes: Mapping[str, Any]) -> T:
+    """Return a dataclass with fields of other values; lists become tuples.
+
+    Raises:
+        ValueError: There is no such field, or a value is not allowed.
+    """
+    names = sorted({field.name for field in dataclasses.fields(base)} - {KEPT})  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for name, value in changes.items():
+        if name not in names:
+            raise ValueError(f"there is no parameter {quoted(name)}{suggestion(name, names)}: {', '.join(names)}.")
+        before = getattr(base, name)
+        if isinstance(value, dict):
+            if not dataclasses.is_dataclass(before):
+                raise ValueError(f"{name}={quoted(value)}: is no group of numbers.")
+            values[name] = vary(before, value)
+        else:
+            values[name] = tuple(value) if isinstance(value, list) else value
+    return dataclasses.replace(base, **values)  # type: ignore[type-var]

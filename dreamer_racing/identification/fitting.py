@@ -1,0 +1,376 @@
+"""Finds the numbers of a rate loop with which the simulation answers a recording's commands as its vehicle did.
+
+The model is the very one that agents train in: flight controller, mixer and motors of `preset=betaflight`, turning a
+rigid body. Many candidates fly all stretches of the recording at once, so that a step of Gauss-Newton is one flight.
+
+Shapes: C candidates, S stretches, T ms, P parameters; N = C · S drones. SI units, body frame FLU.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.drone.quadrotor import Quadrotor
+from dreamer_racing.envs.drone.rate_loop import Own, Row
+from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.identification.recorded import AXES, DT, Recorded, stretches
+
+logger = logging.getLogger(__name__)
+
+STRETCH = 1.1
+"""s that a drone flies without being told where it is [choice]: longer ones stray by what is not modelled."""
+BURN_IN = 0.2
+"""s at its beginning that are not compared [choice]: what filters and integrals were then is not known."""
+EVERY = 5
+"""ms between two comparisons."""
+CORRELATED = 0.04
+"""s over which errors are alike [choice]: what is left is not noise, but what the model lacks."""
+FLOOR = 0.003
+"""Of the RMS of rates: the least that errors are taken to be [choice]."""
+OUTLIER = 3.0
+"""Standard deviations beyond which an error counts by its size, not its square: recordings have pauses and gusts."""
+LEFT_OUT = 0.1
+"""Share of the errors, the largest ones, that do not show in `Fit.errors`: of pauses and gusts."""
+STEPS = 15
+"""Of Gauss-Newton, at the most."""
+UNKNOWN = 0.5
+"""Share of what a number was believed to within before, above which a recording has told little of it [choice]."""
+DONE = 0.02
+"""Largest change of a parameter, relative to how well it was known before, at which it is found."""
+
+
+class Parameter(NamedTuple):
+    """A number to be found.
+
+    Args:
+        name: Of it.
+        prior: Standard deviation of what is believed before: of its logarithm, or of a delay in s [choice].
+        probe: By which it is changed to see what that does.
+        axis: On whose steps it depends, of `AXES`; None: on all.
+    """
+
+    name: str
+    prior: float
+    probe: float
+    axis: str | None = None
+
+
+PARAMETERS = (
+    *(Parameter(f"p_{axis}", 0.7, 0.05, axis) for axis in AXES[:3]),
+    *(Parameter(f"i_{axis}", 1.0, 0.2, axis) for axis in AXES[:3]),
+    *(Parameter(f"d_{axis}", 0.7, 0.1, axis) for axis in AXES[:2]),
+    Parameter("motor_lag", 0.7, 0.1),
+    Parameter("delay", 0.015, 0.003),
+)
+"""Gains relative to those that the fit began with, and the lag, as logarithms; delay in s, added. Cut-offs of filters
+are not among them: D tells the same of them, and a flight controller is asked for them."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was found.
+
+    Attributes:
+        parameters: Of the drone that answers as the recorded one did.
+        values: By name: what was found, relative to where the fit began, and in s of the delay.
+        deviations: By name: standard deviation of it, as a share, and in s of the delay; by how stretches differ.
+        unknown: Names of those of which the recording says little: they are as they were.
+        errors: RMS error of body rates relative to the RMS of those asked for, by axis, of all but the `LEFT_OUT` that
+            are farthest off; of the fitted, and ``before``.
+        thrust: Delivered collective thrust, relative to what the model gives; None where no force was measured.
+    """
+
+    parameters: QuadrotorParameters
+    values: dict[str, float]
+    deviations: dict[str, float]
+    unknown: tuple[str, ...]
+    errors: dict[str, float]
+    before: dict[str, float]
+    thrust: float | None
+
+
+class Flown(NamedTuple):
+    """Stretches as candidates flew them.
+
+    Args:
+        rates: (T / EVERY, C, S, 3) rad/s.
+        force: (T / EVERY, C, S) of the rotors, per mass, m/s².
+    """
+
+    rates: Tensor
+    force: Tensor
+
+
+class Model:
+    """Candidates that fly the stretches of a recording.
+
+    Args:
+        nominal: The drone that candidates are variations of; its `betaflight` is set.
+        recorded: What was flown.
+        parts: S stretches of T ms.
+        candidates: C at a time.
+    """
+
+    def __init__(
+        self, nominal: QuadrotorParameters, recorded: Recorded, parts: Sequence[slice], candidates: int
+    ) -> None:
+        assert nominal.betaflight is not None, "checked"
+        self._drone = replace(
+            nominal, physics_dt=DT, control_dt=DT, command_delay=0.0, drag=(0.0, 0.0, 0.0), randomisation=None
+        )
+        self._delay = nominal.command_delay
+        self._shape = candidates, len(parts)
+        num_drones = candidates * len(parts)
+        self._quadrotor = Quadrotor(self._drone, num_drones)
+        self._qpos = torch.zeros(num_drones, 7, dtype=torch.float64)
+        self._qvel, self._force = (torch.zeros(num_drones, 6, dtype=torch.float64) for _ in range(2))
+        self._inertia = torch.tensor(self._drone.inertia, dtype=torch.float64)
+        self._flight = FusedFlight(self._quadrotor, self._qpos, self._qvel, self._force, self._integrate)
+        command, fresh, rates = (
+            torch.from_numpy(np.stack([values[part] for part in parts], 1))
+            for values in (recorded.command, recorded.fresh, recorded.rates)
+        )
+        # what a controller remembers where a stretch begins is what it does in the one before, as last flown
+        begins = np.array([part.start for part in parts])
+        self._handover = round((STRETCH - BURN_IN) / DT)
+        self._follows = torch.from_numpy(np.diff(begins, prepend=begins[0] - 1) == self._handover)  # (S,)
+        self._remembered: tuple[Tensor, Tensor] | None = None
+        command[..., 0] *= self._drone.mass
+        self._command, self._fresh, self._rates = command, fresh, rates  # each (T, S, ...)
+
+    def _integrate(self) -> None:
+        """Turn the bodies, which stay where they are, as MuJoCo would."""
+        rates = self._qvel[:, 3:]
+        gyroscopic = torch.linalg.cross(rates, self._inertia * rates)
+        rates += DT / self._inertia * (self._force[:, 3:] - gyroscopic)
+
+    def fly(self, candidates: Tensor) -> Flown:
+        """Fly all stretches with candidates (C, P), from the rates at their beginnings on."""
+        quadrotor, loop, (_, stretches_) = self._quadrotor, self._quadrotor.rate_loop, self._shape
+        assert loop is not None
+        late = self._give(candidates)  # (C,) ms
+        quadrotor.reset(torch.ones(len(self._qpos), dtype=torch.bool))
+        self._begin(len(candidates))
+        rates, force = [], []
+        columns = torch.arange(stretches_)
+        for step in range(len(self._command)):
+            at = (step - late).clamp(min=0).unsqueeze(1)  # (C, 1)
+            quadrotor.setpoints[0] = self._command[at, columns].flatten(0, 1)
+            arrived = self._fresh[at, columns].flatten() & (step >= late).repeat_interleave(stretches_)
+            loop.state[:, Row.THROTTLE, 2].masked_fill_(arrived, 0.0)
+            if step == self._handover:
+                self._remember(candidate=0)
+            self._flight.step(0)
+            if step % EVERY == EVERY - 1:
+                rates.append(self._qvel[:, 3:].view(*self._shape, 3).clone())
+                force.append(quadrotor.rotor_speed.square().sum(1).view(self._shape) / self._drone.mass)
+        self._remembered = self._next
+        return Flown(torch.stack(rates), torch.stack(force))
+
+    def _begin(self, candidates: int) -> None:
+        """Put the drones at the beginnings of their stretches."""
+        loop = self._quadrotor.rate_loop
+        assert loop is not None
+        self._qpos[:, 3:] = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=torch.float64)
+        start = self._rates[0].expand(candidates, -1, -1).reshape(-1, 3)
+        self._qvel.zero_()
+        self._qvel[:, 3:] = start
+        for row in (Row.GYRO_LPF1, Row.GYRO_LPF2, Row.DTERM_LPF1, Row.DTERM_LPF2):
+            loop.state[:, row] = torch.rad2deg(start)
+        if self._remembered is not None:
+            for kept, remembered in zip((loop.state, self._quadrotor.rotor_speed), self._remembered, strict=True):
+                of_all = remembered.repeat(candidates, *[1] * (remembered.ndim - 1))
+                rows = self._follows.repeat(candidates).view(-1, *[1] * (kept.ndim - 1))
+                kept.copy_(torch.where(rows, of_all, kept))
+
+    def _remember(self, candidate: int) -> None:
+        """Keep what the drones of a candidate remember, each for the stretch after its own."""
+        loop = self._quadrotor.rate_loop
+        assert loop is not None
+        own = slice(candidate * self._shape[1], (candidate + 1) * self._shape[1])
+        self._next = loop.state[own].roll(1, 0).clone(), self._quadrotor.rotor_speed[own].roll(1, 0).clone()
+
+    def _give(self, candidates: Tensor) -> Tensor:
+        """Give the drones of candidates (C, P) their numbers; return the delay of each, (C,) ms."""
+        loop, values = self._quadrotor.rate_loop, by_name(candidates)
+        assert loop is not None
+        own = torch.ones(len(candidates), len(Own), 3, dtype=torch.float64)
+        for row, gain, axes in ((Own.P, "p", 3), (Own.I, "i", 3), (Own.D, "d", 2)):
+            for index, axis in enumerate(AXES[:axes]):
+                own[:, row, index] = values[f"{gain}_{axis}"].exp()
+        decay = math.log(self._quadrotor.motor_decay) / values["motor_lag"].exp()
+        own[:, Own.MOTORS, 0], own[:, Own.MOTORS, 1], own[:, Own.MOTORS, 2] = decay.exp(), (0.5 * decay).exp(), 0.0
+        loop.own.copy_(own.repeat_interleave(self._shape[1], 0))
+        return ((self._delay + values["delay"]) / DT).round().long().clamp(min=0)
+
+
+def by_name(candidates: Tensor) -> dict[str, Tensor]:
+    """Return the numbers of candidates (C, P), (C,) each."""
+    return {parameter.name: candidates[:, index] for index, parameter in enumerate(PARAMETERS)}
+
+
+def fit(recorded: Recorded, nominal: QuadrotorParameters) -> Fit:
+    """Find the numbers of a recording's drone.
+
+    What the recording says nothing of stays near what it was: each number has a width by which it is believed before.
+
+    Args:
+        recorded: The recording; `Recorded.check` says whether it is one to learn from.
+        nominal: Where to begin, with a flight controller of `betaflight`.
+
+    Raises:
+        ValueError: The drone has no such flight controller, or there is no stretch that was measured throughout.
+    """
+    if nominal.betaflight is None:
+        raise ValueError("The fit is of a Betaflight's rate loop: begin with preset=betaflight, or a drone made of it.")
+    parts = stretches(recorded, STRETCH, BURN_IN)
+    if not parts:
+        raise ValueError(f"No {STRETCH:g} s of this recording were measured without a gap: it says nothing.")
+    priors = torch.tensor([parameter.prior for parameter in PARAMETERS], dtype=torch.float64)
+    probes = torch.tensor([parameter.probe for parameter in PARAMETERS], dtype=torch.float64)
+    model = Model(nominal, recorded, parts, 1 + len(PARAMETERS))
+    measured = torch.from_numpy(np.stack([recorded.rates[part] for part in parts], 1))[EVERY - 1 :: EVERY]  # (T, S, 3)
+    kept = slice(round(BURN_IN / DT / EVERY), None)
+    floor = FLOOR * measured.square().mean((0, 1)).sqrt().clamp(min=0.1)
+    found, before, last = torch.zeros(len(PARAMETERS), dtype=torch.float64), None, None
+    for number in range(STEPS):
+        flown = model.fly(found + torch.cat((torch.zeros(1, len(priors)), probes.diag())))
+        error = (flown.rates - measured.unsqueeze(1))[kept]  # (T, C, S, 3)
+        rms = _rms(error[:, 0], recorded, parts)
+        words = ", ".join(f"{axis} {each:.1%}" for axis, each in rms.items())
+        logger.info("identification: step %d, errors %s", number, words)
+        before = before or rms
+        change, known, differing = _solve(error, floor, probes, priors, found)
+        last = Step(found.clone(), rms, known, differing, flown)
+        if (change / priors).abs().max() < DONE:
+            break
+        found = found + change
+        found[-1] = found[-1].clamp(min=-nominal.command_delay)
+    assert last is not None
+    assert before is not None
+    return _conclude(last, before, nominal, recorded, parts)
+
+
+class Step(NamedTuple):
+    """A step of the fit.
+
+    Args:
+        found: (P,) numbers.
+        errors: Of them, by axis.
+        known: (P,) standard deviations with which they are known.
+        differing: (P,) likewise, by how stretches differ.
+        flown: By them and by what is near them.
+    """
+
+    found: Tensor
+    errors: dict[str, float]
+    known: Tensor
+    differing: Tensor
+    flown: Flown
+
+
+def _solve(
+    error: Tensor, floor: Tensor, probes: Tensor, priors: Tensor, found: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return by how much to change the numbers, how well they are known, and by how much stretches differ, (P,) each.
+
+    The second is the standard deviation of a posterior, the third that of the estimate over stretches (sandwich), which
+    also holds where errors are not independent.
+
+    Args:
+        error: (T, C, S, 3) of the present numbers, and of each with its probe.
+        floor: (3,) rad/s, which errors are taken to be at the least: where a vehicle hovers there is next to none.
+        probes: (P,).
+        priors: (P,) standard deviations of what is believed before.
+        found: (P,) present numbers.
+    """
+    present = error[:, 0]  # (T, S, 3)
+    slopes = (error[:, 1:] - present.unsqueeze(1)) / probes.view(-1, 1, 1)  # (T, P, S, 3)
+    scale = torch.maximum(1.4826 * present.abs().flatten(0, 1).median(0).values, floor)  # (3,) rad/s, robust
+    weights = (OUTLIER * scale / present.abs().clamp(min=1e-9)).clamp(max=1.0) / scale.square()
+    weights = weights * (EVERY * DT / CORRELATED)
+    rows = slopes.movedim(1, -1)  # (T, S, 3, P)
+    weighted = rows * weights.unsqueeze(-1)
+    information = torch.einsum("tsap,tsaq->pq", rows, weighted) + priors.square().reciprocal().diag()
+    scores = torch.einsum("tsap,tsa->sp", weighted, present)  # (S, P)
+    covariance = torch.linalg.inv(information)
+    change = -(covariance @ (scores.sum(0) + found / priors.square()))
+    differing = covariance @ (scores - scores.mean(0)).T  # (P, S)
+    return change.clamp(-priors, priors), covariance.diagonal().sqrt(), differing.square().sum(1).sqrt()
+
+
+def _rms(error: Tensor, recorded: Recorded, parts: Sequence[slice]) -> dict[str, float]:
+    """Return the RMS of errors (T, S, 3), but for the largest, relative to that of the rates asked for, by axis."""
+    asked = np.concatenate([recorded.command[part, 1:] for part in parts])
+    squares = error.square().flatten(0, 1).sort(0).values  # (T · S, 3)
+    kept = squares[: math.ceil((1.0 - LEFT_OUT) * len(squares))].mean(0).sqrt()
+    relative = kept / torch.from_numpy(asked).square().mean(0).sqrt().clamp(min=1e-6)
+    return dict(zip(AXES, relative.tolist(), strict=False))
+
+
+def _conclude(
+    last: Step, before: dict[str, float], nominal: QuadrotorParameters, recorded: Recorded, parts: Sequence[slice]
+) -> Fit:
+    """Make the drone of the numbers found."""
+    unknown = tuple(
+        parameter.name
+        for parameter, each in zip(PARAMETERS, last.known.tolist(), strict=True)
+        if each > UNKNOWN * parameter.prior
+    )
+    found = {parameter.name: float(each) for parameter, each in zip(PARAMETERS, last.found, strict=True)}
+    values = {name: each if name == "delay" else math.exp(each) for name, each in found.items()}
+    thrust = _thrust(last.flown.force[:, 0], recorded, parts)
+    parameters = apply(nominal, values, thrust or 1.0)
+    deviations = dict(zip(found, last.differing.tolist(), strict=True))
+    return Fit(parameters, values, deviations, unknown, last.errors, before, thrust)
+
+
+def _thrust(force: Tensor, recorded: Recorded, parts: Sequence[slice]) -> float | None:
+    """Return by which factor the measured force exceeds the modelled one (T, S), m/s²."""
+    measured = np.stack([recorded.force[part] for part in parts], 1)
+    size = round(BURN_IN / DT / EVERY)
+    measured = measured[: EVERY * len(force)].reshape(len(force), EVERY, -1)[size:]
+    seen = np.isfinite(measured).all(1)
+    if seen.mean() < 0.5:
+        return None
+    modelled, mean = force[size:].numpy()[seen], measured.mean(1)[seen]
+    return float(modelled @ mean / (modelled @ modelled))
+
+
+def apply(nominal: QuadrotorParameters, values: dict[str, float], thrust: float = 1.0) -> QuadrotorParameters:
+    """Return a drone with numbers relative to a nominal one's.
+
+    Args:
+        nominal: With a flight controller of `betaflight`.
+        values: By the names of `PARAMETERS`; the delay in s, added.
+        thrust: Of its rotors, relative: gains, which command them, are less by as much.
+    """
+    assert nominal.betaflight is not None, "checked"
+    firmware: Any = nominal.betaflight
+    gains = {
+        gain: tuple(
+            round(number * values.get(f"{gain}_{axis}", 1.0) / thrust, 2)
+            for axis, number in zip(AXES, getattr(firmware, gain), strict=False)
+        )
+        for gain in ("p", "i", "d")
+    }
+    gains["d_max"] = tuple(
+        round(number * values.get(f"d_{axis}", 1.0) / thrust, 2)
+        for axis, number in zip(AXES, firmware.d_max, strict=False)
+    )
+    return replace(
+        nominal,
+        betaflight=replace(firmware, **gains),
+        motor_time_constant=round(nominal.motor_time_constant * values["motor_lag"], 5),
+        command_delay=round(max(nominal.command_delay + values["delay"], 0.0), 3),
+        rotor_thrust_max=round(nominal.rotor_thrust_max * thrust, 4),
+    )

@@ -1,0 +1,195 @@
+"""Recordings of what was asked of a vehicle and what it did, put on a grid of 1 ms.
+
+Shapes: T ms.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.attitude import rotation_matrix
+from dreamer_racing.hil.recording import Flight
+
+DT = 0.001
+"""s, of the grid."""
+
+AXES = ("roll", "pitch", "yaw", "thrust")
+UNITS = ("rad/s", "rad/s", "rad/s", "m/s²")
+
+FASTEST = 500.0
+"""rad/s² beyond which rates were not flown, but the body was put somewhere else [choice]: small racers reach 440."""
+
+LONGEST_GAP = 0.05
+"""s without a measurement over which nothing is interpolated [choice]."""
+
+QUIET = (0.4, 0.4, 0.3, 0.8)
+"""By which commands of each axis must vary at least, as a standard deviation within a window, for that to count as
+moved [choice]: below it noise and what is not modelled are as large as what is to be seen."""
+LEAST = (2.0, 2.0, 3.0, 2.0)
+"""s for which each axis must be moved [choice]: yaw, which is slow, for longer."""
+WINDOW = 1.0
+"""s over which variation is measured [choice]."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording of T ms.
+
+    Attributes:
+        command: (T, 4) what was asked for: collective thrust, m/s², and body rates, rad/s; held until the next command.
+        fresh: (T,) bool: where a command was sent.
+        rates: (T, 3) body rates that were measured, rad/s; not a number where nothing was.
+        force: (T,) specific force along body z that was measured, m/s²; not a number where nothing was.
+    """
+
+    command: np.ndarray
+    fresh: np.ndarray
+    rates: np.ndarray
+    force: np.ndarray
+
+    def moved(self) -> tuple[float, ...]:
+        """Return for how long each axis was moved while it was measured, s: roll, pitch, yaw, thrust."""
+        asked = np.column_stack((self.command[:, 1:], self.command[:, 0]))
+        seen = np.isfinite(self.rates).all(1)
+        size = round(WINDOW / DT)
+        windows = [slice(begin, begin + size) for begin in range(0, len(asked) - size + 1, size)]
+        deviation = np.array([asked[part].std(0) if seen[part].mean() > 0.9 else np.zeros(4) for part in windows])
+        if not len(deviation):
+            return 0.0, 0.0, 0.0, 0.0
+        return tuple(float(WINDOW * count) for count in (deviation > QUIET).sum(0))
+
+    def check(self, source: str | Path) -> None:
+        """Refuse what is too short or too quiet to tell anything.
+
+        Raises:
+            ValueError: The message says which axis needs what.
+        """
+        asked, lacking = np.column_stack((self.command[:, 1:], self.command[:, 0])), []
+        for index, (axis, seconds) in enumerate(zip(AXES, self.moved(), strict=True)):
+            if seconds < LEAST[index]:
+                lacking.append(
+                    f"{axis} was moved for {seconds:g} s, and needs {LEAST[index]:g} s in which its commands vary by "
+                    f"{QUIET[index]:g} {UNITS[index]} or more (over all of it: {asked[:, index].std():.2g})"
+                )
+        if lacking:
+            raise ValueError(
+                f"{source} is too short or too quiet: {'; '.join(lacking)}. actor=identify of recipes/hil.py flies "
+                "what is needed."
+            )
+
+
+def read_recorded(path: str | Path) -> Recorded:
+    """Read a flight of `recipes/hil.py`, or a table (``.csv``, ``.csv.gz``) as `read_table` does.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is neither, or was never armed.
+    """
+    path = Path(path)
+    if path.name.endswith((".csv", ".csv.gz")):
+        return read_table(path)
+    return of_flight(Flight(path))
+
+
+def read_table(path: Path) -> Recorded:
+    """Read a table with a row a ms: ``t`` s, ``thrust_cmd`` m/s², ``wx_cmd wy_cmd wz_cmd`` and ``wx wy wz`` rad/s, FLU.
+
+    Thrust is read off ``az`` (specific force along body z, m/s²) where there is such a column.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no recording {path}.")
+    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
+        rows = list(csv.DictReader(file))
+    names = ("t", "thrust_cmd", "wx_cmd", "wy_cmd", "wz_cmd", "wx", "wy", "wz")
+    if not rows or (lacking := [name for name in names if name not in rows[0]]):
+        raise ValueError(
+            f"{path} lacks {', '.join(lacking if rows else names)}: see `read_table` for what a table has."
+        )
+    time, *columns = (np.array([float(row[name]) for row in rows]) for name in names)
+    force = np.array([float(row["az"]) for row in rows]) if "az" in rows[0] else np.full(len(rows), np.nan)
+    command = np.column_stack(columns[:4])
+    changes = np.flatnonzero(np.concatenate(([True], (np.diff(command, axis=0) != 0).any(1))))
+    return _on_grid(time[changes], command[changes], time, np.column_stack(columns[4:]), time, force)
+
+
+def of_flight(flight: Flight) -> Recorded:
+    """Put a flight of `recipes/hil.py` on the grid: while it was armed.
+
+    Raises:
+        ValueError: It never was.
+    """
+    sent = [(tick["in"]["time"] + tick["took"]["sent"], tick["out"]["command"]) for tick in flight.ticks]
+    armed = [(time, command[1:]) for time, command in sent if command[0]]
+    if not armed:
+        raise ValueError("This flight was never armed: there is nothing to be read off it.")
+    poses = np.array([packet for tick in flight.ticks for packet in tick["in"]["received"]], float)
+    poses = poses[np.unique(poses[:, 2], return_index=True)[1]]  # by stamp, each once
+    latency = float((flight.about.get("config") or {}).get("latency") or 0.0)
+    time = poses[:, 2] + (poses[:, 0] - poses[:, 2]).min() - latency  # s, by the loop's clock
+    within = (time >= armed[0][0]) & (time <= armed[-1][0])
+    time, poses = time[within], poses[within]
+    force_time, force = _specific_force(time, poses)
+    command_time, command = (np.array(column) for column in zip(*armed, strict=True))
+    return _on_grid(command_time, command, time, poses[:, 13:16], force_time, force)
+
+
+def _specific_force(time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return specific forces along body z, m/s², between poses, and when that was."""
+    velocity, attitude = poses[:, 10:13], poses[:, 6:10]
+    step = np.diff(time)
+    acceleration = np.diff(velocity, axis=0) / np.maximum(step, 1e-6)[:, None] + (0.0, 0.0, GRAVITY)
+    up = np.array([rotation_matrix(each)[:, 2] for each in attitude])
+    middle = up[1:] + up[:-1]
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return time[:-1] + 0.5 * step, (acceleration * middle).sum(1)
+
+
+def _on_grid(
+    command_time: np.ndarray,
+    command: np.ndarray,
+    time: np.ndarray,
+    rates: np.ndarray,
+    force_time: np.ndarray,
+    force: Any,
+) -> Recorded:
+    """Hold commands, and interpolate measurements, on a grid of `DT` from the first command to the last measurement."""
+    begin = command_time[0]
+    grid = begin + DT * np.arange(max(int((time[-1] - begin) / DT), 1) if len(time) else 1)
+    newest = np.searchsorted(command_time, grid + 1e-9, side="right") - 1
+    fresh = np.zeros(len(grid), bool)
+    fresh[np.flatnonzero(np.diff(newest, prepend=-1))] = True
+    measured = _interpolate(grid, time, rates)
+    jumps = np.abs(np.diff(measured, axis=0, prepend=measured[:1])) > FASTEST * DT
+    measured[jumps.any(1)] = np.nan
+    return Recorded(command[newest], fresh, measured, _interpolate(grid, force_time, force[:, None])[:, 0])
+
+
+def _interpolate(grid: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (T, K) on the grid; not a number in gaps."""
+    if len(time) < 2:
+        return np.full((len(grid), values.shape[1]), np.nan)
+    columns = np.column_stack([np.interp(grid, time, column) for column in values.T])
+    after = np.searchsorted(time, grid).clip(1, len(time) - 1)
+    gap = (time[after] - time[after - 1] > LONGEST_GAP) | (grid < time[0]) | (grid > time[-1])
+    columns[gap] = np.nan
+    return columns
+
+
+def stretches(recorded: Recorded, seconds: float, overlap: float) -> Sequence[slice]:
+    """Return windows of so many s, each so much within the one before, in which all rates were measured throughout."""
+    size, step = round(seconds / DT), round((seconds - overlap) / DT)
+    seen = np.isfinite(recorded.rates).all(1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], seen, [False]))))
+    return [
+        slice(begin, begin + size)
+        for first, end in edges.reshape(-1, 2)
+        for begin in range(first, end - size + 1, step)
+    ]

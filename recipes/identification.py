@@ -1,0 +1,104 @@
+"""Finds the numbers of a vehicle's rate loop, motors and thrust from a flight, and writes a drone that agents train on.
+
+    python recipes/hil.py actor=identify track=circle arm=true     # flies what tells most: small steps about a hover
+    python recipes/identification.py flight=runs/hil_circle_20260101-120000 output=drone.yaml
+    python recipes/dreamer_v3.py env=betaflight env.preset=drone.yaml
+
+Any flight of recipes/hil.py that moves all axes will do, and so does a table (.csv, .csv.gz) with a row a ms. What it
+does not tell stays as preset= has it, and is said. Read docs/hil.md, "What a drone is", first.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from composing.command_line import plain_errors, start_logging
+from composing.entry import recipe
+from hydra.core.config_store import ConfigStore
+
+from dreamer_racing.envs.drone.variations import SUFFIXES
+
+if TYPE_CHECKING:
+    from dreamer_racing.identification.fitting import Fit
+
+
+@dataclass
+class IdentificationConfig:
+    """`recipes/identification.py`."""
+
+    flight: str | None = None  # what was flown: a folder of recipes/hil.py, its file, or a table
+    preset: str = "betaflight"  # where to begin: a preset with a Betaflight, or a drone's file; mass and inertia stay
+    output: str = "drone.yaml"  # the file to write
+
+
+ConfigStore.instance().store(name="identification_schema", node=IdentificationConfig)
+
+
+@recipe("identification")
+def main(config: IdentificationConfig) -> None:
+    """Read, fit, write."""
+    start_logging()
+    with plain_errors():
+        check(config)
+        identify(config)
+
+
+def check(config: IdentificationConfig) -> None:
+    """Refuse what could only fail once all is done.
+
+    Raises:
+        ValueError: the message names the field and what is allowed.
+    """
+    if not config.output.endswith(SUFFIXES):
+        raise ValueError(f"output={config.output}: the name of the file must end in {' or '.join(SUFFIXES)}.")
+
+
+def identify(config: IdentificationConfig) -> None:
+    """Do all of it, and print what came of it.
+
+    Raises:
+        ValueError: There is no such flight, it is too short or too quiet, or the preset has no Betaflight.
+    """
+    if config.flight is None:
+        raise ValueError("flight= is missing: a folder in which recipes/hil.py flew, or a table.")
+    from dreamer_racing.envs.drone.parameters import load_preset, save_drone
+    from dreamer_racing.identification.fitting import fit
+    from dreamer_racing.identification.recorded import read_recorded
+
+    nominal, recorded = load_preset(config.preset), read_recorded(config.flight)
+    recorded.check(f"flight={config.flight}")
+    logging.getLogger("dreamer_racing.identification").setLevel(logging.INFO)
+    found = fit(recorded, nominal)
+    about = {
+        "flight": Path(config.flight).name,
+        "begun_with": Path(config.preset).name,
+        "error_of_rates": {axis: round(error, 4) for axis, error in found.errors.items()},
+        "not_told": list(found.unknown),
+    }
+    if not all(math.isfinite(error) for error in found.errors.values()):
+        raise ValueError("The fit diverged: begin with a preset= that is nearer.")
+    save_drone(Path(config.output), found.parameters, about)
+    say(config, found)
+
+
+def say(config: IdentificationConfig, found: "Fit") -> None:
+    """Print what was found."""
+    print(f"{'':<10}{'relative':>10}{'±':>8}  (to {config.preset}; delay in ms, added)")
+    for name, value in found.values.items():
+        scale = 1e3 if name == "delay" else 1.0
+        width = scale * found.deviations[name] * (1.0 if name == "delay" else value)
+        untold = "   little is told of it" if name in found.unknown else ""
+        print(f"{name:<10}{scale * value:>10.3f}{width:>8.3f}{untold}")
+    for axis, error in found.errors.items():
+        print(f"{axis}: body rates follow within {error:.1%} of what was asked ({found.before[axis]:.1%} before)")
+    if found.thrust is None:
+        print("thrust: no force was measured")
+    else:
+        print(f"thrust: {found.thrust:.3f} of what was believed: multiply full_thrust= of recipes/hil.py by it")
+    print(f"written to {config.output}: env=betaflight env.preset={config.output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""The fit finds a drone that is hidden from it: simulated by the model itself, and flown in the plant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dreamer_racing.envs.drone.parameters import PRESETS, QuadrotorParameters
+from dreamer_racing.envs.tracks import load_track
+from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.identify import IdentificationFlyer
+from dreamer_racing.hil.recording import FILE, FlightRecorder
+from dreamer_racing.hil.safety import SafetyLimits
+from dreamer_racing.identification import fitting
+from dreamer_racing.identification.fitting import EVERY, PARAMETERS, Model, apply, fit
+from dreamer_racing.identification.recorded import DT, Recorded, read_recorded
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
+
+NOMINAL = replace(PRESETS["betaflight"], randomisation=None)
+HIDDEN = {"p_roll": 0.75, "p_pitch": 1.3, "p_yaw": 1.2, "d_roll": 0.8, "d_pitch": 1.2, "motor_lag": 1.35, "delay": 0.01}
+NAMES = [parameter.name for parameter in PARAMETERS]
+
+
+def commands(stretches: int) -> Recorded:
+    """Random commands of stretches of 1.1 s, each from rest, with a gap behind each."""
+    random, length = np.random.default_rng(0), round(fitting.STRETCH / DT)
+    command = np.zeros((stretches * (length + 1), 4))
+    fresh = np.zeros(len(command), bool)
+    for begin in range(0, len(command), 10):
+        if begin % 70 == 0:
+            scale = (3.0, 2.0, 2.0, 1.0)
+            present = np.array((10.0, 0.0, 0.0, 0.0)) + scale * random.uniform(-1.0, 1.0, 4)
+        command[begin : begin + 10], fresh[begin] = present, True
+    rates = np.zeros((len(command), 3))
+    rates[length :: length + 1] = np.nan
+    return Recorded(command, fresh, rates, np.full(len(command), np.nan))
+
+
+def candidate(values: dict[str, float]) -> torch.Tensor:
+    """The numbers (1, P) of relative values."""
+    return torch.tensor(
+        [[values.get(name, 0.0) if name == "delay" else math.log(values.get(name, 1.0)) for name in NAMES]],
+        dtype=torch.float64,
+    )
+
+
+def flown_by(values: dict[str, float], stretches: int, yaw: bool = True) -> Recorded:
+    """What a drone of such values answers to the commands, of yaw or without."""
+    asked = commands(stretches)
+    asked.command[:, 3] *= yaw
+    length = round(fitting.STRETCH / DT)
+    parts = [slice(begin, begin + length) for begin in range(0, len(asked.command) - length, length + 1)]
+    flown = Model(NOMINAL, asked, parts, 1).fly(candidate(values))
+    rates = asked.rates.copy()
+    for index, part in enumerate(parts):
+        seen = flown.rates[:, 0, index].numpy()
+        times = np.arange(length)
+        known = np.concatenate(([0], EVERY * np.arange(1, len(seen) + 1) - 1))
+        for axis in range(3):
+            rates[part, axis] = np.interp(times, known, np.concatenate(([0.0], seen[:, axis])))
+    return replace(asked, rates=rates)
+
+
+def test_the_fit_finds_what_the_model_was_given() -> None:
+    found = fit(flown_by(HIDDEN, 8), NOMINAL)
+    for name, value in HIDDEN.items():
+        assert found.values[name] == pytest.approx(value, abs=0.002 if name == "delay" else 0.05), name
+    assert max(found.errors.values()) < 0.02 < min(found.before.values())
+
+
+def test_what_is_asked_for_nowhere_stays_and_is_said() -> None:
+    """Nothing is asked about yaw."""
+    quiet = flown_by(HIDDEN, 4, yaw=False)
+    noise = 0.1 * np.random.default_rng(0).standard_normal(quiet.rates.shape)  # rad/s
+    found = fit(replace(quiet, rates=quiet.rates + noise), NOMINAL)
+    assert "i_yaw" in found.unknown
+    assert "p_roll" not in found.unknown
+
+
+def test_found_numbers_become_a_drone() -> None:
+    drone = apply(NOMINAL, {**dict.fromkeys(NAMES, 1.0), "delay": 0.004, "p_roll": 2.0, "d_pitch": 0.5}, thrust=0.8)
+    before, after = NOMINAL.betaflight, drone.betaflight
+    assert before is not None and after is not None
+    assert after.p[0] == pytest.approx(2.5 * before.p[0])
+    assert after.d[1] == pytest.approx(0.625 * before.d[1]) and after.d_max[1] == pytest.approx(
+        0.625 * before.d_max[1], rel=1e-3
+    )
+    assert drone.rotor_thrust_max == pytest.approx(0.8 * NOMINAL.rotor_thrust_max)
+    assert drone.command_delay == pytest.approx(NOMINAL.command_delay + 0.004)
+
+
+def test_other_rate_loops_and_recordings_full_of_gaps_are_refused() -> None:
+    with pytest.raises(ValueError, match="begin with preset=betaflight"):
+        fit(commands(2), PRESETS["easy"])
+    asked = commands(2)
+    with pytest.raises(ValueError, match="measured without a gap"):
+        fit(replace(asked, rates=np.full_like(asked.rates, np.nan)), NOMINAL)
+
+
+def fly_in_the_plant(drone: QuadrotorParameters, folder: Path, **mismatch: float) -> None:
+    """Fly all steps, by poses as motion capture gives them."""
+    track = load_track("circle")
+    delivery = Delivery(rate=200.0, jitter=0.002, packet_loss=0.01, position_noise=0.001, attitude_noise=0.003)
+    plant, flyer = LockStep(PlantVehicle(track, drone, Mismatch(**mismatch)), delivery), IdentificationFlyer()
+    limits = SafetyLimits.of_track(track, still_time=3600.0)
+    chain = make_chain(flyer, plant.plant.vehicle, ChainConfig(limits, arm=True))
+    with FlightRecorder(folder / FILE, {"config": {"latency": 0.0}}) as recorder:
+        assert plant.fly(chain, flyer.rate, flyer.duration + 3.0, recorder).endswith("s are over")
+
+
+@pytest.mark.slow
+def test_a_drone_that_is_hidden_in_the_plant_is_found_from_its_flight(tmp_path: Path) -> None:
+    hidden = apply(NOMINAL, {**dict.fromkeys(NAMES, 1.0), **HIDDEN})
+    fly_in_the_plant(hidden, tmp_path, thrust=0.9)
+    recorded = read_recorded(tmp_path)
+    recorded.check(tmp_path)
+    found = fit(recorded, NOMINAL)
+    for name in ("p_roll", "p_pitch", "p_yaw"):
+        assert found.values[name] == pytest.approx(HIDDEN[name] * 0.9, rel=0.1), name
+    assert found.values["motor_lag"] == pytest.approx(HIDDEN["motor_lag"], rel=0.1)
+    assert found.values["delay"] == pytest.approx(HIDDEN["delay"], abs=0.003)
+    assert found.thrust == pytest.approx(0.9, abs=0.02)
+    assert all(after < 0.5 * before for after, before in zip(found.errors.values(), found.before.values(), strict=True))
