@@ -5,7 +5,7 @@
     python recipes/dreamer_v3.py env=betaflight env.preset=drone.yaml
 
 Any flight of recipes/hil.py that moves all axes will do, and so does a table (.csv, .csv.gz) with a row a ms. What it
-does not tell stays as preset= has it, and is said. Read docs/hil.md, "What a drone is", first.
+does not tell stays as preset= has it, and is said. More: docs/betaflight.md, "Your own drone".
 """
 
 import logging
