@@ -20,10 +20,10 @@ def column(*numbers: float) -> torch.Tensor:
 
 def test_returns_and_what_is_reached_end_with_a_crash() -> None:
     rollout = learning_signal.Rollout(column(1.0, 2.0, 4.0), column(1.0, 0.0, 1.0), column(9.0, 10.0, 20.0, 30.0))
-    learner = SimpleNamespace(discount=0.5, actor_loss=SimpleNamespace(lambda_=1.0))
+    learner = SimpleNamespace(discount=0.5, loss_config=SimpleNamespace(lambda_=1.0))
     assert rollout.returns(learner).flatten().tolist() == [1.0 + 0.5 * 2.0, 2.0, 4.0 + 0.5 * 30.0]
     assert rollout.reached().flatten().tolist() == [1.0, 1.0, 0.0, 0.0]
-    learner.actor_loss.lambda_ = 0.0
+    learner.loss_config.lambda_ = 0.0
     assert rollout.returns(learner).flatten().tolist() == [1.0 + 0.5 * 10.0, 2.0, 4.0 + 0.5 * 30.0]
 
 
