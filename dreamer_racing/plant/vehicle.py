@@ -135,13 +135,15 @@ class PlantVehicle:
         qpos, qvel, force = (torch.from_numpy(array[None]) for array in (data.qpos, data.qvel, data.qfrc_applied))
         # a command may change at any physics step, and its delay is kept here: armed or not is delayed with it
         controller = Quadrotor(replace(own, control_dt=own.physics_dt, command_delay=0.0), 1)
-        rotors = Quadrotor(replace(controller.parameters, motor_time_constant=math.inf), 1)
+        bare = replace(controller.parameters, motor_time_constant=math.inf, motor_lag_of="speed", betaflight=None)
+        rotors = Quadrotor(bare, 1)
         rotors.rotor_speed = controller.rotor_speed  # with an endless lag they stay what they are set to
         self._by_commands = FusedFlight(controller, qpos, qvel, force, integrate)
         self._by_rotors = FusedFlight(rotors, qpos, qvel, force, integrate)
         self._setpoint = controller.setpoints[0, 0].numpy()  # (4,) N and rad/s
         self._rotor_speed = controller.rotor_speed[0].numpy()  # (4,) √N
         self._decay = controller.motor_decay
+        self._rate_loop = controller.rate_loop
 
     def reset(self) -> None:
         """Put the drone back on the stand: whole, disarmed, rotors at rest, with no gate passed."""
@@ -156,7 +158,7 @@ class PlantVehicle:
         self._bore_itself = 0  # physics steps in a row in which it was asked for all of its weight
         self.crash, self.fate = CrashCause.NONE, "none"
         self.lap_times: list[float] = []
-        self._rotor_speed[:] = 0.0
+        self._rotor_speed[:], self.armed = 0.0, False
         self._act(at_rest())
         self._hold(self._start)
         self._path = [self._qpos[:3].copy()]
@@ -217,6 +219,8 @@ class PlantVehicle:
 
     def _act(self, command: Command) -> None:
         """Let the flight controller do as it is told; it reckons with the nominal mass and thrust."""
+        if command.armed and not self.armed and self._rate_loop is not None:
+            self._rate_loop.reset(torch.ones(1, 1, dtype=torch.bool))  # nothing is integrated before
         self.armed = command.armed
         limits = self.parameters.body_rate_max
         thrust = max(command.setpoint.collective_thrust, 0.0) * self._nominal_mass * self._differs.thrust
@@ -252,10 +256,16 @@ class PlantVehicle:
         """Make a physics step with rotors that follow their own commands, or run down."""
         given = self._target_speed if self.crash is CrashCause.NONE else None
         target = np.zeros(4) if given is None else given
-        lag = self._rotor_speed - target
-        self._rotor_speed[:] = target + math.sqrt(self._decay) * lag  # of the step's middle
+        speed = self._rotor_speed.copy()
+        self._rotor_speed[:] = self._follow(target, speed, math.sqrt(self._decay))  # of the step's middle
         self._by_rotors.step(0)
-        self._rotor_speed[:] = target + self._decay * lag
+        self._rotor_speed[:] = self._follow(target, speed, self._decay)
+
+    def _follow(self, target: np.ndarray, speed: np.ndarray, decay: float) -> np.ndarray:
+        """Return speeds (4,) in √N on their way to a target, when so much of the way is left."""
+        if self.parameters.motor_lag_of == "speed":
+            return target + decay * (speed - target)
+        return np.sqrt(target**2 + decay * (speed**2 - target**2))
 
     def _hold(self, place: np.ndarray) -> None:
         """Keep the body at a place (7,), at rest."""
