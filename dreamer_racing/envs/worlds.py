@@ -5,7 +5,7 @@ The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: 
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, TypedDict
 
 import torch
@@ -54,6 +54,7 @@ class RaceOptions(TypedDict, total=False):
     start_on_line: float
     start_noise: float
     miss_radius: float
+    action_change_weight: float
     control_rate: float | None
     camera_rate: float | None
     imu: str | ImuErrors | None
@@ -93,6 +94,9 @@ class RaceWorlds:
         miss_radius: training episodes end, as with a crash, where the target gate's plane is crossed beside its frame
             and less than so far from its centre, m; if 0 the drone flies on. For tracks whose way to a gate does not
             lead past it.
+        action_change_weight: b₃, penalty in training for each unit of ‖aₜ − aₜ₋₁‖², but in a step that ends in a crash
+            and the first of an episode; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature 620,
+            2023, Extended Data Table 1) has 1e-4 where a metre of progress is 1, too.
         control_rate: actions a second, Hz; if None the preset's, 50.
         camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
             one, and none is drawn in between; if None the camera's, a frame at every control step.
@@ -132,6 +136,7 @@ class RaceWorlds:
         start_on_line: float = 0.0,
         start_noise: float = 0.0,
         miss_radius: float = 0.0,
+        action_change_weight: float = 0.0,
         control_rate: float | None = None,
         camera_rate: float | None = None,
         imu: str | ImuErrors | None = None,
@@ -163,6 +168,9 @@ class RaceWorlds:
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
+        check_numbers({}, {"action_change_weight": action_change_weight})
+        self.action_change_weight = 0.0 if evaluation else float(action_change_weight)
+        self._last_action = torch.zeros(num_envs, ACTION_SIZE, device=self.device)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
@@ -305,9 +313,16 @@ class RaceWorlds:
     def _fly(self, action: Tensor) -> RaceStep:
         """Fly one control step and judge it; nothing here waits for a CUDA device."""
         invalid = ~action.isfinite().all(dim=1)
-        path = self.simulator.step(action.nan_to_num(0.0, 0.0, 0.0))
+        flown = action.nan_to_num(0.0, 0.0, 0.0)
+        goes_on = self.race.step_count > 0  # before the step: the first of an episode changes nothing
+        path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
-        return outcome
+        if not self.action_change_weight:
+            return outcome
+        flown = flown.float().clamp(-1.0, 1.0)
+        change = (flown - self._last_action).square().sum(1).masked_fill(~goes_on | outcome.terminated, 0.0)
+        self._last_action.copy_(flown)
+        return replace(outcome, reward_base=outcome.reward_base - self.action_change_weight * change)
 
     def _capture(self, action: Tensor, draws: bool) -> GraphedFunction:
         """Capture physics, race and perhaps images of a step as one CUDA graph, and leave the worlds as they were.
@@ -366,6 +381,11 @@ class RaceWorlds:
             "target_gate": self.race.target_gate.unsqueeze(-1).clone(),
         }
 
+    @property
+    def effort(self) -> Tensor:
+        """What the last control step asked of the motors, float32 (N, 3), a copy; see `Quadrotor`."""
+        return self.simulator.quadrotor.effort.to(torch.float32, copy=True)
+
     def vector(self) -> Tensor:
         """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
         return self.race_vector(self.simulator.state, self.race.target_gate)
@@ -376,6 +396,7 @@ class RaceWorlds:
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
+            **({"last_action": self._last_action.clone()} if self.action_change_weight else {}),
             **({} if self._held is None else {"frames": self._held.state_dict()}),
             **({} if self.imu is None else {"imu": self.imu.state_dict()}),
         }
@@ -395,6 +416,8 @@ class RaceWorlds:
             raise ValueError("The saved worlds had another camera_rate than these: resume with theirs.")
         if ("imu" in state_dict) != (self.imu is not None):
             raise ValueError("The saved worlds had another imu than these: resume with theirs.")
+        if self.action_change_weight and "last_action" in state_dict:
+            self._last_action.copy_(state_dict["last_action"])
         self.begun = True
         generator = state_dict["generator"].cpu()
         if generator.shape != self._generator.get_state().shape:

@@ -39,6 +39,9 @@ class Episode:
         speed_mean: m/s.
         action_change_mean: mean norm of the change of the action from one control step to the next, in units of the
             action, whose four numbers lie in [−1, 1]; 0 of an episode of one step.
+        saturation_share: share of time in which a motor was to be at one of its limits.
+        thrust_shortfall: share of the collective thrust asked for that motors were not to give, by their limits or
+            because the mixer gave it up for rates.
         crash_gate: index of the gate that was next when the drone crashed, from 0; None if it did not.
     """
 
@@ -52,6 +55,8 @@ class Episode:
     speed_max: float
     speed_mean: float
     action_change_mean: float
+    saturation_share: float
+    thrust_shortfall: float
     crash_gate: int | None
 
 
@@ -157,6 +162,18 @@ class Evaluation:
         changes = sum(episode.action_change_mean * (episode.length - 1) for episode in self.episodes)
         return changes / max(1, sum(episode.length - 1 for episode in self.episodes))
 
+    @property
+    def saturation_share(self) -> float:
+        """Share of all time in which a motor was to be at one of its limits."""
+        flown = sum(episode.saturation_share * episode.length for episode in self.episodes)
+        return flown / sum(episode.length for episode in self.episodes)
+
+    @property
+    def thrust_shortfall(self) -> float:
+        """Mean share of the collective thrust asked for that motors were not to give, by episodes' lengths."""
+        missed = sum(episode.thrust_shortfall * episode.length for episode in self.episodes)
+        return missed / sum(episode.length for episode in self.episodes)
+
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """Put evaluations on tracks with the same number of gates together, in order."""
@@ -177,6 +194,8 @@ class Evaluation:
             "speed_mean",
             "gate_offset_mean",
             "action_change_mean",
+            "saturation_share",
+            "thrust_shortfall",
             "crashes",
             "crashes_by_gate",
             "timeout_rate",
@@ -209,6 +228,7 @@ class Evaluation:
             ("speed", f"max {self.speed_max:.1f} m/s, mean {self.speed_mean:.1f} m/s"),
             ("gate offset", f"mean {offset}"),
             ("action change", f"mean {self.action_change_mean:.3f} a step"),
+            ("motors", f"at a limit {self.saturation_share:.1%}, thrust missing {self.thrust_shortfall:.1%}"),
             ("return", f"{self.return_mean:.1f} ± {self.return_std:.1f}"),
         )
         return "\n".join(f"{name:<18} {value}" for name, value in rows)
@@ -278,7 +298,8 @@ def evaluate(
             value = value_function(acted[:recorded]) if value_function and recorder.running else None
             tensordict, following = env.step_and_maybe_reset(acted)
             action, action_before = _as_flown(tensordict["action"]), action
-            steps = _read_step(tensordict["next"], (action - action_before).norm(dim=-1, keepdim=True))
+            change = (action - action_before).norm(dim=-1, keepdim=True)
+            steps = _read_step(tensordict["next"], change, env.worlds.effort)
             before = sum(map(len, flown))
             for index, (log, step) in enumerate(zip(logs, steps, strict=True)):
                 if len(flown[index]) < shares[index]:
@@ -322,15 +343,17 @@ def _as_flown(action: Tensor) -> Tensor:
     return action.float().nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
 
 
-def _read_step(after: TensorDictBase, action_change: Tensor) -> list[dict[str, float]]:
+def _read_step(after: TensorDictBase, action_change: Tensor, effort: Tensor) -> list[dict[str, float]]:
     """Read what is measured in one step; one dictionary for each of the N environments, in one transfer.
 
     Args:
         after: what the step led to.
         action_change: norm of the change from the action before, (N, 1).
+        effort: of the motors, (N, 3), as `RaceWorlds.effort`.
     """
     columns = {
         "action_change": action_change,
+        **dict(zip(("saturated", "thrust_asked", "thrust_missing"), effort.split(1, dim=1), strict=True)),
         "target_gate": after["privileged", "target_gate"],
         "reward": after["reward"],
         "done": after["done"],
@@ -350,6 +373,13 @@ def _outcome(step: dict[str, float]) -> str | None:
     return FINISHED if step["finished"] else TIMEOUT
 
 
+_KEPT = (
+    "reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change", "saturated", "thrust_asked",
+    "thrust_missing",
+)  # fmt: skip
+"""What an episode is made of."""
+
+
 class _EpisodeLog:
     """Adds up one environment's steps to episodes."""
 
@@ -359,7 +389,7 @@ class _EpisodeLog:
 
     def add(self, step: dict[str, float]) -> list[Episode]:
         """Add one step; return the episode that it ended, if it did."""
-        for name in ("reward", "speed", "gates_passed", "gate_offset", "lap_time", "action_change"):
+        for name in _KEPT:
             self._values[name].append(step[name])
         outcome = _outcome(step)
         if outcome is None:
@@ -384,6 +414,8 @@ class _EpisodeLog:
             speed_max=max(speeds),
             speed_mean=_mean(speeds),
             action_change_mean=_mean(changes) if changes else 0.0,
+            saturation_share=_mean(values["saturated"]),
+            thrust_shortfall=sum(values["thrust_missing"]) / max(sum(values["thrust_asked"]), 1e-9),
             crash_gate=int(step["target_gate"]) if outcome in CRASHES else None,
         )
         return [episode]

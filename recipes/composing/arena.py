@@ -91,6 +91,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
             start_at_gate=env.start_at_gate,
             start_on_line=env.start_on_line,
             miss_radius=env.miss_radius,
+            action_change_weight=env.action_change_weight,
             looks=env.looks,
             seed=config.seed,
             num_threads=num_threads,

@@ -63,6 +63,7 @@ RACE_ONLY = (
     "env.start_at_gate",
     "env.start_on_line",
     "env.miss_radius",
+    "env.action_change_weight",
     "env.preset",
     "env.camera_tilt",
     "env.renderer",

@@ -42,6 +42,8 @@ class EnvConfig:
     start_on_line: float = setting(0.0, SHARE)
     # m; training episodes end where a gate is missed by less than this; 0: they go on
     miss_radius: float = setting(0.0, NOT_NEGATIVE)
+    # b3, penalty in training for each unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
+    action_change_weight: float = setting(0.0, NOT_NEGATIVE)
     # of the worlds, to train and to be evaluated in: cpu | cuda | auto, which takes the learner's where it can
     device: str = "auto"
     renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp

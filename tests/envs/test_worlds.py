@@ -41,6 +41,33 @@ def test_no_gradient_goes_back_to_the_action(preset: str) -> None:
     assert not any(tensor.requires_grad for tensor in kept)
 
 
+def test_changes_of_action_cost_what_they_are_weighed_with_but_not_over_a_reset() -> None:
+    weight, actions = 0.1, 0.5 * torch.rand(4, 2, 4, generator=torch.Generator().manual_seed(0)) - 0.5
+    plain, weighed = (
+        RaceWorlds("circle", 2, from_pixels=False, seed=0, action_change_weight=value) for value in (0.0, weight)
+    )
+    plain.reset()
+    weighed.reset()
+    for step, action in enumerate(actions):
+        expected = plain.step(action).reward_base
+        if step:
+            expected = expected - weight * (action - actions[step - 1]).square().sum(1)
+        torch.testing.assert_close(weighed.step(action).reward_base, expected)
+    mask = torch.tensor([True, False])
+    plain.reset(mask)
+    weighed.reset(mask)
+    lost = plain.step(actions[0]).reward_base - weighed.step(actions[0]).reward_base
+    torch.testing.assert_close(
+        lost, torch.stack((torch.zeros(()), weight * (actions[0, 1] - actions[3, 1]).square().sum()))
+    )
+    other = RaceWorlds("circle", 2, from_pixels=False, seed=1, action_change_weight=weight)
+    other.load_state_dict(weighed.state_dict())
+    assert torch.equal(other.step(actions[1]).reward_base, weighed.step(actions[1]).reward_base)
+    assert (
+        RaceWorlds("circle", from_pixels=False, evaluation=True, action_change_weight=1.0).action_change_weight == 0.0
+    )
+
+
 @pytest.mark.parametrize(("lives", "acts"), [("cuda:0", "cuda:1"), ("cuda:0", "cpu"), ("cpu", "cuda:0")])
 def test_an_action_on_another_device_is_refused(lives: str, acts: str) -> None:
     worlds = RaceWorlds("circle", 2, from_pixels=False, seed=0)

@@ -32,7 +32,8 @@ class ScriptedRace(EnvBase):
         self.script = script
         parameters, track = SimpleNamespace(control_dt=DT), SimpleNamespace(num_gates=3)
         camera = SimpleNamespace(tilt=30.0)
-        self.worlds = SimpleNamespace(evaluation=True, parameters=parameters, track=track, camera=camera)
+        effort = torch.tensor([[0.25, 8.0, 2.0]]).repeat(len(script), 1)
+        self.worlds = SimpleNamespace(evaluation=True, parameters=parameters, track=track, camera=camera, effort=effort)
         n = self.batch_size
         self.action_spec = Bounded(-1.0, 1.0, (*n, 4))
         self.reward_spec = Unbounded((*n, 1))
@@ -163,6 +164,26 @@ def test_crashes_by_gate():
         "ground": [0, 4, 0],
         "gate_frame": [2, 0, 0],
     }
+
+
+def test_motors_at_their_limits_by_hand():
+    result = evaluate(ScriptedRace(SCRIPT), idle(), 4)
+    assert [episode.saturation_share for episode in result.episodes] == [0.25] * 4
+    assert (result.saturation_share, result.thrust_shortfall) == pytest.approx((0.25, 0.25))
+    assert result.to_dict()["thrust_shortfall"] == pytest.approx(0.25)
+
+
+def full_roll(position: torch.Tensor) -> torch.Tensor:
+    return torch.tensor([[1.0, 1.0, 0.0, 0.0]])
+
+
+def test_a_hover_is_within_the_motors_limits_and_full_roll_at_full_thrust_is_not():
+    for preset in ("easy", "betaflight"):
+        env = race(1, preset=preset, episode_steps=20)
+        calm = evaluate(env, hover(env), 1)
+        assert (calm.saturation_share, calm.thrust_shortfall) == pytest.approx((0.0, 0.0), abs=2e-3)  # a µs of throttle
+        rolled = evaluate(env, TensorDictModule(full_roll, [STATE_KEY], ["action"]), 1)
+        assert rolled.saturation_share > 0.2 and rolled.thrust_shortfall > 0.02
 
 
 def test_action_change_by_hand():

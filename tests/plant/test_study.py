@@ -36,6 +36,12 @@ def test_what_ends_at_once_is_said_and_repeats():
 
 
 @pytest.mark.slow
+def test_the_pilot_finishes_through_the_rate_loop_of_a_betaflight():
+    flown = fly(PilotFlyer(load_track("circle"), "betaflight"), "circle", "betaflight", "mass", 1.0, 0)
+    assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0
+
+
+@pytest.mark.slow
 def test_the_pilot_finishes_with_ten_percent_more_mass():
     flown = fly(PilotFlyer(load_track("circle"), "faithful"), "circle", "faithful", "mass", 1.1, 0)
     assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0

@@ -45,6 +45,11 @@ class Quadrotor:
         dtype: floating-point type; MuJoCo's own (float64) on CPU.
         generator: source of the per-episode randomisation, on `device`; needed only if parameters are randomised.
 
+    Attributes:
+        effort: (N, 3) of the control step so far: share of its physics steps in which a rotor was to be at a limit,
+            collective thrust asked for, and what of it rotors were not to give for the sake of rates or by their
+            limits, both in N on average.
+
     Example:
         >>> quadrotor = Quadrotor(QuadrotorParameters(), num_drones=2)
         >>> quadrotor.command(torch.zeros(2, 4))
@@ -99,6 +104,9 @@ class Quadrotor:
         self._hover_setpoint = tensor((p.mass * GRAVITY, 0.0, 0.0, 0.0))
         self.setpoints = self._hover_setpoint.repeat(history + 1, num_drones, 1)  # newest first (history + 1, N, 4)
         self._drones = self._nominal_drones() if p.randomisation or history else None
+        idle = 0.0 if p.betaflight is None else p.betaflight.motor_idle
+        self.thrust_min = p.rotor_thrust_max * idle**2  # N, of a rotor
+        self.effort = torch.zeros(num_drones, 3, device=device, dtype=dtype)
         self.rate_loop = None if p.betaflight is None else RateLoop(p, num_drones, device, dtype)
         self._lag_of_thrust = p.motor_lag_of == "thrust"
         if self.rate_loop is not None:
@@ -224,11 +232,20 @@ class Quadrotor:
         else:
             commands = self.rate_loop.motor_commands(setpoint, body_rates)
             target = commands * math.sqrt(self.parameters.rotor_thrust_max)
+        self._note_effort(physics_step, setpoint[:, :1], target.square())
         thrusts = self._turn_rotors(target)
         wrench = _product(thrusts, self._effectiveness)
         if self._has_drag or self._drones is not None:
             wrench = self._perturb(wrench, attitude, linear_velocity, body_rates, gyroscopic)
         return wrench
+
+    def _note_effort(self, physics_step: int, asked: Tensor, targets: Tensor) -> None:
+        """Add a physics step, in which thrusts (N, 4) were chosen for a collective one (N, 1), to `effort`."""
+        low, high = targets.aminmax(dim=1, keepdim=True)
+        at_limit = (low <= self.thrust_min + 1e-6) | (high >= self.parameters.rotor_thrust_max - 1e-6)
+        missing = (asked - targets.sum(1, keepdim=True)).clamp(min=0.0)
+        new = torch.cat((at_limit.to(asked), asked, missing), dim=1) / self.parameters.physics_steps
+        self.effort.copy_(new if physics_step == 0 else self.effort + new)
 
     def _turn_rotors(self, target: Tensor) -> Tensor:
         """Let rotors follow target speeds (N, 4) in √N for a physics step; return their thrusts in its middle, N."""

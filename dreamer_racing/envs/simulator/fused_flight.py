@@ -69,6 +69,7 @@ class FusedFlight:
         constants = _constants(quadrotor, kernels.constants)
         constants.firmware = fused_rate_loop.fill(quadrotor.rate_loop, kernels.firmware)
         force, saved, path = (warp.from_torch(tensor) for tensor in (qfrc_applied, before, self._path))
+        effort = warp.from_torch(quadrotor.effort)
         with scope(self._device):
             self._push, self._settle = (
                 [
@@ -76,7 +77,7 @@ class FusedFlight:
                     for index in range(steps)
                 ]
                 for kernel, inputs in (
-                    (kernels.push, [*arrays, *own, force, saved]),
+                    (kernels.push, [*arrays, *own, effort, force, saved]),
                     (kernels.settle, [*arrays[:2], saved, path]),
                 )
             )
@@ -106,7 +107,7 @@ def _constants(quadrotor: Quadrotor, struct: Any) -> Any:
     constants.oldest = len(quadrotor.setpoints) - 1
     constants.perturbed = int(any(p.drag) or p.randomisation is not None)
     constants.corrected = int(p.integrator != "RK4")
-    constants.limit = p.rotor_thrust_max
+    constants.limit, constants.low = p.rotor_thrust_max, quadrotor.thrust_min
     constants.decay, constants.decay_half = quadrotor.motor_decay, quadrotor.motor_decay**0.5
     constants.half_step = 0.5 * p.physics_dt
     constants.rate_gain = p.rate_gain
@@ -141,6 +142,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         perturbed: int  # whether there is drag, or drones have parameters of their own
         corrected: int  # whether MuJoCo's step is of first order
         limit: real  # N, of a rotor
+        low: real  # N
         decay: real  # of rotor speed towards its target, in a physics step
         decay_half: real
         half_step: real  # s
@@ -195,6 +197,20 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         return thrusts
 
     @wp.func
+    def note_effort(c: Constants, i: int, step: int, asked: real, target: vec4, effort: wp.array2d(dtype=real)):
+        share = real(1.0) / real(c.physics_steps)
+        at_limit = real(0.0)
+        if wp.min(target) <= c.low + real(1.0e-6) or wp.max(target) >= c.limit - real(1.0e-6):
+            at_limit = real(1.0)
+        missing = wp.max(asked - (target[0] + target[1] + target[2] + target[3]), real(0.0))
+        if step == 0:
+            for column in range(3):
+                effort[i, column] = real(0.0)
+        effort[i, 0] = effort[i, 0] + share * at_limit
+        effort[i, 1] = effort[i, 1] + share * asked
+        effort[i, 2] = effort[i, 2] + share * missing
+
+    @wp.func
     def turn_rotors(
         c: Constants,
         i: int,
@@ -244,6 +260,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         delay_steps: wp.array(dtype=wp.int64),
         memory: wp.array2d(dtype=vec3),
         own: wp.array2d(dtype=vec3),
+        effort: wp.array2d(dtype=real),
         qfrc_applied: wp.array2d(dtype=real),
         before: wp.array2d(dtype=real),
     ):
@@ -253,7 +270,6 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         wanted = vec3(setpoints[age, i, 1], setpoints[age, i, 2], setpoints[age, i, 3])
         w, v = qpos[i, 3], vec3(qpos[i, 4], qpos[i, 5], qpos[i, 6])
         rates = vec3(qvel[i, 3], qvel[i, 4], qvel[i, 5])
-
         speed = vec4(rotor_speed[i, 0], rotor_speed[i, 1], rotor_speed[i, 2], rotor_speed[i, 3])
         decay, decay_half, sag = real(c.decay), real(c.decay_half), real(0.0)
         target = vec4()  # thrusts
@@ -266,6 +282,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
             middle_rates = half_a_step_later(c, rates, torque_of(c, wp.cw_mul(speed, speed)))
             torque = gyroscopic(c, middle_rates) + c.rate_gain * wp.cw_mul(c.inertia, wanted - middle_rates)
             target = mix(c, setpoints[age, i, 0], torque)
+        note_effort(c, i, physics_step, setpoints[age, i, 0], target, effort)
         thrusts = turn_rotors(c, i, target, speed, decay, decay_half, rotor_speed)
         load = real(0.25) * (thrusts[0] + thrusts[1] + thrusts[2] + thrusts[3]) / c.limit
         thrusts = (real(1.0) - sag * load) * thrusts
@@ -273,8 +290,7 @@ def make_kernels(dtype: torch.dtype) -> Kernels:
         torque = torque_of(c, thrusts)
 
         if c.perturbed != 0:
-            velocity = rotate(w, -v, vec3(qvel[i, 0], qvel[i, 1], qvel[i, 2]))
-            gravity = rotate(w, -v, c.gravity)
+            velocity, gravity = rotate(w, -v, vec3(qvel[i, 0], qvel[i, 1], qvel[i, 2])), rotate(w, -v, c.gravity)
             force = own_force(c, thrust_factor[i, 0] * force, velocity, rates, gravity, mass[i, 0], drag[i, 0])
             torque = thrust_factor[i, 0] * vec3(torque[0], torque[1], torque_factor[i, 0] * torque[2])
             torque = own_torque(c, torque, rates, vec3(inertia[i, 0], inertia[i, 1], inertia[i, 2]))

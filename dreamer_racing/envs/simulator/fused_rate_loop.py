@@ -4,7 +4,7 @@
 """
 
 # warp reads annotations, which are no types to mypy, as they are: no `from __future__ import annotations` here
-# mypy: disable-error-code="valid-type,index,no-untyped-def"
+# mypy: disable-error-code="valid-type,index,no-untyped-def,operator"
 
 from functools import cache
 from typing import Any, NamedTuple

@@ -60,9 +60,11 @@ def test_kernels_do_what_torch_does(parameters: QuadrotorParameters) -> None:
         for one, expected in (
             (ours.force, theirs.force), (ours.qpos, theirs.qpos), (ours.qvel, theirs.qvel),
             (quadrotor.rotor_speed, reference.rotor_speed), (flown, torch.stack(path)),
+            (quadrotor.effort, reference.effort),
         ):  # fmt: skip
             # the square root of a rotor thrust of 0 plus a rounding error of 1e-17 N is 3e-9
             torch.testing.assert_close(one, expected, rtol=1e-7, atol=1e-7)
+    assert (quadrotor.effort.amin(0) >= 0.0).all() and (quadrotor.effort.amax(0) > 0.2).all()
     assert (quadrotor.rotor_speed < 0.3).any()  # some rotors were at their limits
     assert (quadrotor.rotor_speed > 1.9).any()
 
