@@ -31,7 +31,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.settings import check_numbers, quoted, without_none
+from dreamer_racing.settings import NOT_NEGATIVE, check_numbers, check_setting, quoted, without_none
 
 ACTION_SIZE = 4
 START_LINE = LineLimits(speed=0.7)
@@ -147,10 +147,7 @@ class RaceWorlds:
         self._process, self._from_pixels = os.getpid(), from_pixels
         self.track, self.evaluation = load_track(track), evaluation
         self.num_envs = num_envs = int(num_envs)
-        self.parameters = load_preset(preset)
-        if control_rate is not None:
-            check_numbers({}, {"control_rate": control_rate})
-            self.parameters = at_control_rate(self.parameters, control_rate)
+        self.parameters = _load_parameters(preset, control_rate)
         interval = frame_interval(self.camera, 1.0 / self.parameters.control_dt)
         self._generator = torch.Generator(device)
         self.seed(seed)
@@ -168,9 +165,7 @@ class RaceWorlds:
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
-        check_numbers({}, {"action_change_weight": action_change_weight})
-        self.action_change_weight = 0.0 if evaluation else float(action_change_weight)
-        self._last_action = torch.zeros(num_envs, ACTION_SIZE, device=self.device)
+        self._weigh_changes(action_change_weight)
         self.race_vector = RaceVector(self.track, self.device, self.dtype)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
@@ -194,6 +189,12 @@ class RaceWorlds:
             device=self.device,  # in float32: a micrometre is enough for gates, at half the time
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
+
+    def _weigh_changes(self, weight: float) -> None:
+        """Set b₃, which is of training alone, and what the changes of the first actions are counted from."""
+        check_setting("action_change_weight", weight, NOT_NEGATIVE)
+        self.action_change_weight = 0.0 if self.evaluation else float(weight)
+        self._last_action = torch.zeros(self.num_envs, ACTION_SIZE, device=self.device)
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
@@ -448,6 +449,15 @@ class RaceWorlds:
         self._images = None
         if os.getpid() == self._process:
             self.simulator.close()
+
+
+def _load_parameters(preset: str | QuadrotorParameters, control_rate: float | None) -> QuadrotorParameters:
+    """Return the drone of a preset, with so many actions a second."""
+    parameters = load_preset(preset)
+    if control_rate is None:
+        return parameters
+    check_numbers({}, {"control_rate": control_rate})
+    return at_control_rate(parameters, control_rate)
 
 
 def _check_arguments(num_envs: int, whole: Mapping[str, object]) -> None:
