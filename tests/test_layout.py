@@ -93,7 +93,7 @@ def test_functions_are_short(folder):
     """But for kernels, which warp compiles whole, and the loops of recipes, which read top to bottom."""
     whole = re.compile(r"make_kernels$|^recipes/\w+\.py: train$")
     lengths = {name: length(function) for name, function in functions(folder) if not whole.search(name)}
-    assert {name: lines for name, lines in lengths.items() if lines > 60} == {}
+    assert {name: lines for name, lines in lengths.items() if lines > (80 if "/learners/" in name else 60)} == {}
     assert sorted(lengths.values())[int(0.9 * len(lengths))] <= 24
 
 
