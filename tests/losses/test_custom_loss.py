@@ -46,7 +46,7 @@ def test_a_target_is_learned_beside_others(my_losses):
 def test_the_target_is_what_its_text_says(my_losses):
     """The prior after three blind steps, by hand; nothing is compared across a reset."""
     learner = learner_of(seed=0, world_model="my_losses:Overshooting", free_nats=0.0)
-    batch = make_batch(batch=2, time=16)
+    batch = make_batch(time=16)
     batch["is_init"] = torch.zeros_like(batch["is_init"])
     batch["is_init"][:, 7] = True
     model = learner.agent.world_model
@@ -63,7 +63,7 @@ def test_the_target_is_what_its_text_says(my_losses):
     counted = [value for start, value in enumerate(kl) if not start < 7 <= start + 3]
     losses, _ = learner.world_model_loss(batch)
     torch.testing.assert_close(losses["overshooting_kl"], torch.stack(counted).mean())
-    torch.testing.assert_close(losses["loss_overshooting"], 0.3 * torch.stack(counted).sum() / (13 * 2))
+    torch.testing.assert_close(losses["loss_overshooting"], 0.3 * torch.stack(counted).sum() / (13 * 3))
     losses["loss_overshooting"].backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in rssm.prior.parameters())
     assert all(parameter.grad is None for parameter in model.reward_head.parameters())
