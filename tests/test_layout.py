@@ -90,11 +90,26 @@ def length(function: ast.FunctionDef) -> int:
 
 @pytest.mark.parametrize("folder", ["dreamer_racing", "recipes"])
 def test_functions_are_short(folder):
-    """But for kernels, which warp compiles whole, and the loops of recipes, which read top to bottom."""
+    """But for kernels, which warp compiles whole, and what reads top to bottom: a recipe's loop, an update's maths."""
     whole = re.compile(r"make_kernels$|^recipes/\w+\.py: train$")
     lengths = {name: length(function) for name, function in functions(folder) if not whole.search(name)}
-    assert {name: lines for name, lines in lengths.items() if lines > (80 if "/learners/" in name else 60)} == {}
+    algorithm = re.compile(r"learners/\w+\.py: (compute_losses|update_actor)$")
+    limits = {name: 80 if algorithm.search(name) else 60 for name in lengths}
+    assert {name: lines for name, lines in lengths.items() if lines > limits[name]} == {}
     assert sorted(lengths.values())[int(0.9 * len(lengths))] <= 24
+
+
+def test_no_class_of_a_learner_or_loss_has_a_grandparent_of_ours():
+    """Data goes through arguments and return values, not through hooks of a chain of classes."""
+    bases: dict[str, list[str]] = {}
+    for folder in ("losses", "learners", "modules", "experience", "training"):
+        for path in sorted((PACKAGE / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    bases[node.name] = [base.id for base in node.bases if isinstance(base, ast.Name)]
+    assert {"DreamerV3", "LatentPPO", "Image"} <= bases.keys()
+    ours = {name: [base for base in of if base in bases] for name, of in bases.items()}
+    assert [name for name, of in ours.items() if any(ours[base] for base in of)] == []
 
 
 def test_few_plain_modules_stand_at_the_top():
