@@ -2,7 +2,7 @@
 
     python benchmarks/collection_on_ray.py --json results/collection_on_ray.json
 
-Every way collects as `recipes/dreamer_v3.py track=circle tuned=race` does, and nothing is learned meanwhile, in turns:
+Every way collects as `recipes/latent_ppo.py track=circle tuned=race` does, and nothing is learned meanwhile, in turns:
 in this process with all its cores; by one process with one thread and as few worlds as a worker has; by so many of
 those at once, which share nothing, and so do what the machine can; and by so many workers with one thread each on a Ray
 cluster on this machine. `env_steps_per_s` is the median of `--rounds`; `least` and `most` are those of a round;
@@ -29,12 +29,12 @@ from omegaconf import OmegaConf
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-import dreamer_v3
+import latent_ppo
 from composing.arena import make_env
 from composing.building import make_collector
 from composing.learners import make_learner
 from composing.options import CONFIG_DIR
-from composing.schema import CollectorKind, DreamerConfig
+from composing.schema import CollectorKind, WorldModelRunConfig
 from composing.workers import make_own_env, make_rollouts
 
 from dreamer_racing.experience.ray_rollouts import RayRollouts
@@ -111,13 +111,13 @@ def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
     ]
 
 
-def composed(overrides: Sequence[str]) -> DreamerConfig:
+def composed(overrides: Sequence[str]) -> WorldModelRunConfig:
     """The recipe's configuration."""
     given = ["track=circle", "device=cpu", "tuned=race", "run_dir=unused", *overrides]
     with hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
-        config = dreamer_v3.resolve(hydra.compose("dreamer_v3", overrides=given))
+        config = latent_ppo.resolve(hydra.compose("latent_ppo", overrides=given))
     made = OmegaConf.to_object(config)
-    assert isinstance(made, DreamerConfig)
+    assert isinstance(made, WorldModelRunConfig)
     return made
 
 
@@ -144,7 +144,7 @@ def begin_together(barrier: Any) -> None:
     keep_freed_memory()
 
 
-def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
+def collect_alone(config: WorldModelRunConfig, seconds: float) -> dict[str, float]:
     """Collect with one thread, at the same time as the other processes."""
     env = make_env(config, num_threads=1)
     learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
@@ -162,7 +162,7 @@ def collect_alone(config: DreamerConfig, seconds: float) -> dict[str, float]:
     return found(config, rounds, taken)
 
 
-def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
+def collect(config: WorldModelRunConfig, seconds: float) -> dict[str, float]:
     """Collect as the recipe does, with or without workers."""
     env = make_own_env(config)
     learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
@@ -185,7 +185,7 @@ def collect(config: DreamerConfig, seconds: float) -> dict[str, float]:
     return found(config, rounds, taken) | of_workers
 
 
-def found(config: DreamerConfig, rounds: int, taken: float) -> dict[str, float]:
+def found(config: WorldModelRunConfig, rounds: int, taken: float) -> dict[str, float]:
     """What so many rounds say, where they are flown by this process with weights of the last update."""
     frames = config.env.num_envs * config.rollout_steps
     return {

@@ -222,7 +222,7 @@ def train_jobs(device: str, tiny: bool, runs: Path) -> Commands:
         begin += ["model=debug", "model.batch_size=4", "env.num_envs=4", "env.start_on_line=0", "budget=smoke"]
         begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0", "loss.ppo.steps=128"]
     begun = any((run_dir / "checkpoints").glob("checkpoint-*"))
-    yield "kidney", 3600.0, ["recipes/dreamer_v3.py", *([f"resume={run_dir}"] if begun else begin)]
+    yield "kidney", 3600.0, ["recipes/latent_ppo.py", *([f"resume={run_dir}"] if begun else begin)]
 
 
 STAGES: dict[str, Callable[[str, bool, Path], Commands]] = {
@@ -340,7 +340,7 @@ def measure_smoke(device: str, tiny: bool, place: str) -> dict[str, Any]:
     steps = 600 if tiny else 1200
     settings = ["budget=smoke", "track=circle", f"device={device}", f"run_dir={place}", "evaluation.every=0"]
     for overrides in ([*settings, f"total_env_steps={steps}"], [f"resume={place}", f"total_env_steps={steps + 200}"]):
-        subprocess.run([sys.executable, "recipes/dreamer_v3.py", *overrides], check=True, stdout=sys.stderr)
+        subprocess.run([sys.executable, "recipes/latent_ppo.py", *overrides], check=True, stdout=sys.stderr)
     return {"env_steps": steps + 200}
 
 

@@ -32,7 +32,7 @@ from measuring import print_table, write_json
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
-from trained import DreamerConfig, Trained, fly, restore, restore_replay, size_of, worlds_of
+from trained import Trained, WorldModelRunConfig, fly, restore, restore_replay, size_of, worlds_of
 
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
@@ -181,7 +181,9 @@ def linear_share(learned: Shown, measured: Shown) -> float:
     return (error / truth.var(0).mean()).item()
 
 
-def fresh(config: DreamerConfig, size: ModelSize, interface: Interface) -> tuple[WorldModelLoss, torch.optim.Optimizer]:
+def fresh(
+    config: WorldModelRunConfig, size: ModelSize, interface: Interface
+) -> tuple[WorldModelLoss, torch.optim.Optimizer]:
     """Make a world-model loss of initial weights, and what trains it."""
     losses = DreamerV3Losses(**{field.name: getattr(config.loss, field.name) for field in fields(LossConfig)})
     learner = DreamerV3.make(size, interface, losses, config.model, seed=0)
@@ -199,13 +201,13 @@ def flat(latents: Latents) -> Tensor:
     return latents.features.detach().float().flatten(0, 1)
 
 
-def varied(config: DreamerConfig, variant: str) -> tuple[DreamerConfig, ModelSize]:
+def varied(config: WorldModelRunConfig, variant: str) -> tuple[WorldModelRunConfig, ModelSize]:
     """Return the settings of a variant, and the size of its networks."""
     overrides = variant.split()
     of_size = [override.removeprefix("size.") for override in overrides if override.startswith("size.")]
     others = [override for override in overrides if not override.startswith("size.")]
     merged = OmegaConf.merge(OmegaConf.structured(config), OmegaConf.from_dotlist(others))
-    changed = cast(DreamerConfig, OmegaConf.to_object(merged))
+    changed = cast(WorldModelRunConfig, OmegaConf.to_object(merged))
     numbers = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.from_dotlist(of_size)))
     return changed, replace(size_of(changed), **numbers)
 

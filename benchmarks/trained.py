@@ -15,7 +15,7 @@ from composing.building import make_curriculum, make_run_replay
 from composing.learners import size_of
 from composing.restoring import restore_learner
 from composing.saved import trained_config
-from composing.schema import DreamerConfig
+from composing.schema import WorldModelRunConfig
 
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.update import WorldModelLearner
@@ -23,13 +23,13 @@ from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.training.checkpoint import load_components
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 
-__all__ = ["DreamerConfig", "Trained", "fly", "make_env", "restore", "restore_replay", "size_of", "worlds_of"]
+__all__ = ["Trained", "WorldModelRunConfig", "fly", "make_env", "restore", "restore_replay", "size_of", "worlds_of"]
 
 
 class Trained(NamedTuple):
     """A run's settings for a CPU, its learner with the trained weights (not the averaged ones), and where it was."""
 
-    config: DreamerConfig
+    config: WorldModelRunConfig
     learner: WorldModelLearner
     checkpoint: Path
     where: dict[str, Any]
@@ -44,7 +44,7 @@ def restore(path: str) -> Trained:
     checkpoint = latest_checkpoint(path)
     run = RunDirectory.of(checkpoint)
     config = trained_config(run.path)
-    if not isinstance(config, DreamerConfig):
+    if not isinstance(config, WorldModelRunConfig):
         raise SystemExit(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
     config.device, config.replay.device = "cpu", "auto"
     learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
@@ -52,7 +52,7 @@ def restore(path: str) -> Trained:
     return Trained(config, cast(WorldModelLearner, learner), checkpoint, where)
 
 
-def restore_replay(trained: Trained, config: DreamerConfig | None = None) -> StreamReplay:
+def restore_replay(trained: Trained, config: WorldModelRunConfig | None = None) -> StreamReplay:
     """Bring back the replay of a checkpoint that holds one (not `best/`), sampled as the run, or `config`, does."""
     config = config or trained.config
     settings, curriculum = config.replay, make_curriculum(config)

@@ -15,7 +15,7 @@ sys.path.append(str(RECIPES))  # where the next one is found
 from composing.options import Option, common_options, options  # noqa: E402
 
 PAGE = Path(__file__).with_name("options.md")
-FIRST = ("dreamer_v3", "ppo", "sac", "experiment", "evaluate", "perception", "export", "plot")
+FIRST = ("dreamer_v3", "latent_ppo", "ppo", "sac", "experiment", "evaluate", "perception", "export", "plot")
 HEAD = """# Options
 
 Made by `python docs/options.py` from [recipes/composing/schema.py](../recipes/composing/schema.py) and the recipes:

@@ -25,7 +25,7 @@ from composing.command_line import as_override, override_key, override_value, pl
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import read_yaml, trained_config
-from composing.schema import DreamerConfig, ExportConfig, is_race, register
+from composing.schema import ExportConfig, WorldModelRunConfig, is_race, register
 from composing.usage import command
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import set_num_threads
@@ -86,7 +86,7 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = find_trained(config.checkpoint)
     trained = trained_config(config_folder(checkpoint))
-    if not isinstance(trained, DreamerConfig):
+    if not isinstance(trained, WorldModelRunConfig):
         raise ValueError(f"{checkpoint} was trained by {trained.algorithm}; this recipe exports actors of dreamer_v3.")
     if not is_race(trained):
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
@@ -113,7 +113,7 @@ def export(config: ExportConfig) -> None:
 
 
 def prepare(
-    config: ExportConfig, trained: DreamerConfig, checkpoint: Path
+    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path
 ) -> tuple[ActorStep, dict[str, Any], RecordedFlight]:
     """Restore the policy, fly it, and describe the step that is to be exported."""
     env = DroneRacingEnv(
@@ -177,7 +177,7 @@ def check_agent(config: ExportConfig, checkpoint: Path) -> None:
 
 
 def describe(
-    config: ExportConfig, trained: DreamerConfig, checkpoint: Path, step: ActorStep, contract: dict[str, Any]
+    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, step: ActorStep, contract: dict[str, Any]
 ) -> dict[str, Any]:
     """Return what agent.json says: where the agent comes from, and how well it flies."""
     source = contract["source"]
@@ -210,7 +210,7 @@ def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
     ]
 
 
-def training_command(trained: DreamerConfig, checkpoint: Path) -> str | None:
+def training_command(trained: WorldModelRunConfig, checkpoint: Path) -> str | None:
     """Return the command that trains such an agent, without what is of one machine; None if the run did not keep it."""
     path = RunDirectory(config_folder(checkpoint)).run.overrides
     if not path.exists():
@@ -227,7 +227,7 @@ def without_machine(overrides: Iterable[str]) -> list[str]:
 
 
 def read_evaluation(
-    config: ExportConfig, trained: DreamerConfig, checkpoint: Path, weights_sha256: str
+    config: ExportConfig, trained: WorldModelRunConfig, checkpoint: Path, weights_sha256: str
 ) -> dict[str, Any]:
     """Return the statistics of an evaluation of these weights on the track that they were trained on.
 
@@ -270,7 +270,7 @@ def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> P
     return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
 
 
-def write_agent(folder: Path, trained: DreamerConfig, about: dict[str, Any]) -> None:
+def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any]) -> None:
     """Write configuration and agent.json, the latter last: with it the folder is an agent."""
     (folder / AGENT).unlink(missing_ok=True)
     env, track = replace(trained.env, device="cpu"), Path(trained.track).name  # a file's place is of this machine

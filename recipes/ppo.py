@@ -11,18 +11,17 @@ from typing import cast
 
 from composing.arena import make_env
 from composing.building import (
-    adapt_rewards,
+    Rewards,
     make_collector,
-    make_curriculum,
     make_run_evaluator,
     make_tracker,
-    resolve_baseline,
     seed_generators,
 )
 from composing.checks import check_ppo
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
+from composing.resolving import resolve_baseline
 from composing.schema import PPORunConfig, register
 from omegaconf import DictConfig
 
@@ -54,20 +53,20 @@ def train(config: PPORunConfig, session: Session) -> None:
     learner = cast(PPOLearner, make_learner(config, Interface.of(env), config.device))
     seed_generators(config.seed)
     rollouts = Rollouts(make_collector(config, env, learner.policy()))
-    curriculum = make_curriculum(config)
+    rewards = Rewards(config, env)
     session.track(
         learner=learner,
         env=env,
         rollouts=rollouts,
         evaluator=make_run_evaluator(config, session.directory.path, learner),
         tracker=make_tracker(config),
-        **({"curriculum": curriculum} if curriculum else {}),
+        curriculum=rewards,
     )
 
     for rollout in session.rollouts():
         if rollout is not None:
             # Every rollout is learned from in some epochs, and forgotten.
-            session.log(adapt_rewards(env, curriculum, session.log_episodes(rollout)))
+            session.log(rewards.adapt(session.log_episodes(rollout)))
             session.log(learner.update(rollout, session.timed))
             session.counters["updates"] = learner.updates
         if session.due("evaluate"):

@@ -11,19 +11,18 @@ from typing import cast
 
 from composing.arena import make_env
 from composing.building import (
-    adapt_rewards,
+    Rewards,
     make_collector,
-    make_curriculum,
     make_run_evaluator,
     make_run_replay,
     make_tracker,
-    resolve_baseline,
     seed_generators,
 )
 from composing.checks import check_sac
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
+from composing.resolving import resolve_baseline
 from composing.schema import SACRunConfig, register
 from omegaconf import DictConfig
 
@@ -56,8 +55,8 @@ def train(config: SACRunConfig, session: Session) -> None:
     learner = cast(SACLearner, make_learner(config, Interface.of(env), config.device))
     seed_generators(config.seed)
     rollouts = Rollouts(make_collector(config, env, learner.policy()))
-    curriculum = make_curriculum(config)
-    replay = make_run_replay(config, env, curriculum, config.sac.batch_size, TRANSITION)
+    rewards = Rewards(config, env)
+    replay = make_run_replay(config, env, rewards, config.sac.batch_size, TRANSITION)
     ratio = config.make_replay_ratio()
     session.track(
         learner=learner,
@@ -67,13 +66,13 @@ def train(config: SACRunConfig, session: Session) -> None:
         tracker=make_tracker(config),
         replay=replay,
         ratio=ratio,
-        **({"curriculum": curriculum} if curriculum else {}),
+        curriculum=rewards,
     )
 
     for rollout in session.rollouts():
         if rollout is not None:
             replay.extend(rollout)
-            session.log(adapt_rewards(env, curriculum, session.log_episodes(rollout)))
+            session.log(rewards.adapt(session.log_episodes(rollout)))
         for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
             with session.timed("sample"):
                 batch = replay.sample()

@@ -22,7 +22,7 @@ from tests.forked import recipe, started  # noqa: F401 - for tests, beside the r
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "recipes" / "config"
-EXPERIMENTS = ("ablation", "crutches")
+EXPERIMENTS = ("ablation", "race_ablation")
 """Configurations of `recipes/experiment.py`, beside the one of its name."""
 
 SMALL = [
@@ -84,10 +84,10 @@ def prepared(*overrides: str, name: str = "dreamer_v3") -> Session:
     return session
 
 
-def build(*overrides: str) -> None:
-    """Resolve a configuration and make all parts of a run, as `recipes/dreamer_v3.py` does, in this process."""
+def build(*overrides: str, name: str = "dreamer_v3") -> None:
+    """Resolve a configuration and make all parts of a run, as a recipe does, in this process."""
     with recipe_module("composing.command_line").plain_errors():
-        prepared("model=debug", "env.from_pixels=false", *overrides).close()
+        prepared("model=debug", "env.from_pixels=false", *overrides, name=name).close()
 
 
 def free_port() -> int:

@@ -24,7 +24,12 @@ from dreamer_racing.figures.curves import ALL_TRACKS, ENDS_EARLY, QUANTITIES, Cu
 from dreamer_racing.figures.drawing import INK, MUTED, NOTE_LETTERS, dress, save
 from dreamer_racing.figures.runs import CurveKey, axis_of
 
-ALGORITHMS = {"dreamer_v3": ("DreamerV3", "#1c7ed6"), "ppo": ("PPO", "#f76707"), "sac": ("SAC", "#e03131")}
+ALGORITHMS = {
+    "dreamer_v3": ("DreamerV3", "#1c7ed6"),
+    "latent_ppo": ("Latent PPO", "#2f9e44"),
+    "ppo": ("PPO", "#f76707"),
+    "sac": ("SAC", "#e03131"),
+}
 """Names and the paper's colours; another algorithm is drawn in grey under its own name."""
 TRACKS = ("circle", "kidney", "figure8")  # columns of the paper, in its order; others follow
 VARIANT_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))

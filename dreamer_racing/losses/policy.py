@@ -166,8 +166,8 @@ OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics
 
 
 GONE = {
-    "ppo": "PPO learns from what was collected, actor=latent_ppo or asymmetric_ppo",
-    "flown_ppo": "its critic learns from what was collected, too, as that of actor=latent_ppo or asymmetric_ppo",
+    "ppo": "PPO learns from what was collected, by the algorithm latent_ppo",
+    "flown_ppo": "its critic learns from what was collected, too, by the algorithm latent_ppo",
 }
 """Actors that there were, and what there is instead."""
 

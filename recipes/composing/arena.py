@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
-from composing.schema import CRITIC_OF_ACTOR, DreamerConfig, EnvConfig, RunConfig, is_race
+from composing.schema import EnvConfig, LatentPPORunConfig, RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
@@ -81,7 +81,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
     """
     env = config.env
     num_envs = num_envs or env.num_envs
-    readers = privileged_losses(config) if isinstance(config, DreamerConfig) else []
+    readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
     if is_race(config):
         return DroneRacingEnv(
             num_envs=num_envs,
@@ -100,18 +100,17 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
     if readers:
         raise ValueError(
             f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
-            "losses, e.g. loss=reconstruction loss.actor=reinforce."
+            "losses, e.g. loss=reconstruction, and of recipes/latent_ppo.py loss.critic=latent."
         )
     return make_suite(config, num_envs, config.seed, env.episode_steps)
 
 
-def privileged_losses(config: DreamerConfig) -> list[str]:
-    """Which losses of a run read the simulator's state, as on the command line."""
-    model, actor = config.loss.world_model, config.loss.actor
-    readers = {
-        f"loss.world_model={model}": any(PRIVILEGED in target.reads for target in find_targets(model)),
-        f"loss.actor={actor}": CRITIC_OF_ACTOR.get(actor) == "state",
-    }
+def privileged_losses(config: WorldModelRunConfig) -> list[str]:
+    """Return what of a run reads the simulator's state in training, as on the command line."""
+    model = config.loss.world_model
+    readers = {f"loss.world_model={model}": any(PRIVILEGED in target.reads for target in find_targets(model))}
+    if isinstance(config, LatentPPORunConfig):
+        readers[f"loss.critic={config.loss.critic}"] = config.loss.critic == "state"
     return [words for words, reads in readers.items() if reads]
 
 

@@ -1,10 +1,8 @@
 """The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
 
-import math
 import random
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,23 +15,15 @@ from torchrl.collectors import Collector
 from composing.arena import (
     Environment,
     crash_causes,
-    describe_file,
     make_evaluator,
     reward_terms,
-    scene_name,
-    worlds_device,
 )
 from composing.checks import refuse_to_replace
-from composing.command_line import new_run_dir
-from composing.options import CONFIG_DIR
 from composing.saved import flat_settings
-from composing.schema import DreamerConfig, ReplayRunConfig, RunConfig, Storage, is_race
+from composing.schema import ReplayRunConfig, RunConfig, Storage, WorldModelRunConfig, is_race
 from dreamer_racing import parallel
-from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
-from dreamer_racing.envs.race.race import EPISODE_TIME
-from dreamer_racing.envs.tracks import TrackError
 from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.learner import Learner, Policy
@@ -51,60 +41,6 @@ from dreamer_racing.training.following import LockHeldByFirst, NoReport
 from dreamer_racing.training.session import Evaluator, Session
 
 
-def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
-    """Fill in what every recipe leaves open, and say what was chosen; return the learner's device."""
-    device = choose_device(config.device)
-    if config.device == "auto":
-        print(f"device: {device} (device=auto)")
-    config.device = str(device)
-    if OmegaConf.is_missing(config.env, "num_envs"):
-        config.env.num_envs = num_envs
-    if not math.isfinite(config.env.control_rate):
-        raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
-    if config.env.episode_steps is None and config.env.suite == "race":
-        config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
-    if config.env.device == "auto":
-        config.env.device = worlds_device(device, config.env)
-        if device.type != "cpu":
-            print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
-    if config.env.suite == "race":
-        note_track(config)
-    if config.run_dir is None:
-        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
-    return device
-
-
-def note_track(config: DictConfig) -> None:
-    """Note what a track's file says, or where a run that goes on has noted it, say whether that has changed since."""
-    if config.track_description is None:
-        found: list[str | None] = []
-        parallel.together(lambda: found.append(describe_file(config.track)))
-        config.track_description = parallel.agreed(found[0])
-        return
-    with suppress(TrackError):  # it is gone, or none any more
-        if describe_file(config.track) != config.track_description:
-            print(f"track: as {config.track} was when the run was begun, which it no longer is")
-
-
-def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
-    """Fill in what a baseline leaves open, by what it sees (``pixels`` or ``state``), and say what was chosen.
-
-    Args:
-        config: of the recipe.
-        num_envs: worlds flown side by side, of either.
-    """
-    resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
-    if config.network.size == "auto":
-        sees = "images" if config.env.from_pixels else "numbers"
-        config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
-        print(f"network: {config.network.size} (network=auto, seeing {sees}, budget={config.budget})")
-    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml"))
-    for name in ("layers", "units"):
-        if OmegaConf.is_missing(config.network, name):
-            config.network[name] = numbers[name]
-    return config
-
-
 def seed_generators(seed: int) -> None:
     """Seed all global generators, of which torch's samples actions and latents."""
     random.seed(seed)
@@ -112,9 +48,34 @@ def seed_generators(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def make_curriculum(config: RunConfig) -> BodyRateCurriculum | None:
-    """Make the schedule of the race's body-rate penalty; other suites have none."""
-    return BodyRateCurriculum(config.curriculum) if is_race(config) else None
+class Rewards:
+    """Moves the body-rate penalty of a race's rewards by a curriculum; elsewhere there is none.
+
+    Args:
+        config: of the run.
+        env: whose rewards they are.
+    """
+
+    def __init__(self, config: RunConfig, env: Environment) -> None:
+        self.curriculum = BodyRateCurriculum(config.curriculum) if is_race(config) else None
+        self._env = env
+
+    def adapt(self, episodes: TensorDictBase) -> dict[str, float]:
+        """Set the penalty of what comes, by finished episodes ``[E]``; return metrics."""
+        if self.curriculum is None:
+            return {}
+        self._env.body_rate_weight = self.curriculum.update(episodes["return"])
+        return {"curriculum/body_rate_weight": self._env.body_rate_weight}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint needs."""
+        return {} if self.curriculum is None else self.curriculum.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned, also in worlds that begin anew."""
+        if self.curriculum is not None:
+            self.curriculum.load_state_dict(state_dict)
+            self._env.body_rate_weight = self.curriculum.body_rate_weight
 
 
 def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:
@@ -138,7 +99,7 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
 def make_run_replay(
     config: ReplayRunConfig,
     env: Environment,
-    curriculum: BodyRateCurriculum | None,
+    rewards: Rewards,
     batch_size: int,
     batch_length: int,
     latents: LatentFormat | None = None,
@@ -149,7 +110,7 @@ def make_run_replay(
     Args:
         config: resolved.
         env: whose records it is to hold.
-        curriculum: by which old rewards are relabelled, if they are.
+        rewards: by whose curriculum old rewards are relabelled, if they are.
         batch_size: windows in a batch.
         batch_length: records in a window.
         latents: how they are kept with the records, if they are.
@@ -182,7 +143,7 @@ def make_run_replay(
         storage_device=storage_device,
         scratch_dir=files,
         seed=config.seed,
-        transform=RelabelReward(curriculum) if curriculum and config.curriculum.relabel else None,
+        transform=RelabelReward(rewards.curriculum) if rewards.curriculum and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,
         reward_keys=reward_terms(env),
         latents=latents,
@@ -226,7 +187,7 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
 
 
 def make_sequence_replay(
-    config: DreamerConfig, env: Environment, curriculum: BodyRateCurriculum | None, latents: LatentFormat | None
+    config: WorldModelRunConfig, env: Environment, rewards: Rewards, latents: LatentFormat | None
 ) -> StreamReplay:
     """Make the replay of a world model, with the latents beside its records if they are kept."""
     asked = config.replay
@@ -234,7 +195,7 @@ def make_sequence_replay(
     return make_run_replay(
         config,
         env,
-        curriculum,
+        rewards,
         config.model.batch_size,
         config.model.batch_length,
         latents=latents,
@@ -264,16 +225,6 @@ def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> 
 def make_tracker(config: RunConfig) -> EpisodeTracker:
     """Make what finds the finished episodes of this process's worlds."""
     return EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
-
-
-def adapt_rewards(
-    env: Environment, curriculum: BodyRateCurriculum | None, episodes: TensorDictBase
-) -> dict[str, float]:
-    """Let the curriculum, if there is one, set the body-rate penalty of what comes; return metrics."""
-    if curriculum is None:
-        return {}
-    env.body_rate_weight = curriculum.update(episodes["return"])
-    return {"curriculum/body_rate_weight": env.body_rate_weight}
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:

@@ -17,17 +17,16 @@ from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
     CollectorKind,
-    DreamerConfig,
     ExperimentConfig,
+    LatentPPORunConfig,
     PPORunConfig,
     ReplayRunConfig,
     RunConfig,
     SACRunConfig,
     Storage,
     WorkersConfig,
-    imagines,
+    WorldModelRunConfig,
     is_race,
-    learns_from_collected,
 )
 from dreamer_racing import parallel
 from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
@@ -40,7 +39,6 @@ from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.learners.ppo_update import KL_TOLERANCE
 from dreamer_racing.losses import (
     Barlow,
-    DreamerV3Losses,
     Image,
     PPOUpdateConfig,
     State,
@@ -54,7 +52,6 @@ from dreamer_racing.settings import POSITIVE, allowed_values, check_settings
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.schedule import RampClock
 
-PPO_ACTORS = "loss.actor=latent_ppo or asymmetric_ppo"
 RACE_ONLY = (
     "env.control_rate",
     "env.camera_rate",
@@ -91,7 +88,7 @@ def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse settings of DreamerV3 that nothing reads as losses and replay are chosen; one's own losses may read all.
+    """Refuse settings that nothing reads as losses and replay are chosen; one's own losses may read all.
 
     Args:
         config: composed.
@@ -100,27 +97,23 @@ def check_read(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         ValueError: the message names the setting, and what it is for.
     """
-    targets, ppo = find_targets(config.loss.world_model), learns_from_collected(config)
-    if not ppo:
-        find_objective(config.loss.actor)
+    targets = find_targets(config.loss.world_model)
     images = _have(targets, Image) and config.env.from_pixels
-    waits = config.schedule.wait_for_model is not None and ppo
+    waits = config.algorithm != "latent_ppo" or config.schedule.wait_for_model is not None
+    imagines = config.algorithm == "dreamer_v3"
     drift = config.loss.drift_scale == 0 or (config.replay.context and not config.model.sampled)
     names = [name for override in overrides if "." in (name := override_key(override))]  # no choice of a group
     given = [leaf for name in names for leaf in _leaves(config, name)]
     for name, reads, reader in (
-        ("loss.ppo", ppo, PPO_ACTORS),
-        ("schedule.kl_target", ppo, PPO_ACTORS),
         ("loss.image_scale", images, "loss=reconstruction or informed, from images"),
         ("loss.image_share", images, "loss=reconstruction or informed, from images"),
         ("loss.privileged_scale", _have(targets, State), "loss=privileged or informed"),
         ("loss.barlow_scale", _have(targets, Barlow), "loss=decoder_free"),
-        ("model.imagination_starts", not ppo, "an actor that imagines, as loss.actor=reinforce"),
+        ("model.imagination_starts", imagines, "recipes/dreamer_v3.py, which imagines"),
         ("loss.drift_scale", drift, "records that keep latents, replay.context=true, as they are, model.sampled=false"),
         ("replay.recent_records", config.replay.recent_share > 0, "replay.recent_share above 0"),
         ("replay.device", config.replay.storage is Storage.tensor, "replay.storage=tensor"),
-        ("schedule.wait_for_model", ppo, PPO_ACTORS),
-        ("schedule.wait_every", waits, "schedule.wait_for_model, of an actor that learns from what was collected"),
+        ("schedule.wait_every", waits, "schedule.wait_for_model"),
     ):
         for leaf in given:
             if not reads and (leaf == name or leaf.startswith(f"{name}.")):
@@ -171,10 +164,10 @@ def check(config: RunConfig) -> None:
     """
     check_settings(config)
     check_loggers(config.logger.wandb.value)
-    if parallel.asked_for() > 1 and not isinstance(config, DreamerConfig):
+    if parallel.asked_for() > 1 and not isinstance(config, WorldModelRunConfig):
         raise ValueError(
             f"WORLD_SIZE={parallel.asked_for()}: algorithm={config.algorithm} trains in one process, and of those that "
-            "torchrun starts only recipes/dreamer_v3.py makes use: start it without torchrun."
+            "torchrun starts only recipes/dreamer_v3.py and latent_ppo.py makes use: start it without torchrun."
         )
     values = OmegaConf.structured(config)
     on_cuda = config.env.device.partition(":")[0] == "cuda"
@@ -215,7 +208,7 @@ def check_race(config: RunConfig) -> None:
             check_it()
         except ValueError as error:
             raise ValueError(f"{group}.{error}") from error
-    moves = isinstance(config, DreamerConfig) and config.schedule.start_on_line.to is not None
+    moves = isinstance(config, WorldModelRunConfig) and config.schedule.start_on_line.to is not None
     if config.env.start_on_line == 1 and config.env.start_beyond_gate and not moves:
         raise ValueError(
             f"env.start_beyond_gate={config.env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
@@ -268,7 +261,7 @@ def check_sac(config: SACRunConfig) -> None:
     check_replay(config)
 
 
-def check_dreamer(config: DreamerConfig) -> None:
+def check_world_model_run(config: WorldModelRunConfig) -> None:
     """Refuse settings with which a world model could not learn.
 
     Raises:
@@ -277,7 +270,7 @@ def check_dreamer(config: DreamerConfig) -> None:
     check(config)
     check_replay(config)
     check_schedule(config)
-    check_imagination(config)
+    check_actor(config)
     check_image_size(config.env.image_size, config.model.size)
     if config.tuned == "images" and not config.env.from_pixels:
         raise ValueError(
@@ -309,7 +302,7 @@ def check_dreamer(config: DreamerConfig) -> None:
         )
 
 
-def check_workers(config: DreamerConfig) -> None:
+def check_workers(config: WorldModelRunConfig) -> None:
     """Refuse workers beside other ways to collect, and worlds or weights that cannot be shared out among them.
 
     Raises:
@@ -342,29 +335,26 @@ def check_workers(config: DreamerConfig) -> None:
     check_interval(config.weight_interval, num_envs * config.rollout_steps)
 
 
-OF_IMAGINATION = ("continuation", "return_decay")
-"""Numbers of losses that only imagined rollouts read."""
+ACTORS_OF_BEFORE = {"latent_ppo": "latent", "asymmetric_ppo": "state"}
+"""What the critic sees of actors that were losses of DreamerV3 before they were an algorithm."""
 
 
-def check_imagination(config: DreamerConfig) -> None:
-    """Refuse an objective that there is not, and where nothing is imagined, numbers that only imagination reads.
+def check_actor(config: WorldModelRunConfig) -> None:
+    """Refuse an objective that there is not.
 
     Raises:
-        ValueError: the message names the settings.
+        ValueError: the message names those that there are, and the recipe of what is an algorithm of its own now.
     """
-    if imagines(config):
-        find_objective(config.loss.actor)
-        return
-    for name in OF_IMAGINATION:
-        own, default = getattr(config.loss, name), getattr(DreamerV3Losses, name)
-        if own != default:
-            raise ValueError(
-                f"loss.{name}={str(own).lower()}, and loss.actor={config.loss.actor} imagines nothing: leave it at "
-                f"{str(default).lower()}, or choose another actor."
-            )
+    actor = config.loss.actor  # type: ignore[attr-defined]
+    if actor in ACTORS_OF_BEFORE:
+        raise ValueError(
+            f"loss.actor={actor} is an algorithm of its own now: recipes/latent_ppo.py "
+            f"loss.critic={ACTORS_OF_BEFORE[actor]}."
+        )
+    find_objective(actor)
 
 
-def check_schedule(config: DreamerConfig) -> None:
+def check_schedule(config: WorldModelRunConfig) -> None:
     """Refuse ramps that end before they begin, or lead where the setting itself could not be.
 
     Raises:
@@ -374,9 +364,10 @@ def check_schedule(config: DreamerConfig) -> None:
         "learning_rates": POSITIVE,
         "world_model_rate": POSITIVE,
         **{name: allowed_values(config.loss, name) for name in LOSS_RAMPS},
-        "kl_target": allowed_values(config.loss.ppo, "kl_target"),
         "start_on_line": allowed_values(config.env, "start_on_line"),
     }
+    if isinstance(config, LatentPPORunConfig):
+        targets["kl_target"] = allowed_values(config.loss.ppo, "kl_target")
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")
@@ -387,10 +378,11 @@ def check_schedule(config: DreamerConfig) -> None:
         if ramp.to is not None and allowed is not None and ramp.to not in allowed:
             raise ValueError(f"schedule.{name}.to={ramp.to}: must be {allowed}.")
     check_deviations(config)
-    limit = config.schedule.wait_for_model
-    if limit is not None and limit <= 1:
-        raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
-    check_kl(config.loss.ppo, config.schedule.kl_target.to)
+    if isinstance(config, LatentPPORunConfig):
+        limit = config.schedule.wait_for_model
+        if limit is not None and limit <= 1:
+            raise ValueError(f"schedule.wait_for_model={limit}: a ratio of errors, must be above 1.")
+        check_kl(config.loss.ppo, config.schedule.kl_target.to)
     to = config.schedule.start_on_line.to
     if to is not None and not is_race(config):
         raise ValueError(f"schedule.start_on_line is for races, and env.suite={config.env.suite}: leave it out.")
@@ -398,7 +390,7 @@ def check_schedule(config: DreamerConfig) -> None:
         raise ValueError("schedule.start_on_line begins at env.start_on_line=0: give that a share above 0.")
 
 
-def check_deviations(config: DreamerConfig) -> None:
+def check_deviations(config: WorldModelRunConfig) -> None:
     """Refuse a smallest deviation of actions above the largest, also where a ramp leads.
 
     Raises:
@@ -430,7 +422,7 @@ def check_kl(ppo: PPOUpdateConfig, to: float | None) -> None:
     for name, target in (("loss.ppo.kl_target", ppo.kl_target), ("schedule.kl_target.to", to)):
         if target is not None and ppo.kl_stop < KL_TOLERANCE * target:
             raise ValueError(
-                f"loss.ppo.kl_stop={ppo.kl_stop} ends improvements before {name}={target} is seen to be exceeded: the "
+                f"loss.ppo.kl_stop={ppo.kl_stop} ends updates before {name}={target} is seen to be exceeded: the "
                 f"stop must be at least {KL_TOLERANCE} times the target."
             )
 

@@ -31,7 +31,7 @@ def plain_errors(applies: Callable[[], bool] = lambda: True) -> Iterator[None]:
         if not applies():
             raise
         missing = isinstance(error, MissingMandatoryValue)
-        say_error(f"{error.full_key}= is missing, and there is no default." if missing else error)
+        say_error(f"{getattr(error, 'full_key', '')}= is missing, and there is no default." if missing else error)
         raise SystemExit(2) from error
 
 

@@ -27,7 +27,7 @@ from composing.command_line import (
     start_logging,
 )
 from composing.saved import begun_with, changed_settings, keep_saved, saved_config
-from composing.schema import DreamerConfig, RunConfig, is_race
+from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import WorkerError
@@ -101,7 +101,7 @@ def compose_run(config: DictConfig, tune: Callable[[DictConfig], str] | None) ->
         config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
         config.track_description = noted
     check_overrides(config, overrides)
-    if config.algorithm == "dreamer_v3":
+    if config.algorithm in ("dreamer_v3", "latent_ppo"):
         check_read(config, given)
     return config, overrides
 
@@ -240,7 +240,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
 
 def _rising(config: RunConfig) -> str:
     """Return what to know before a run is made longer: what has moved by its share of the run moves back."""
-    if not isinstance(config, DreamerConfig):
+    if not isinstance(config, WorldModelRunConfig):
         return ""
     ramps = {ramp.name: getattr(config.schedule, ramp.name) for ramp in fields(config.schedule)}
     by_run = [

@@ -1,6 +1,9 @@
 """The learner of a configuration, and what of it a schedule moves."""
 
-from dataclasses import fields, replace
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -8,14 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 from composing.arena import Environment
 from composing.saved import read_yaml
 from composing.schema import (
-    CRITIC_OF_ACTOR,
     LOSS_RAMPS,
-    DreamerConfig,
+    DreamerV3RunConfig,
+    LatentPPORunConfig,
     NetworkConfig,
     PPORunConfig,
     RunConfig,
     SACRunConfig,
-    learns_from_collected,
+    WorldModelRunConfig,
 )
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.export.agents import existing_agent_path
@@ -27,7 +30,7 @@ from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.learners.learner import Learner
 from dreamer_racing.learners.saved import check_size
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, find_targets
+from dreamer_racing.losses import find_targets
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
@@ -37,33 +40,47 @@ IN_CHECKPOINTS = ("min_std", "max_std")
 """Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
 
 
-def make_schedule(config: DreamerConfig, num_gates: int = 0) -> Schedule:
-    """Make the schedule of what a learner's `adjust` takes, by its names, and of `start_on_line`."""
+def make_schedule(config: WorldModelRunConfig, env: Environment | None = None) -> Schedule:
+    """Make the schedule of what a learner's `adjust` takes, by its names, and of `start_on_line`.
+
+    Args:
+        config: resolved.
+        env: whose gates some ramps go by; None, where what is restored has counted them.
+    """
     schedule, loss = config.schedule, config.loss
     ramps = {"rates": (1.0, schedule.learning_rates), "world_model_rate": (1.0, schedule.world_model_rate)}
     for name in LOSS_RAMPS:
         ramp = getattr(schedule, name)
         if ramp.to is not None or name in IN_CHECKPOINTS:
             ramps[name] = (getattr(loss, name), ramp)
-    if (kl_target := loss.ppo.kl_target) is not None and learns_from_collected(config):
-        ramps["kl_target"] = (kl_target, schedule.kl_target)
+    if isinstance(config, LatentPPORunConfig) and (kl_target := config.loss.ppo.kl_target) is not None:
+        ramps["kl_target"] = (kl_target, config.schedule.kl_target)
     if schedule.start_on_line.to is not None:
         ramps["start_on_line"] = (config.env.start_on_line, schedule.start_on_line)
+    num_gates = env.track.num_gates if isinstance(env, DroneRacingEnv) else 0
     return Schedule(ramps, config.total_env_steps, num_gates)
 
 
-def size_of(config: DreamerConfig) -> ModelSize:
+def move_starts(env: Environment, scheduled: dict[str, float]) -> dict[str, float]:
+    """Set the share of episodes that begin on a line, if it is scheduled; return the other numbers."""
+    numbers = dict(scheduled)
+    if (share := numbers.pop("start_on_line", None)) is not None:
+        cast(DroneRacingEnv, env).worlds.start_on_line = share
+    return numbers
+
+
+def size_of(config: WorldModelRunConfig) -> ModelSize:
     """The networks' size, and what their states are."""
     return replace(get_size(config.model.size), sampled=config.model.sampled, state_std=config.model.state_std)
 
 
-def make_agent(config: DreamerConfig, interface: Interface) -> Agent:
+def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
     """Make the networks of a resolved configuration, with initial weights from torch's generator."""
     decodes = any(target.decodes for target in find_targets(config.loss.world_model))
     return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
 
 
-def begin_with(learner: WorldModelLearner, config: DreamerConfig, env: Environment) -> str:
+def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
     """Give a new learner the weights that ``init_from`` names; return a line on what that was.
 
     Raises:
@@ -99,28 +116,24 @@ def begin_with(learner: WorldModelLearner, config: DreamerConfig, env: Environme
 def make_learner(
     config: RunConfig, interface: Interface, device: torch.device | str, seed: int | None = None
 ) -> Learner:
-    """Make the learner of a recipe's configuration, with initial weights by its seed or another one."""
+    """Make the learner of a recipe's configuration, to train or to be restored.
+
+    Args:
+        config: resolved.
+        interface: what is seen and done.
+        device: where it computes.
+        seed: of the initial weights; the run's if None.
+    """
     seed = config.seed if seed is None else seed
-    if isinstance(config, DreamerConfig):
-        return make_dreamer(config, interface, device, seed)
+    if isinstance(config, DreamerV3RunConfig):
+        return DreamerV3.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
+    if isinstance(config, LatentPPORunConfig):
+        return LatentPPO.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
     if isinstance(config, PPORunConfig):
         return PPOLearner(network_size(config.network), interface, config.ppo, device, seed)
     if isinstance(config, SACRunConfig):
         return SACLearner(network_size(config.network), interface, config.sac, device, seed)
     raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
-
-
-def make_dreamer(
-    config: DreamerConfig, interface: Interface, device: torch.device | str, seed: int | None = None
-) -> DreamerV3 | LatentPPO:
-    """Make the learner that `loss.actor` chooses, with initial weights by the run's seed, or by another one."""
-    size, seed, loss = size_of(config), config.seed if seed is None else seed, vars(config.loss)
-    if learns_from_collected(config):
-        own = {field.name: loss[field.name] for field in fields(LatentPPOLosses)}
-        own |= {"actor": LatentPPOLosses.actor, "critic": CRITIC_OF_ACTOR[config.loss.actor]}
-        return LatentPPO.make(size, interface, LatentPPOLosses(**own), config.model, device=device, seed=seed)
-    losses = DreamerV3Losses(**{field.name: loss[field.name] for field in fields(DreamerV3Losses)})
-    return DreamerV3.make(size, interface, losses, config.model, device=device, seed=seed)
 
 
 def network_size(config: NetworkConfig) -> NetworkSize:

@@ -32,6 +32,9 @@ HYDRAS_FLAGS = (
 )  # fmt: skip
 """Flags that are hydra's own; it takes the beginnings of their names, too."""
 
+TRAINING = ("dreamer_v3", "latent_ppo", "ppo", "sac")
+"""The training recipes."""
+
 
 class Option(NamedTuple):
     """One option, or the parts of a schedule."""
@@ -110,8 +113,8 @@ def evaluate(node: ast.expr, module: Module) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Range":
         return settings.Range(*(evaluate(part, module) for part in node.args))
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):  # of an enumeration
-        found = find_class(module, node.value.id)
-        return members(found[0])[node.attr] if found else None
+        declared = find_class(module, node.value.id)
+        return members(declared[0])[node.attr] if declared else None
     if isinstance(node, ast.Lambda):
         return evaluate(node.body, module)
     return ast.literal_eval(node)
@@ -271,6 +274,8 @@ def no_such_setting(name: str, recipe: str) -> str:
     known = names(recipe)
     if name in known:  # a group that nothing is taken from where nobody says so
         return f"{name}: is added, with a plus: +{name}=..."
+    if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
+        return f"{name}: there is no such setting of recipes/{recipe}.py; it is for {' and '.join(takers)}."
     last = {full.rpartition(".")[2]: full for full in known}
     close = difflib.get_close_matches(name, known, n=1) or [
         last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)

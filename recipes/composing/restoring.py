@@ -12,10 +12,10 @@ from composing.arena import Environment, describe_file, make_env, track_as_begun
 from composing.learners import IN_CHECKPOINTS, make_learner, make_schedule
 from composing.saved import trained_config
 from composing.schema import (
-    DreamerConfig,
     EvaluateConfig,
     PerceptionConfig,
     RunConfig,
+    WorldModelRunConfig,
     is_race,
 )
 from dreamer_racing.devices import choose_device
@@ -212,7 +212,7 @@ def restore_learner(
     """
     config.env.device = "cpu"  # wherever it was trained
     chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
-    if isinstance(config, DreamerConfig):
+    if isinstance(config, WorldModelRunConfig):
         config.model.compile = config.model.cuda_graph = False
         config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
     env = _probe(config)
@@ -221,7 +221,7 @@ def restore_learner(
     learner = make_learner(config, interface, device)
     counters: dict[str, int] = {}
     parts = {"learner": learner, "counters": counters}
-    if not isinstance(config, DreamerConfig):
+    if not isinstance(config, WorldModelRunConfig):
         load_components(checkpoint, parts, map_location=device)
         return learner, counters
     schedule = make_schedule(config)  # takes the gates of what is restored

@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from composing.command_line import override_key
-from composing.schema import RECIPES, DreamerConfig, RunConfig
+from composing.schema import RECIPES, RunConfig, WorldModelRunConfig
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
@@ -35,7 +35,7 @@ def trained_config(run_dir: Path) -> RunConfig:
     """
     path = RunDirectory(run_dir).config
     saved = read_yaml(path, DictConfig)
-    algorithm = str(saved.get("algorithm", DreamerConfig.algorithm))
+    algorithm = str(saved.get("algorithm", WorldModelRunConfig.algorithm))
     if algorithm not in RECIPES:
         raise ValueError(f"{path}: algorithm={shortened(algorithm)}; there are {', '.join(RECIPES)}.")
     return cast(RunConfig, OmegaConf.to_object(whole(with_schema(saved, algorithm), path)))

@@ -5,7 +5,7 @@ from enum import Enum
 from functools import cache
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING
 
 from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
@@ -68,11 +68,6 @@ class ModelConfig(LearnerConfig):
     imagination_starts: int | None = setting(MISSING, COUNT)
     learning_rate: float = setting(MISSING, POSITIVE)
     warmup_updates: int = setting(MISSING, NOT_NEGATIVE)
-
-
-@dataclass
-class LossesConfig(DreamerV3Losses, LatentPPOLosses):
-    """Losses of either algorithm, of which `actor` chooses: latent_ppo and asymmetric_ppo are PPO in latents."""
 
 
 @dataclass
@@ -163,13 +158,19 @@ class ScheduleConfig:
     world_model_rate: Ramp = field(default_factory=Ramp)  # `to`: share of that share, of the world model's alone
     discount: Ramp = field(default_factory=Ramp)  # loss.discount
     entropy_scale: Ramp = field(default_factory=Ramp)  # loss.entropy_scale
-    kl_target: Ramp = field(default_factory=Ramp)  # loss.ppo.kl_target
     min_std: Ramp = field(default_factory=Ramp)  # loss.min_std
     max_std: Ramp = field(default_factory=Ramp)  # loss.max_std
     start_on_line: Ramp = field(default_factory=Ramp)  # env.start_on_line
-    # actors that step alone (loss.actor=..._ppo) wait while the newest records' error is so many times that in training
+
+
+@dataclass
+class LatentPPOScheduleConfig(ScheduleConfig):
+    """And of an actor that learns from what was collected."""
+
+    kl_target: Ramp = field(default_factory=Ramp)  # loss.ppo.kl_target
+    # the actor waits while the model's error on the newest records is so many times that in training
     wait_for_model: float | None = None
-    wait_every: int = setting(5_000, COUNT)  # env_steps between two looks at those errors
+    wait_every: int = setting(5_000, COUNT)  # env_steps between two measurements of those errors
 
 
 LOSS_RAMPS = tuple(sorted({ramp.name for ramp in fields(ScheduleConfig)} & {loss.name for loss in fields(LossConfig)}))
@@ -234,13 +235,12 @@ class ReplayRunConfig(RunConfig):
 
 
 @dataclass
-class DreamerConfig(ReplayRunConfig):
-    """`recipes/dreamer_v3.py`."""
+class WorldModelRunConfig(ReplayRunConfig):
+    """What the recipes with a world model have in common."""
 
-    algorithm: str = "dreamer_v3"
     # run, checkpoint or agent (docs/agents.md) whose weights a new run begins with, on whatever track and physics
     init_from: str | None = None
-    # none: DreamerV3 as published; race: what races on a CPU; images: the same, but no network sees the simulator's
+    # none: the algorithm as published; race: what races on a CPU; images: the same, but no network sees the simulator's
     # state in training; gpu: race for a GPU, unmeasured; suite: what learns the Control Suite on a CPU; auto: race or
     # suite from images on a CPU by cpu_small, else none
     tuned: str = "auto"
@@ -252,7 +252,7 @@ class DreamerConfig(ReplayRunConfig):
     num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
-    loss: LossesConfig = field(default_factory=LossesConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
 
@@ -265,6 +265,23 @@ class DreamerConfig(ReplayRunConfig):
     def weight_interval(self) -> int:
         """How many env_steps old the weights of workers are at most."""
         return self.workers.weight_interval or 2 * self.env.num_envs * self.rollout_steps
+
+
+@dataclass
+class DreamerV3RunConfig(WorldModelRunConfig):
+    """`recipes/dreamer_v3.py`."""
+
+    algorithm: str = "dreamer_v3"
+    loss: DreamerV3Losses = field(default_factory=DreamerV3Losses)
+
+
+@dataclass
+class LatentPPORunConfig(WorldModelRunConfig):
+    """`recipes/latent_ppo.py`."""
+
+    algorithm: str = "latent_ppo"
+    loss: LatentPPOLosses = field(default_factory=LatentPPOLosses)
+    schedule: LatentPPOScheduleConfig = field(default_factory=LatentPPOScheduleConfig)
 
 
 @dataclass
@@ -302,7 +319,7 @@ class SACRunConfig(ReplayRunConfig):
 
 
 RECIPES: dict[str, type[RunConfig]] = {
-    schema.algorithm: schema for schema in (DreamerConfig, PPORunConfig, SACRunConfig)
+    schema.algorithm: schema for schema in (DreamerV3RunConfig, LatentPPORunConfig, PPORunConfig, SACRunConfig)
 }
 """The training recipes by algorithm, which is the name of its file in recipes/ and in recipes/config/."""
 
@@ -380,20 +397,6 @@ class ExportConfig:
     seed: int = setting(0, SEED)
 
 
-CRITIC_OF_ACTOR = {"latent_ppo": "latent", "asymmetric_ppo": "state"}
-"""What the critic of an actor sees that learns by PPO in latents, by `loss.actor`; the other actors imagine."""
-
-
-def learns_from_collected(config: DreamerConfig | DictConfig) -> bool:
-    """Whether the actor learns from what was collected, in updates of its own."""
-    return config.loss.actor in CRITIC_OF_ACTOR
-
-
-def imagines(config: DreamerConfig | DictConfig) -> bool:
-    """Whether the actor learns from what it imagines."""
-    return not learns_from_collected(config)
-
-
 def is_race(config: RunConfig) -> bool:
     """Whether the run races drones, rather than being tested on the Control Suite.
 
@@ -419,7 +422,6 @@ def register() -> None:
     for group, node in (
         ("env", EnvConfig),
         ("model", ModelConfig),
-        ("loss", LossesConfig),
         ("network", NetworkConfig),
         ("curriculum", CurriculumConfig),
         ("logger", LoggerConfig),

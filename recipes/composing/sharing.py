@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from composing.schema import DreamerConfig, imagines, learns_from_collected
+from composing.schema import LatentPPORunConfig, WorldModelRunConfig
 from dreamer_racing import parallel
 
 DIVIDED = ("env.num_envs", "model.batch_size", "model.imagination_starts")
@@ -24,7 +24,7 @@ SEEDS_APART = 1_000_000
 """Between the seeds of two processes' worlds, samples and actions; initial weights have that of the run."""
 
 
-def share_of(config: DreamerConfig) -> DreamerConfig:
+def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
     """What this process does of a run that is resolved and checked; of a single process, all of it.
 
     Raises:
@@ -36,7 +36,7 @@ def share_of(config: DreamerConfig) -> DreamerConfig:
     check_devices(config)
     check_captured(config)
     own = copy.deepcopy(config)
-    for name in DIVIDED + (OF_PPO if learns_from_collected(config) else ()):
+    for name in DIVIDED + (OF_PPO if isinstance(config, LatentPPORunConfig) else ()):
         part, key = _place(own, name)
         whole = getattr(part, key)
         if whole is not None:
@@ -64,7 +64,7 @@ def share_of(config: DreamerConfig) -> DreamerConfig:
     return own
 
 
-def check_devices(config: DreamerConfig) -> None:
+def check_devices(config: WorldModelRunConfig) -> None:
     """Refuse more processes than CUDA devices on this machine, and to have them all on one.
 
     Raises:
@@ -86,17 +86,16 @@ def check_devices(config: DreamerConfig) -> None:
             )
 
 
-def check_captured(config: DreamerConfig) -> None:
+def check_captured(config: WorldModelRunConfig) -> None:
     """Refuse to capture updates that exchange imagined returns on their way.
 
     Raises:
         ValueError: the message names the settings.
     """
-    if imagines(config) and config.model.cuda_graph:
+    if not isinstance(config, LatentPPORunConfig) and config.model.cuda_graph:
         raise ValueError(
-            f"model.cuda_graph=true: loss.actor={config.loss.actor} exchanges imagined returns between "
-            f"{parallel.count()} processes in the midst of an update. Set model.cuda_graph=false, or choose "
-            "loss.actor=latent_ppo or asymmetric_ppo, which imagine nothing."
+            f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns of {parallel.count()} processes "
+            "in the midst of an update. Set it to false, or use recipes/latent_ppo.py, which imagines nothing."
         )
 
 

@@ -17,7 +17,7 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
     Returns:
         Each as ``setting=value (there)``, as the command line takes both.
     """
-    numbers = tuned_numbers(config.tuned)
+    numbers = tuned_numbers(config.tuned, config.algorithm)
     numbers.pop("tuned")
     return [
         f"{name}={said(value)} ({said(there)})"
@@ -26,9 +26,11 @@ def changed_from_tuned(config: DictConfig) -> list[str]:
     ]
 
 
-def tuned_numbers(tuned: str) -> dict[str, Any]:
-    """Return what a file of the group `tuned` has, over what the files of other groups have that it takes."""
+def tuned_numbers(tuned: str, algorithm: str) -> dict[str, Any]:
+    """Return what a file of the group `tuned`, and that of an algorithm, have over what they take of other groups."""
     groups, own = layers_of(tuned)
+    if (CONFIG_DIR / "tuned" / algorithm / f"{tuned}.yaml").exists():
+        own = merged(own, layers_of(tuned, f"tuned/{algorithm}")[1])
     groups.pop("model", None)  # the size's own numbers follow from model.size
     taken = {group: numbers_of(group, name) for group, name in groups.items()}
     for numbers in taken.values():
@@ -36,19 +38,19 @@ def tuned_numbers(tuned: str) -> dict[str, Any]:
     return merged(taken, own)
 
 
-def layers_of(tuned: str) -> tuple[dict[str, str], dict[str, Any]]:
+def layers_of(tuned: str, group: str = "tuned") -> tuple[dict[str, str], dict[str, Any]]:
     """Return which files of other groups a file of the group `tuned` takes, by group, and its own numbers.
 
     If it takes another file of its own group, that one's are among them, and give way to its own.
     """
     groups: dict[str, str] = {}
-    own = numbers_of("tuned", tuned)
-    for taken in own.pop("defaults"):
+    own = numbers_of(group, tuned)
+    for taken in own.pop("defaults", ()):
         if isinstance(taken, str):
-            below, numbers = layers_of(taken)
+            below, numbers = layers_of(taken, group)
             groups, own = below | groups, merged(numbers, own)
         else:
-            groups |= {group.rpartition("/")[2]: name for group, name in taken.items()}
+            groups |= {other.rpartition("/")[2]: name for other, name in taken.items()}
     return groups, own
 
 

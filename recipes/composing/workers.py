@@ -11,7 +11,7 @@ from torchrl.envs import TensorDictPrimer, TransformedEnv
 from composing.arena import Environment, make_env, worlds_device
 from composing.building import make_collector
 from composing.learners import make_agent
-from composing.schema import CollectorKind, DreamerConfig, WorkersConfig, is_race
+from composing.schema import CollectorKind, WorkersConfig, WorldModelRunConfig, is_race
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
@@ -46,12 +46,12 @@ def resolve_workers(config: DictConfig) -> None:
         config.num_workers, config.workers = None, default
 
 
-def make_own_env(config: DreamerConfig) -> Environment:
+def make_own_env(config: WorldModelRunConfig) -> Environment:
     """Make the environment of this process: its worlds to train in, or where workers fly, one to take their measure."""
     return make_env(config, num_envs=1 if config.collector is CollectorKind.ray else None)
 
 
-def make_rollouts(config: DreamerConfig, env: Environment, learner: WorldModelLearner) -> Rollouts:
+def make_rollouts(config: WorldModelRunConfig, env: Environment, learner: WorldModelLearner) -> Rollouts:
     """Make what is collected.
 
     Raises:
@@ -66,7 +66,7 @@ def make_rollouts(config: DreamerConfig, env: Environment, learner: WorldModelLe
     return OverlappedRollouts(make_collector(config, env, acting), acting, policy)
 
 
-def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy) -> RayRollouts:
+def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerPolicy) -> RayRollouts:
     """Start workers on a Ray cluster, each with its share of the worlds."""
     asked, workers, own = config.workers, cast(int, config.num_workers), share_of_worker(config)
     print(
@@ -99,7 +99,7 @@ def make_workers(config: DreamerConfig, env: Environment, policy: DreamerPolicy)
     )
 
 
-def share_of_worker(config: DreamerConfig) -> DreamerConfig:
+def share_of_worker(config: WorldModelRunConfig) -> WorldModelRunConfig:
     """What one worker has of a run."""
     own = copy.deepcopy(config)
     own.env.num_envs = config.env.num_envs // cast(int, config.num_workers)
@@ -108,6 +108,6 @@ def share_of_worker(config: DreamerConfig) -> DreamerConfig:
     return own
 
 
-def make_worker_env(config: DreamerConfig, primer: TensorDictPrimer) -> TransformedEnv:
+def make_worker_env(config: WorldModelRunConfig, primer: TensorDictPrimer) -> TransformedEnv:
     """Make a worker's worlds, there."""
     return with_memory(make_env(config, num_threads=max(1, int(config.workers.cpus))), primer)

@@ -13,6 +13,7 @@ from torchrl.envs.transforms import Transform
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.gate_pass_rate import GatePassRate
 from dreamer_racing.training.schedule import RampClock
 from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
 
@@ -27,12 +28,12 @@ def test_every_group_composes(path: Path) -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_variant_of_an_experiment_is_a_run_that_differs_from_the_others(experiment: str) -> None:
-    checks, recipe = recipe_module("composing.checks"), recipe_module("dreamer_v3")
-    variants, overrides = (compose(experiment)[name] for name in ("variants", "overrides"))
+    algorithm, variants, overrides = (compose(experiment)[name] for name in ("algorithm", "variants", "overrides"))
+    checks, recipe = recipe_module("composing.checks"), recipe_module(algorithm)
     settings = set()
     for changes in variants.values():
-        resolved = recipe.resolve(compose("dreamer_v3", "device=cpu", "run_dir=run", *changes, *overrides))
-        checks.check_dreamer(OmegaConf.to_object(resolved))
+        resolved = recipe.resolve(compose(algorithm, "device=cpu", "run_dir=run", *changes, *overrides))
+        checks.check_world_model_run(OmegaConf.to_object(resolved))
         settings.add(OmegaConf.to_yaml(resolved))
     assert len(settings) == len(variants)
     swept = OmegaConf.load(CONFIG / f"{experiment}.yaml").hydra.sweeper.params.variant
@@ -107,13 +108,12 @@ def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
         assert made[0]["device"] == expected
 
 
-def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -> object:
+def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str, name: str = "dreamer_v3") -> object:
     """A configuration for a device that is asked for, not looked for."""
-    dreamer = recipe_module("dreamer_v3")
-    for module in (dreamer, recipe_module("composing.building")):
-        monkeypatch.setattr(module, "choose_device", torch.device)
-    monkeypatch.setattr(dreamer, "choose_mixed_precision", lambda device: (True, "as the test says"))
-    return dreamer.resolve(compose("dreamer_v3", f"device={device}", *overrides))
+    resolving = recipe_module("composing.resolving")
+    monkeypatch.setattr(resolving, "choose_device", torch.device)
+    monkeypatch.setattr(resolving, "choose_mixed_precision", lambda device: (True, "as the test says"))
+    return recipe_module(name).resolve(compose(name, f"device={device}", *overrides))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,6 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str) -
         (["model.cuda_graph=false"], ("size12m", 64, 16, True, False)),
         (["collector=overlapped"], ("size12m", 64, 16, True, False)),
         (["tuned=race"], ("cpu_small", 32, 16, True, True)),
-        (["tuned=gpu"], ("cpu_small", 64, 16, True, True)),
         (["tuned=suite", "env=dmc"], ("cpu_small", 16, 32, True, True)),
     ],
 )
@@ -138,7 +137,7 @@ def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
     config = resolved_on("cuda", monkeypatch, *overrides)
     model = config.model
     assert (model.size, model.batch_size, model.batch_length, config.replay.context, model.cuda_graph) == expected
-    recipe_module("composing.checks").check_dreamer(OmegaConf.to_object(config))
+    recipe_module("composing.checks").check_world_model_run(OmegaConf.to_object(config))
 
 
 def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +149,7 @@ def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> 
 def test_several_processes_capture_what_does_not_imagine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert not resolved_on("cuda", monkeypatch).model.cuda_graph
-    assert resolved_on("cuda", monkeypatch, "tuned=race").model.cuda_graph
+    assert resolved_on("cuda", monkeypatch, "tuned=race", name="latent_ppo").model.cuda_graph
 
 
 def test_the_smallest_run_is_not_refused(tmp_path: Path) -> None:
@@ -168,36 +167,40 @@ def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize(
-    "override", ["loss.actor=dynamics", "loss.actor=reinforce", "loss.actor=latent_ppo", "replay.held_out=0"]
+    ("name", "override"),
+    [("dreamer_v3", "loss.actor=dynamics"), ("dreamer_v3", "replay.held_out=0"), ("latent_ppo", "loss.critic=latent")],
 )
-def test_what_races_goes_with_other_actors(override: str) -> None:
-    config = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", override))
-    recipe_module("composing.checks").check_dreamer(OmegaConf.to_object(config))
+def test_what_races_goes_with_other_actors(name: str, override: str) -> None:
+    config = recipe_module(name).resolve(compose(name, "tuned=race", override))
+    recipe_module("composing.checks").check_world_model_run(OmegaConf.to_object(config))
 
 
 def test_settings_that_race_yield_to_the_command_line() -> None:
-    tuned = compose("dreamer_v3", "tuned=race")
+    tuned = compose("latent_ppo", "tuned=race")
     assert (tuned.model.size, tuned.loss.world_model, tuned.loss.privileged_scale) == ("cpu_small", "privileged", 50)
     assert (tuned.env.control_rate, tuned.env.start_on_line, tuned.loss.discount) == (25, 0.7, 0.98)
-    assert (tuned.loss.actor, tuned.model.sampled, tuned.replay.context) == ("asymmetric_ppo", False, True)
+    assert (tuned.loss.critic, tuned.model.sampled, tuned.replay.context) == ("state", False, True)
     assert (tuned.env.start_at_gate, tuned.schedule.start_on_line.to) == (0, 0)
     assert (tuned.schedule.wait_for_model, tuned.loss.drift_scale) == (2, 1)
     assert (tuned.model.state_std, tuned.schedule.max_std.by) == (False, RampClock.known)
-    changed = compose("dreamer_v3", "tuned=race", "loss=informed", "env.control_rate=50")
+    changed = compose("latent_ppo", "tuned=race", "loss=informed", "env.control_rate=50")
     assert (changed.loss.world_model, changed.env.control_rate, changed.loss.discount) == ("informed", 50, 0.98)
 
 
 def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
     """All else is as in `tuned=race`, and so are other settings that are asked for."""
-    images, race = (compose("dreamer_v3", f"tuned={name}") for name in ("images", "race"))
-    assert (images.loss.world_model, images.loss.actor) == ("reconstruction", "latent_ppo")
+    images, race = (compose("latent_ppo", f"tuned={name}") for name in ("images", "race"))
+    assert (images.loss.world_model, images.loss.critic) == ("reconstruction", "latent")
     assert (images.env.start_on_line, images.env.start_at_gate, images.schedule.start_on_line.to) == (0, 0.5, None)
     arena = recipe_module("composing.arena")
-    assert not arena.privileged_losses(images) and len(arena.privileged_losses(race)) == 2
+    recipe = recipe_module("latent_ppo")
+    resolved = [recipe.resolve(compose("latent_ppo", f"tuned={name}", "device=cpu")) for name in ("images", "race")]
+    readers = [arena.privileged_losses(OmegaConf.to_object(config)) for config in resolved]
+    assert readers == [[], ["loss.world_model=privileged", "loss.critic=state"]]
     changed = set(flatten(OmegaConf.to_container(images))) ^ set(flatten(OmegaConf.to_container(race)))
     assert {name for name, _ in changed} == {
         "tuned", "total_env_steps", "env.start_on_line", "env.start_at_gate", "model.replay_ratio",
-        "loss.world_model", "loss.actor", "loss.image_scale", "loss.image_share", "loss.free_nats",
+        "loss.world_model", "loss.critic", "loss.image_scale", "loss.image_share", "loss.free_nats",
         "loss.privileged_scale", "schedule.start_on_line.to",
     }  # fmt: skip
     assert compose("dreamer_v3", "tuned=images", "loss=informed").loss.world_model == "informed"
@@ -229,14 +232,13 @@ def test_what_races_goes_with_a_state_space_model() -> None:
 def test_dreamer_as_published_is_one_word_away() -> None:
     """Every number of losses, model and schedule as in the reference, or as its size says."""
     faithful, schema = compose("dreamer_v3", "tuned=none"), recipe_module("composing.schema")
-    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.LossesConfig))
+    assert OmegaConf.to_container(faithful.loss) == OmegaConf.to_container(OmegaConf.structured(schema.DreamerV3Losses))
     assert OmegaConf.to_container(faithful.env) | {"num_envs": None} == OmegaConf.to_container(
         OmegaConf.structured(schema.EnvConfig(num_envs=1))
     ) | {"num_envs": None}
     assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
     schedule = OmegaConf.to_container(faithful.schedule)
     assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.ScheduleConfig))
-    assert schedule.pop("wait_for_model") is None and schedule.pop("wait_every")
     assert all(ramp["to"] is None for ramp in schedule.values())
 
 
@@ -260,7 +262,7 @@ def test_what_learns_is_chosen_where_it_does(
 ) -> None:
     assert recipe_module("dreamer_v3").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
     told = capsys.readouterr().out
-    assert all((f"settings: tuned={name}" in told) == (expected == name) for name in ("race", "suite"))
+    assert ("settings: tuned=none, the algorithm as published: none are chosen for" in told) == (expected == "none")
 
 
 def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
@@ -282,8 +284,9 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    recipe_module("composing.checks").check_dreamer(config)
-    schedule = recipe_module("composing.learners").make_schedule(config, num_gates=1)
+    recipe_module("composing.checks").check_world_model_run(config)
+    schedule = recipe_module("composing.learners").make_schedule(config)
+    schedule.pass_rate = GatePassRate(num_gates=1)
     assert schedule.at(100_000)["min_std"] == pytest.approx(0.1)
     schedule.pass_rate.best = 0.6
     assert schedule.at(0)["min_std"] == pytest.approx(0.075)
@@ -308,8 +311,8 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
     overrides = ["tuned=race", "device=cpu", "total_env_steps=100000"]
     found = []
-    for actor in ("asymmetric_ppo", "reinforce"):
-        resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides, f"loss.actor={actor}"))
+    for name in ("latent_ppo", "dreamer_v3"):
+        resolved = recipe_module(name).resolve(compose(name, *overrides))
         moved = recipe_module("composing.learners").make_schedule(OmegaConf.to_object(resolved)).at(0)
         found.append(set(moved) - {"rates", "world_model_rate", "start_on_line"})
     assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
@@ -319,16 +322,16 @@ def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
-        recipe_module("composing.checks").check_dreamer(config)
+        recipe_module("composing.checks").check_world_model_run(config)
 
 
 def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
     """What trains and what restores a learner make it alike."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
-    overrides += ["loss.actor=asymmetric_ppo", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
-    recipe, learners = recipe_module("dreamer_v3"), recipe_module("composing.learners")
-    config = OmegaConf.to_object(recipe.resolve(compose("dreamer_v3", *overrides)))
-    run = prepared(*overrides)
+    overrides += ["loss.critic=state", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
+    recipe, learners = recipe_module("latent_ppo"), recipe_module("composing.learners")
+    config = OmegaConf.to_object(recipe.resolve(compose("latent_ppo", *overrides)))
+    run = prepared(*overrides, name="latent_ppo")
     made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()
     begun = run.learner.state_dict()
     run.close()
@@ -389,26 +392,26 @@ def test_a_run_that_is_refused_leaves_what_was_there_and_its_lock_to_the_next(
 
 
 def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = recipe_module("dreamer_v3")
-    recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu"))
+    recipe = recipe_module("latent_ppo")
+    recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu"))
     told = capsys.readouterr().out
     assert "settings: tuned=images, which race Circle from images alone" in told
     assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
-    recipe.resolve(compose("dreamer_v3", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
+    recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
     assert "env.control_rate=50" in line and "(25)" in line and "loss.image_scale=1.0 (0.003)" in line
 
 
 def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing for the settings as they are; else each with what the file has, also of a group that it takes."""
-    recipe = recipe_module("dreamer_v3")
-    recipe.resolve(compose("dreamer_v3", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
+    recipe = recipe_module("latent_ppo")
+    recipe.resolve(compose("latent_ppo", "tuned=race", "track=kidney", "seed=3", "device=cpu"))
     assert "as asked for" not in capsys.readouterr().out
-    changed = ["loss=reconstruction", "loss.actor=latent_ppo", "schedule.kl_target.to=null", "replay.context=false"]
-    recipe.resolve(compose("dreamer_v3", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
+    changed = ["loss=reconstruction", "loss.critic=latent", "schedule.kl_target.to=null", "replay.context=false"]
+    recipe.resolve(compose("latent_ppo", "tuned=race", "device=cpu", "loss.drift_scale=0", *changed))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
     for words in (
-        "loss.world_model=reconstruction (privileged)", "loss.actor=latent_ppo (asymmetric_ppo)",
+        "loss.world_model=reconstruction (privileged)", "loss.critic=latent (state)",
         "schedule.kl_target.to=null (0.004)", "replay.context=false (true)", "loss.drift_scale=0.0 (1.0)",
     ):  # fmt: skip
         assert words in line

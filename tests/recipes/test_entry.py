@@ -98,7 +98,7 @@ def test_what_hydra_refuses_is_said_in_plain_words(override: str, words: str) ->
         ("dreamer_v3", ["+decoys=paper", "track=kidney", "++seed=1", "+hydra.launcher.ray.remote.num_gpus=1", "-m"]),
         ("dreamer_v3", ["schedule.max_std.to=0.1", "schedule={}", "hydra/launcher=slurm", "budget=smoke,cpu"]),
         ("experiment", ["+variants.slow=['env.num_envs=4']", "variant=slow", "--multirun"]),  # docs/baselines.md
-        ("experiment", ["--config-n=crutches", "--config-name", "ablation", "-m", "'name=--a=b'", "anything=1"]),
+        ("experiment", ["--config-n=race_ablation", "--config-name", "ablation", "-m", "'name=--a=b'", "anything=1"]),
         ("doctor", ["--json"]),
     ],
 )

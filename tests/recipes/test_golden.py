@@ -60,6 +60,7 @@ SCHEDULES = [
     "schedule.max_std.begin=0",
 ]  # fmt: skip
 """What moves everything that a schedule moves, and the learning rate of the actor by its divergence."""
+ALGORITHMS = {"race": "latent_ppo", "images": "latent_ppo", "none": "dreamer_v3", "dynamics": "dreamer_v3"}
 RUNS = {
     "race": ["tuned=race", *SCHEDULES, "schedule.wait_for_model=1.02", "schedule.wait_every=200"],
     "images": ["tuned=images", *SCHEDULES, "model.replay_ratio=3"],
@@ -72,7 +73,7 @@ def train(name: str, folder: Path) -> dict[str, Any]:
     """Train one of the runs in a folder; return what is stored of it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")
-        done = recipe("dreamer_v3", *COMMON, *RUNS[name], f"run_dir={name}", cwd=folder, timeout=900)
+        done = recipe(ALGORITHMS[name], *COMMON, *RUNS[name], f"run_dir={name}", cwd=folder, timeout=900)
     assert done.returncode == 0, done.stderr[-2000:]
     state, metadata = load_state(folder / name, "learner")
     with (folder / name / "metrics.csv").open(newline="") as file:

@@ -18,10 +18,16 @@ from dreamer_racing.settings import check_settings, shortened
 from tests.running_recipes import CONFIG, EXPERIMENTS, recipe_module
 
 RECIPES = sorted(path.stem for path in CONFIG.glob("*.yaml") if path.stem not in EXPERIMENTS)
-TRAINING = {"dreamer_v3": "check_dreamer", "ppo": "check_ppo", "sac": "check_sac"}
+TRAINING = {
+    "dreamer_v3": "check_world_model_run",
+    "latent_ppo": "check_world_model_run",
+    "ppo": "check_ppo",
+    "sac": "check_sac",
+}
 UNTYPED = ("fly", "tracks")  # their checks take what hydra composed
 NEEDED = {
     "dreamer_v3": ["model=debug", "device=cpu"],
+    "latent_ppo": ["model=debug", "device=cpu"],
     "ppo": ["device=cpu"],
     "sac": ["device=cpu"],
     "evaluate": ["checkpoint=nowhere"],

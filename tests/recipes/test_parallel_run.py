@@ -40,7 +40,7 @@ def wait_for_updates(run_dir: Path, process: subprocess.Popen[str], seconds: flo
 @pytest.mark.slow
 def test_two_processes_are_stopped_by_a_signal_and_one_goes_on(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
-    start = torchrun(2, str(ROOT / "recipes" / "dreamer_v3.py"), *SETTINGS, "total_env_steps=1000000", "run_dir=run")
+    start = torchrun(2, str(ROOT / "recipes" / "latent_ppo.py"), *SETTINGS, "total_env_steps=1000000", "run_dir=run")
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         start, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -60,7 +60,7 @@ def test_two_processes_are_stopped_by_a_signal_and_one_goes_on(tmp_path: Path) -
     assert "journal" in manifest["components"] and not {"journal", "learner", "counters"} & own.keys()
     assert OmegaConf.load(run_dir / "config.yaml").env.num_envs == 4, "the configuration is of all"
 
-    done = recipe("dreamer_v3", "resume=run", f"total_env_steps={env_steps + 64}", cwd=tmp_path)
+    done = recipe("latent_ppo", "resume=run", f"total_env_steps={env_steps + 64}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "saved by another number of processes (2 there, 1 here)" in done.stdout
     assert f"resumed run at {env_steps:,} env_steps" in done.stdout
@@ -77,7 +77,11 @@ def share(monkeypatch: pytest.MonkeyPatch, *overrides: str, rank: int = 0, proce
     monkeypatch.setattr(parallel._here, "rank", rank)
     monkeypatch.setenv("LOCAL_RANK", str(rank))
     monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
-    config = compose("dreamer_v3", *SETTINGS, *overrides)
+    imagines = "model.cuda_graph=true" in overrides
+    name, settings = (
+        ("dreamer_v3", [one for one in SETTINGS if "ppo" not in one]) if imagines else ("latent_ppo", SETTINGS)
+    )
+    config = compose(name, *settings, *overrides)
     for name, value in OmegaConf.load(ROOT / "recipes/config/model/debug.yaml").items():
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = value
@@ -87,7 +91,7 @@ def share(monkeypatch: pytest.MonkeyPatch, *overrides: str, rank: int = 0, proce
 def test_shares_add_up_to_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     shares = [share(monkeypatch, "seed=3", rank=rank) for rank in range(2)]
     assert [own.env.num_envs for own in shares] == [2, 2] and [own.model.batch_size for own in shares] == [2, 2]
-    assert [own.loss.ppo.flown for own in shares] == [64, 64] and [own.loss.ppo.minibatch for own in shares] == [32, 32]
+    assert [own.loss.ppo.steps for own in shares] == [64, 64] and [own.loss.ppo.minibatch for own in shares] == [32, 32]
     assert [own.replay.capacity for own in shares] == [500, 500], "so that each world has as many records as ever"
     assert [own.replay.held_out for own in shares] == [1, 0]
     assert [own.seed for own in shares] == [3, 1_000_003]
@@ -115,7 +119,7 @@ def test_replays_of_all_processes_must_fit_together(monkeypatch: pytest.MonkeyPa
         (["replay.held_out=2"], 2, ["replay.held_out=2", "has 2 of env.num_envs=4"]),
         (["device=cuda"], 2, ["device=cuda", "each of the 2 processes", "has 1", "--nproc-per-node=1"]),
         (["device=cuda:1"], 2, ["device=cuda:1", "device=cuda each has its own"]),
-        (["loss.actor=reinforce", "model.cuda_graph=true"], 2, ["model.cuda_graph=true", "loss.actor=reinforce"]),
+        (["model.cuda_graph=true"], 2, ["model.cuda_graph=true", "dreamer_v3 exchanges", "recipes/latent_ppo.py"]),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, list) else None,
 )

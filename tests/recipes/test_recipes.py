@@ -289,7 +289,7 @@ def test_a_run_goes_on_with_its_settings_whatever_today_s_are(run_dir: Path, tmp
     config = composed("model.replay_ratio=5", "loss=decoder_free", "schedule.discount.to=0.99")
     assert (config.model.replay_ratio, config.loss.discount, config.env.num_envs) == (5.0, 0.997, 2)
     assert config.loss.world_model == "decoder_free" and config.schedule.discount.to == 0.99
-    assert composed("tuned=race").loss.actor == "asymmetric_ppo"
+    assert composed("tuned=race").loss.world_model == "privileged"
 
 
 def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(

@@ -46,7 +46,7 @@ REFUSED = [
     (["env.looks=pretty", "env.from_pixels=true"], ["pretty", "nominal", "randomised"]),
     (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
     (["loss.actor=magic"], ["magic", "reinforce"]),
-    (["loss.actor=flown_ppo"], ["'flown_ppo' is gone", "actor=latent_ppo or asymmetric_ppo"]),
+    (["loss.actor=flown_ppo"], ["'flown_ppo' is gone", "the algorithm latent_ppo"]),
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
     (["prefill=100", "env.num_envs=8"], ["prefill=100", "12 records", "batch_length=16", "at least 128"]),
@@ -80,24 +80,24 @@ REFUSED = [
     (["schedule.learning_rates.to=0"], ["schedule.learning_rates.to=0.0: must be above 0"]),
     (["schedule.start_on_line.to=0.3"], ["schedule.start_on_line begins at env.start_on_line=0"]),
     (
-        ["loss.continuation=false", "loss=privileged", "loss.actor=asymmetric_ppo"],
-        ["loss.continuation=false, and loss.actor=asymmetric_ppo imagines nothing"],
+        ["loss.actor=asymmetric_ppo"],
+        ["loss.actor=asymmetric_ppo is an algorithm of its own now: recipes/latent_ppo.py loss.critic=state."],
     ),
     (["tuned=images", "env.from_pixels=false"], ["tuned=images is for agents that see images", "leave one out"]),
-    (["env=dmc", "loss.actor=asymmetric_ppo"], ["loss.actor=asymmetric_ppo: read", "loss.actor=reinforce"]),
+    (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["loss.ppo.steps=0"], ["loss.ppo.steps=0: must be at least 1"]),
-    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends improvements before loss.ppo.kl_target=0.03"]),
+    (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends updates before loss.ppo.kl_target=0.03"]),
     (
         ["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0.03"],
-        ["loss.ppo.kl_stop=0.03 ends improvements before schedule.kl_target.to=0.03"],
+        ["loss.ppo.kl_stop=0.03 ends updates before schedule.kl_target.to=0.03"],
     ),
     (["schedule.kl_target.to=0.01"], ["schedule.kl_target.to=0.01 begins at loss.ppo.kl_target=null"]),
     (["loss.ppo.kl_target=0.01", "schedule.kl_target.to=0"], ["schedule.kl_target.to=0.0: must be above 0"]),
     (["model.average_rate=5"], ["model.average_rate=5.0: must be above 0 and at most 1"]),
     (["loss.min_std=0.5", "loss.max_std=0.5"], ["loss.min_std=0.5 must be below loss.max_std=0.5"]),
     (["loss.min_std=0.3", "schedule.max_std.to=0.15"], ["loss.min_std=0.3 must be below schedule.max_std.to=0.15"]),
-    (["schedule.wait_for_model=0.9", "loss.actor=latent_ppo"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
+    (["schedule.wait_for_model=0.9"], ["schedule.wait_for_model=0.9: a ratio of errors"]),
     (["env.miss_radius=0.5"], ["env.miss_radius=0.5", "more than 1.025 m"]),
     (["evaluation.start_noise=9"], ["evaluation.start_noise=9", "before the plane"]),
     (["env=dmc", "env.control_rate=25"], ["env.control_rate=25", "for races", "leave it at 50"]),
@@ -108,12 +108,20 @@ REFUSED = [
 ]
 
 
+OF_LATENT_PPO = ("loss.ppo", "loss.critic", "schedule.kl_target", "schedule.wait")
+
+
+def taker(overrides: list[str]) -> str:
+    """The recipe that has such settings."""
+    return "latent_ppo" if any(override.startswith(OF_LATENT_PPO) for override in overrides) else "dreamer_v3"
+
+
 @pytest.mark.parametrize(("overrides", "words"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
 def test_what_cannot_work_is_refused_before_it_starts(
     overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as exited:
-        build(f"run_dir={tmp_path / 'run'}", *overrides)
+        build(f"run_dir={tmp_path / 'run'}", *overrides, name=taker(overrides))
     assert exited.value.code == 2
     message = capsys.readouterr().err.strip()
     assert message.startswith("error: ") and "\n" not in message
@@ -149,40 +157,50 @@ def test_what_would_be_ignored_is_refused(overrides: list[str], words: str) -> N
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["loss.actor=reinforce", "loss.ppo.epochs=2"], "loss.ppo.epochs=2 is for loss.actor=latent_ppo or asym"),
-        (
-            ["loss.actor=reinforce", "schedule.kl_target={to: 0.01}"],
-            "kl_target.to=0.01 is for loss.actor=latent_ppo",
-        ),
-        (["loss.actor=dynamics", "loss.ppo.critic_learning_rate=1"], "is for loss.actor=latent_ppo or asymmet"),
         (["loss=reconstruction", "loss.privileged_scale=3"], "privileged_scale=3.* is for loss=privileged or informed"),
         (["loss=privileged", "loss.image_scale=3"], "image_scale=3.* is for loss=reconstruction or informed"),
         (["loss=decoder_free", "loss.image_share=0.5"], "image_share=0.5 is for loss=reconstruction or informed"),
         (["env.from_pixels=false", "loss.image_share=0.5"], "is for loss=reconstruction or informed, from images"),
         (["loss=privileged", "loss.barlow_scale=3"], "loss.barlow_scale=3.* is for loss=decoder_free"),
-        (["loss.actor=asymmetric_ppo", "model.imagination_starts=8"], "imagination_starts=8 is for an actor that imag"),
+        (["loss.critic=state", "model.imagination_starts=8"], "imagination_starts=8 is for recipes/dreamer_v3.py, whi"),
         (["loss.drift_scale=1", "replay.context=true"], "drift_scale=1.* is for .*, as they are, model.sampled=false"),
         (["loss.drift_scale=1", "model.sampled=false"], "drift_scale=1.* is for records that keep latents, replay.con"),
         (["replay.recent_records=9"], "replay.recent_records=9 is for replay.recent_share above 0"),
         (["replay.storage=memmap", "replay.device=cpu"], "replay.device=cpu is for replay.storage=tensor"),
-        (["schedule.wait_for_model=1.2"], "wait_for_model=1.2 is for loss.actor=latent_ppo or asymmetric_ppo"),
-        (
-            ["schedule.wait_every=9"],
-            "wait_every=9 is for schedule.wait_for_model, of an actor that learns from what was collected",
-        ),
+        (["schedule.wait_every=9"], "wait_every=9 is for schedule.wait_for_model, which is not chosen"),
     ],
 )
 def test_what_nothing_would_read_is_refused(overrides: list[str], words: str) -> None:
-    config = compose("dreamer_v3", *overrides)
+    config = compose(taker(overrides), *overrides)
     with pytest.raises(ValueError, match=words):
         recipe_module("composing.checks").check_read(config, overrides)
 
 
 @pytest.mark.parametrize(
+    ("name", "setting", "other"),
+    [
+        ("dreamer_v3", "loss.ppo.epochs=2", "latent_ppo"),
+        ("dreamer_v3", "loss.critic=state", "latent_ppo"),
+        ("dreamer_v3", "schedule.kl_target.to=0.01", "latent_ppo"),
+        ("dreamer_v3", "schedule.wait_for_model=2", "latent_ppo"),
+        ("latent_ppo", "loss.return_decay=0.9", "dreamer_v3"),
+        ("latent_ppo", "loss.continuation=false", "dreamer_v3"),
+        ("latent_ppo", "sac.batch_size=2", "sac"),
+    ],
+)
+def test_a_setting_of_another_algorithm_is_refused_with_the_recipe_that_takes_it(
+    name: str, setting: str, other: str
+) -> None:
+    key = setting.partition("=")[0]
+    with pytest.raises(ValueError, match=rf"{key}: there is no such setting of .*{name}.py; it is for .*{other}.py"):
+        recipe_module("composing.options").refuse_slips(name, [setting])
+
+
+@pytest.mark.parametrize(
     "overrides",
     [
-        ["tuned=race", "loss.actor=reinforce", "schedule.kl_target.to=null"],
-        ["loss.actor=latent_ppo", "loss.ppo.steps=200"],
+        ["tuned=race", "schedule.kl_target.to=null"],
+        ["loss.critic=latent", "loss.ppo.steps=200"],
         ["loss=informed", "loss.privileged_scale=3", "replay.recent_share=0.1", "replay.recent_records=9"],
         ["loss=informed", "loss.image_scale=3", "loss.image_share=0.5"],
         ["loss.actor=mine:objective", "loss.world_model=mine:Mine", "loss.image_scale=9", "loss.barlow_scale=9"],
@@ -194,7 +212,7 @@ def test_what_is_read_or_left_out_or_may_be_read_passes(
     own = "from dreamer_racing.losses import State, reinforce as objective\n\n\nclass Mine(State):\n    pass\n"
     (tmp_path / "mine.py").write_text(own)
     monkeypatch.syspath_prepend(tmp_path)
-    recipe_module("composing.checks").check_read(compose("dreamer_v3", *overrides), overrides)
+    recipe_module("composing.checks").check_read(compose(taker(overrides), *overrides), overrides)
 
 
 @pytest.mark.parametrize(

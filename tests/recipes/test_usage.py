@@ -38,7 +38,7 @@ def test_groups_are_the_recipes_own() -> None:
 
 def test_what_is_read_of_the_source_is_what_the_dataclasses_are() -> None:
     """Names, defaults and ranges of every option of DreamerV3, beside those of the imported classes."""
-    schema = recipe_module("composing.schema").DreamerConfig
+    schema = recipe_module("composing.schema").DreamerV3RunConfig
     found = {name: option for option in options.options("dreamer_v3") for name in option.names}
 
     def compare(config: type, prefix: str = "") -> Iterator[str]:

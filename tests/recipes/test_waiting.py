@@ -1,4 +1,4 @@
-"""The actor waits where the model lags behind, and only where it steps alone."""
+"""The actor waits where the model lags behind."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dreamer_racing.training.model_lag import LOOKS
-from tests.running_recipes import TINY, open_session, prepared, recipe_module
+from tests.running_recipes import TINY, open_session, recipe_module
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.steps=32",
@@ -20,8 +20,10 @@ SETTINGS = [
 def test_the_actor_waits_while_the_newest_records_are_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dreamer = recipe_module("dreamer_v3")
-    config, session = open_session(*SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}")
+    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.measuring")
+    config, session = open_session(
+        *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}", name="latent_ppo"
+    )
     looked, waited = [], []
 
     def measure(learner, windows):
@@ -31,7 +33,7 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
         looked.append(learner.updates)
         return {"privileged_error": torch.tensor(1e3 if session.env_steps <= 12 * 32 else 0.0)}
 
-    def watched(self, batch, timed, update=dreamer.LatentPPO.update):
+    def watched(self, batch, timed, update=latent_ppo.LatentPPO.update):
         before = [parameter.clone() for parameter in self.agent.actor.parameters()]
         if looked and looked[-1] == self.updates:  # the first update after a look
             waited.append(self.actor_waits)
@@ -41,15 +43,8 @@ def test_the_actor_waits_while_the_newest_records_are_not_known(
         assert self.actor_waits is session.parts["lag"].waits
         return metrics
 
-    monkeypatch.setattr(dreamer, "world_model_metrics", measure)
-    monkeypatch.setattr(dreamer.LatentPPO, "update", watched)
-    dreamer.train(config, session)
+    monkeypatch.setattr(measuring, "world_model_metrics", measure)
+    monkeypatch.setattr(latent_ppo.LatentPPO, "update", watched)
+    latent_ppo.train(config, session)
     session.close()
     assert True in waited and waited[-1] is False and waited == sorted(waited, reverse=True)
-
-
-def test_an_actor_that_cannot_wait_is_not_watched(tmp_path: Path) -> None:
-    given = [setting for setting in SETTINGS if not setting.startswith(("loss.ppo", "schedule.wait_every"))]
-    session = prepared(*given, "loss.actor=reinforce", f"run_dir={tmp_path}")
-    assert session.config.schedule.wait_for_model == 2 and session.parts["lag"].limit is None
-    session.close()

@@ -24,8 +24,10 @@ SETTINGS = [
 def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
     ray_cluster: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dreamer, resumed = recipe_module("dreamer_v3"), [f"resume={tmp_path}", f"run_dir={tmp_path}"]
-    config, session = open_session(*SETTINGS, "collector=ray", f"run_dir={tmp_path}", "total_env_steps=256")
+    latent_ppo, resumed = recipe_module("latent_ppo"), [f"resume={tmp_path}", f"run_dir={tmp_path}"]
+    config, session = open_session(
+        *SETTINGS, "collector=ray", f"run_dir={tmp_path}", "total_env_steps=256", name="latent_ppo"
+    )
     log, seen = session.log_episodes, []
 
     def losing_a_worker(rollout):
@@ -35,7 +37,7 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
         return log(rollout)
 
     monkeypatch.setattr(session, "log_episodes", losing_a_worker)
-    dreamer.train(config, session)
+    latent_ppo.train(config, session)
     session.close()
     replay = session.parts["replay"]
     assert session.env.batch_size == (1,) and replay.num_streams == 4, "the worlds are the workers'"
@@ -46,14 +48,14 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
     assert session.counters["updates"] == int((9 * 32 - 100) * config.model.replay_ratio / 64)
 
     again = ["collector=ray", "num_workers=1", *resumed]
-    config, session = open_session(*SETTINGS, *again, "total_env_steps=384")
-    dreamer.train(config, session)
+    config, session = open_session(*SETTINGS, *again, "total_env_steps=384", name="latent_ppo")
+    latent_ppo.train(config, session)
     session.close()
     assert session.collected.rounds == 13, "counted on from the nine before"
     assert latest_checkpoint(tmp_path).name.endswith(str(384 + 32))  # with the round that was under way
     assert 0 < float(rows(tmp_path)[-2]["collect/weights_age"]) <= 64
 
-    config, session = open_session(*SETTINGS, *again, "total_env_steps=1000")
+    config, session = open_session(*SETTINGS, *again, "total_env_steps=1000", name="latent_ppo")
     wait = RayRollouts._wait
 
     def lose_the_next_but_one(self: RayRollouts, asked: list) -> bool:
@@ -63,11 +65,11 @@ def test_a_run_outlives_a_worker_and_goes_on_with_workers_or_without(
 
     monkeypatch.setattr(RayRollouts, "_wait", lose_the_next_but_one)
     with pytest.raises(WorkerError):
-        dreamer.train(config, session)
+        latent_ppo.train(config, session)
     session.close()
     assert latest_checkpoint(tmp_path).name.endswith(str(384 + 2 * 32)), "what was delivered is saved"
 
-    done = recipe("dreamer_v3", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
+    done = recipe("latent_ppo", f"resume={tmp_path}", "collector=local", "total_env_steps=480", cwd=tmp_path.parent)
     assert done.returncode == 0, done.stderr
     assert "workers: none (collector=local); left out: num_workers=1, workers.patience=120.0\n" in done.stdout
     assert "collector=local (was ray)" in done.stdout

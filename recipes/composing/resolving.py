@@ -1,0 +1,202 @@
+"""What a configuration leaves open, filled in for this machine, and said."""
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import cast
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from composing.arena import describe_file, scene_name, worlds_device
+from composing.command_line import new_run_dir
+from composing.options import CONFIG_DIR
+from composing.schema import CollectorKind, RunConfig
+from composing.tuned import changed_from_tuned
+from composing.workers import place_worlds, resolve_workers
+from dreamer_racing import parallel
+from dreamer_racing.devices import choose_device, choose_mixed_precision
+from dreamer_racing.envs.race.race import EPISODE_TIME
+from dreamer_racing.envs.tracks import TrackError
+
+NUM_ENVS = 32  # of the recipes with a world model
+SHORT_WINDOW = 16  # records, on a CUDA device
+MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
+SETTINGS = {
+    "race": """which race from images on a CPU:
+  the world model decodes the simulator's state in training; whoever flies sees images only
+  70 % of training episodes begin in flight on a planned racing line, until every gate is passed; then all come to begin
+  at the start, as a race does; a missed gate ends one; 25 actions a second
+  what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
+    "images": """which race Circle from images alone, on a CPU:
+  the world model reconstructs images, at a small weight; no network sees the simulator's state, not even in training
+  half of the training episodes begin at rest, half before a gate; a missed gate ends one; 25 actions a second
+  what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
+    "gpu": "those of tuned=race with more worlds and updates, for a GPU, unmeasured",
+    "suite": """which learn a task of the Control Suite from images on a CPU:
+  a small model that trains on 128 records for each action, and averaged weights fly evaluations""",
+}
+"""What the files of the group `tuned` set, by their names."""
+ACTORS = {
+    "dreamer_v3": ("the actor learns in imagination, from latents of the replay on",),
+    "latent_ppo": (
+        "the actor learns by PPO from what was collected, in the model's latents, and so does its critic; nothing is",
+        "imagined; where the model errs twice as much on new records as in training the actor waits for it",
+    ),
+}
+"""What the actor of each algorithm learns from."""
+RACE_SPEED = 450  # env_steps/s of latent PPO with tuned=race on one core with bfloat16 and AMX, two runs side by side
+FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
+
+
+def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
+    """Fill in what every recipe leaves open, and say what was chosen; return the learner's device."""
+    device = choose_device(config.device)
+    if config.device == "auto":
+        print(f"device: {device} (device=auto)")
+    config.device = str(device)
+    if OmegaConf.is_missing(config.env, "num_envs"):
+        config.env.num_envs = num_envs
+    if not math.isfinite(config.env.control_rate):
+        raise ValueError(f"env.control_rate={config.env.control_rate} Hz: must be a finite number.")
+    if config.env.episode_steps is None and config.env.suite == "race":
+        config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
+    if config.env.device == "auto":
+        config.env.device = worlds_device(device, config.env)
+        if device.type != "cpu":
+            print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
+    if config.env.suite == "race":
+        note_track(config)
+    if config.run_dir is None:
+        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
+    return device
+
+
+def note_track(config: DictConfig) -> None:
+    """Note what a track's file says, or where a run that goes on has noted it, say whether that has changed since."""
+    if config.track_description is None:
+        found: list[str | None] = []
+        parallel.together(lambda: found.append(describe_file(config.track)))
+        config.track_description = parallel.agreed(found[0])
+        return
+    with suppress(TrackError):  # it is gone, or none any more
+        if describe_file(config.track) != config.track_description:
+            print(f"track: as {config.track} was when the run was begun, which it no longer is")
+
+
+def resolve_baseline(config: DictConfig, num_envs: Mapping[str, int]) -> DictConfig:
+    """Fill in what a baseline leaves open, by what it sees (``pixels`` or ``state``), and say what was chosen.
+
+    Args:
+        config: of the recipe.
+        num_envs: worlds flown side by side, of either.
+    """
+    resolve_common(config, num_envs["pixels" if config.env.from_pixels else "state"])
+    if config.network.size == "auto":
+        sees = "images" if config.env.from_pixels else "numbers"
+        config.network.size = "paper" if config.env.from_pixels and config.budget != "smoke" else "small"
+        print(f"network: {config.network.size} (network=auto, seeing {sees}, budget={config.budget})")
+    numbers = cast(DictConfig, OmegaConf.load(CONFIG_DIR / "network" / f"{config.network.size}.yaml"))
+    for name in ("layers", "units"):
+        if OmegaConf.is_missing(config.network, name):
+            config.network[name] = numbers[name]
+    return config
+
+
+def tune(config: DictConfig) -> str:
+    """Choose the file of the group `tuned` for what is to be trained with a world model."""
+    device, size, budget = choose_device(config.device).type, config.model.size, config.budget
+    others = {
+        f"device={device}": device != "cpu",
+        "env.from_pixels=false": not config.env.from_pixels,
+        f"model={size}": size not in ("auto", "cpu_small"),
+        f"budget={budget}": budget in ("smoke", "paper"),
+    }
+    if reasons := [setting for setting, other in others.items() if other]:
+        print(f"settings: tuned=none, the algorithm as published: none are chosen for {', '.join(reasons)}")
+        return "none"
+    return "race" if config.env.suite == "race" else "suite"
+
+
+def resolve_world_model(config: DictConfig) -> DictConfig:
+    """Fill in what a recipe with a world model leaves open, by device, size and budget, and say what was chosen."""
+    place_worlds(config)
+    device = resolve_common(config, NUM_ENVS)
+    size = config.model.size
+    if size == "auto":
+        by_device = "size12m" if device.type == "cuda" else "cpu_small"
+        size = MODEL_OF_BUDGET.get(config.budget, by_device)
+        print(f"model: {size} (model=auto on {device.type}, budget={config.budget})")
+    config.model.size = size
+    shorten_windows(config, device)
+    let_drift(config)
+    resolve_workers(config)
+    numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{size}.yaml")
+    for name in config.model:
+        if OmegaConf.is_missing(config.model, name):
+            config.model[name] = numbers[name]
+    if config.model.mixed_precision is None:
+        config.model.mixed_precision, reason = parallel.agreed(choose_mixed_precision(device))
+        print(f"mixed precision: {'on' if config.model.mixed_precision else 'off'}, {reason}")
+    if config.model.cuda_graph is None:
+        config.model.cuda_graph = captures(config, device)
+        if config.model.cuda_graph:
+            print("updates: replayed as one CUDA graph (model.cuda_graph=null)")
+    tell_of_tuned(config)
+    if config.replay.held_out is None:
+        worlds = config.env.num_envs // parallel.asked_for()  # of the first process, which holds them out
+        config.replay.held_out = int(worlds >= FEW_WORLDS)
+        if not config.replay.held_out:
+            print(f"held out: nothing, because there are only {worlds} worlds (replay.held_out=null)")
+    return config
+
+
+def tell_of_tuned(config: DictConfig) -> None:
+    """Say what the settings of the group `tuned` mean, and what of them was asked for otherwise."""
+    if config.tuned not in SETTINGS:
+        return
+    files = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have every number"
+    said = (f"settings: tuned={config.tuned}, {SETTINGS[config.tuned]}", *ACTORS[config.algorithm], files)
+    print("\n  ".join(said))
+    if changed := changed_from_tuned(config):
+        print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
+    if config.algorithm == "latent_ppo" and config.tuned != "gpu":
+        minutes = config.total_env_steps / RACE_SPEED / 60
+        time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
+        print(f"length: {config.total_env_steps:,} env_steps, {time} at one core's {RACE_SPEED} a second")
+
+
+def shorten_windows(config: DictConfig, device: torch.device) -> None:
+    """On a CUDA device, take the records of a batch in more and shorter windows where their number is left open.
+
+    A record of a window waits for the one before it, and every wait is a kernel's launch; windows begin warm then, or
+    the first records of short ones would teach forgetting.
+    """
+    open_numbers = all(OmegaConf.is_missing(config.model, name) for name in ("batch_size", "batch_length"))
+    shortened = device.type == "cuda" and open_numbers and config.replay.context is not False
+    if shortened:
+        numbers = OmegaConf.load(CONFIG_DIR / "model" / f"{config.model.size}.yaml")
+        shortened = numbers.batch_length > SHORT_WINDOW
+    if shortened:
+        config.model.batch_length = SHORT_WINDOW
+        config.model.batch_size = numbers.batch_size * numbers.batch_length // SHORT_WINDOW
+        print(f"batch: {config.model.batch_size} windows of {SHORT_WINDOW} records that begin warm, on a CUDA device")
+    if config.replay.context is None:
+        config.replay.context = shortened
+
+
+def let_drift(config: DictConfig) -> None:
+    """Hold the policy nowhere where no latents are kept to hold it at, or where they differ by their draw already."""
+    reasons = {
+        "records keep no latents (replay.context=false)": not config.replay.context,
+        "latents are drawn (model.sampled=true)": config.model.sampled,
+    }
+    if config.loss.drift_scale and any(reasons.values()):
+        config.loss.drift_scale = 0.0
+        print(f"policy's drift: not held, because {' and '.join(name for name, holds in reasons.items() if holds)}")
+
+
+def captures(config: DictConfig, device: torch.device) -> bool:
+    """Whether updates can be captured as a CUDA graph: not beside what acts meanwhile, or exchanges on the way."""
+    alone = parallel.asked_for() == 1 or config.algorithm == "latent_ppo"
+    return device.type == "cuda" and config.collector is not CollectorKind.overlapped and alone

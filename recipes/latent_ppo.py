@@ -1,0 +1,120 @@
+"""Recurrent PPO in a world model's latents: collect → replay → update the model → update the actor → evaluate.
+
+    python recipes/latent_ppo.py track=kidney
+    python recipes/latent_ppo.py track=circle tuned=images           # no network sees the simulator's state in training
+    python recipes/latent_ppo.py track=figure8 env=faithful loss.critic=latent
+    python recipes/latent_ppo.py resume=runs/latent_ppo_kidney_20260101-120000
+    torchrun --nproc-per-node=2 recipes/latent_ppo.py track=kidney   # processes that share worlds, replay and batch
+
+Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
+"""
+
+from typing import Any, cast
+
+from composing.building import (
+    Rewards,
+    make_run_evaluator,
+    make_sequence_replay,
+    make_tracker,
+    seed_generators,
+)
+from composing.checks import check_world_model_run
+from composing.entry import recipe
+from composing.launching import launch
+from composing.learners import begin_with, make_learner, make_schedule, move_starts
+from composing.measuring import measure, measure_lag
+from composing.resolving import resolve_world_model, tune
+from composing.schema import LatentPPORunConfig, register
+from composing.sharing import share_of
+from composing.workers import make_own_env, make_rollouts
+from omegaconf import DictConfig
+
+from dreamer_racing import parallel
+from dreamer_racing.learners.latent_ppo import LatentPPO
+from dreamer_racing.modules import Interface
+from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.session import Session
+
+REMEDY = "model.learning_rate (of an actor's update loss.ppo.learning_rate), or model.mixed_precision=false"
+
+register()
+
+
+@recipe("latent_ppo")
+def main(config: DictConfig) -> None:
+    """Compose the configuration, and train."""
+    launch(config, resolve, train, tune, remedy=REMEDY)
+
+
+def resolve(config: DictConfig) -> DictConfig:
+    """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
+    return resolve_world_model(config)
+
+
+def train(config: LatentPPORunConfig, session: Session) -> None:
+    """Collect, replay, update, evaluate, save."""
+    check_world_model_run(config)
+    own = share_of(config)  # of several processes
+    env = make_own_env(own)
+    learner = cast(LatentPPO, make_learner(own, Interface.of(env), own.device, config.seed))
+    if config.init_from and not config.resume:
+        print(begin_with(learner, config, env))
+    seed_generators(own.seed)
+    rewards = Rewards(config, env)
+    rollouts = make_rollouts(own, env, learner)
+    replay = make_sequence_replay(own, env, rewards, learner.latent_format if config.replay.context else None)
+    ratio = config.make_replay_ratio()
+    schedule = make_schedule(config, env)
+    lag = ModelLag(config.schedule.wait_for_model, config.schedule.wait_every)
+    own_parts: dict[str, Any] = {} if parallel.is_first() else {"storage": learner.storage}  # else in the learner's
+    session.track(
+        learner=learner,
+        env=env,
+        rollouts=rollouts,
+        evaluator=make_run_evaluator(config, session.directory.path, learner),
+        tracker=make_tracker(config),
+        replay=replay,
+        ratio=ratio,
+        schedule=schedule,
+        curriculum=rewards,
+        lag=lag,
+        best=("schedule",),
+        **own_parts,
+    )
+
+    for rollout in session.rollouts():
+        # Replay what was collected, and keep it for the actor; a resumed run first makes the updates that are due.
+        if rollout is not None:
+            replay.extend(rollout)
+            learner.collect(rollout)
+            episodes = session.log_episodes(rollout)
+            session.log(rewards.adapt(episodes))
+            session.log(schedule.observe(episodes, session.env_steps))
+
+        # Move what is scheduled; the actor waits while the model does not know the newest records.
+        if lag.due(session.env_steps) and session.counters["updates"]:
+            session.log(measure_lag(session, config, learner, replay, lag))
+        scheduled = move_starts(env, schedule.at(session.env_steps))
+        learner.adjust(**scheduled)
+        learner.actor_waits = lag.waits
+
+        # Update the world model on replayed windows, and actor and critic once enough is collected.
+        for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
+            with session.timed("sample"):
+                batch = replay.sample()
+            metrics = learner.update(batch, session.timed)
+            session.log(metrics)
+            lag.trained(metrics)
+            if config.replay.context and learner.latents is not None:  # later windows go on from the latents of now
+                replay.refresh(batch["index"], learner.latents["belief"], learner.latents["state"])
+
+        # Evaluate, log and save.
+        if session.due("evaluate"):
+            session.evaluate()
+        if session.due("log"):
+            session.write_row(measure(session, config, learner, replay, scheduled))
+        session.save_if_due()
+
+
+if __name__ == "__main__":
+    main()
