@@ -35,6 +35,7 @@ BEGIN, END = "<!-- benchmarks/gpu.py writes this -->", "<!-- end of benchmarks/g
 GPU_TESTS = (
     "tests/learners/test_cuda_graph.py",
     "tests/envs/simulator/test_mujoco_warp.py",
+    "tests/envs/test_camera_rate.py",
     "tests/envs/race/test_gates.py",
     "tests/experience/test_replay.py",
 )

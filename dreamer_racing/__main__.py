@@ -32,7 +32,7 @@ def usage(folder: Path) -> Iterator[str]:
     yield from ("usage: python -m dreamer_racing RECIPE [NAME=VALUE ...]", "")
     for path in sorted(folder.glob("*.py")):
         said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        yield f"  {path.stem:<13}{said.partition(chr(10))[0]}"
+        yield f"  {path.stem:<16}{said.partition(chr(10))[0]}"
     yield from ("", "python -m dreamer_racing RECIPE --help has the options of one.")
 
 

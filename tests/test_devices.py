@@ -12,11 +12,9 @@ INSTRUCTIONS = {"avx512_bf16": True, "amx_bf16": False}
 
 @pytest.mark.parametrize("slow", [torch.float32, torch.bfloat16])
 def test_a_cpu_computes_in_bfloat16_where_that_is_faster(slow: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    multiply = torch.mm
-
     def as_slow_as_said(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        time.sleep(0.005 if left.dtype == slow else 0.0)
-        return multiply(left, right)
+        time.sleep(0.001 if left.dtype == slow else 0.0)
+        return left
 
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: INSTRUCTIONS)
     monkeypatch.setattr(torch, "mm", as_slow_as_said)

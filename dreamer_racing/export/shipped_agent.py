@@ -209,7 +209,7 @@ def check_env(folder: str | Path, contract: dict[str, Any], env: DroneRacingEnv)
     pairs: dict[str, tuple[Any, Any]] = {
         "env.control_rate": (contract["control"]["rate_hz"], 1.0 / env.worlds.parameters.control_dt),
         "env.from_pixels": (camera is not None, env.from_pixels),
-        "env.imu": tuple("exact" if has else "none" for has in ("imu" in contract, env.worlds.imu is not None)),
+        "env.imu": ("exact" if "imu" in contract else "none", "exact" if env.worlds.imu is not None else "none"),
     }
     if camera is not None and env.from_pixels:
         here = describe_camera(env.worlds.camera)

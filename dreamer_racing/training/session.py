@@ -119,6 +119,7 @@ class Session:
         self.clock = RunClock(self.counters, alone=parallel.count() == 1)
         self.began = False
         self.parts: dict[str, Any] = {}
+        self.metrics = UnwrittenMetrics()
         self.say: Callable[[str], None] = logger.info
         self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
         self._periods = Periods(log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every)
@@ -192,7 +193,6 @@ class Session:
         kept = ("learner", "counters", *best)
         self.best = BestCheckpoint(path, {name: self.parts[name] for name in kept}, self.env_steps)
         parallel.together(lambda: None)  # all have read what is written anew now
-        self.metrics = UnwrittenMetrics()
         if parallel.is_first():
             self.directory.set_aside_after(self.env_steps)
             self._note_start(self.env_steps)

@@ -173,7 +173,8 @@ def _options(config: ast.ClassDef, module: Module, prefix: str = "") -> Iterator
         default, allowed = default_of(field, home)
         if kind:  # an enumeration
             allowed = ", ".join(f"`{value}`" for value in members(kind[0]).values())
-        free = ast.unparse(field.annotation).startswith("dict")
+        # Any: also of a dataclass that is made of the fields of another
+        free = ast.unparse(field.annotation).startswith(("dict", "Any"))
         yield Option((f"{prefix}{name}",), default, allowed, meanings.get(name, ""), free)
 
 
@@ -274,9 +275,11 @@ def no_such_setting(name: str, recipe: str) -> str:
     known = names(recipe)
     if name in known:  # a group that nothing is taken from where nobody says so
         return f"{name}: is added, with a plus: +{name}=..."
-    if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
-        return f"{name}: there is no such setting of recipes/{recipe}.py; it is for {' and '.join(takers)}."
     last = {full.rpartition(".")[2]: full for full in known}
+    if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
+        same = last.get(name.rpartition(".")[2])
+        meant = f" (did you mean {same}?)" if same else ""
+        return f"{name}: there is no such setting of recipes/{recipe}.py{meant}; it is for {' and '.join(takers)}."
     close = difflib.get_close_matches(name, known, n=1) or [
         last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)
     ]

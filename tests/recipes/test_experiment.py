@@ -122,7 +122,10 @@ def test_a_run_with_other_settings_is_not_continued(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("override", "words"),
-    [("algorithm=tdmpc", "algorithm=tdmpc: there are dreamer_v3, ppo, sac"), ("variant=mad", "variant=mad: there are")],
+    [
+        ("algorithm=tdmpc", "algorithm=tdmpc: there are dreamer_v3, latent_ppo, ppo, sac"),
+        ("variant=mad", "variant=mad: there are"),
+    ],
 )
 def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=words):
