@@ -48,7 +48,13 @@ def restore(path: str) -> Trained:
         raise SystemExit(f"{checkpoint} was trained by {config.algorithm}, which has no world model.")
     config.device, config.replay.device = "cpu", "auto"
     learner, counters = restore_learner(config, checkpoint, torch.device("cpu"), "trained")
-    where = {"run": run.path.name, "track": config.track, "actor": config.loss.actor, "seed": config.seed, **counters}
+    where = {
+        "run": run.path.name,
+        "track": config.track,
+        "actor": cast(Any, config.loss).actor,
+        "seed": config.seed,
+        **counters,
+    }
     return Trained(config, cast(WorldModelLearner, learner), checkpoint, where)
 
 

@@ -203,10 +203,11 @@ def default_of(field: ast.AnnAssign, module: Module) -> tuple[str, str]:
     """Return a field's default as one would write it, and what it may be, in words."""
     value, allowed = field.value, ""
     if isinstance(value, ast.Call) and isinstance(value.func, ast.Name):
-        if value.func.id == "setting":
+        made_by = value.func.id
+        if made_by == "setting":
             allowed = str(evaluate(value.args[1], module))
             value = value.args[0]
-        elif value.func.id == "field":  # of an empty list or dictionary, or one that a lambda makes
+        elif made_by == "field":  # of an empty list or dictionary, or one that a lambda makes
             factory = value.keywords[0].value
             value = factory if isinstance(factory, ast.Lambda) else ast.Constant("")
     default = None if value is None else evaluate(value, module)
@@ -277,9 +278,7 @@ def no_such_setting(name: str, recipe: str) -> str:
         return f"{name}: is added, with a plus: +{name}=..."
     last = {full.rpartition(".")[2]: full for full in known}
     if takers := [f"recipes/{other}.py" for other in TRAINING if recipe in TRAINING and name in names(other)]:
-        same = last.get(name.rpartition(".")[2])
-        meant = f" (did you mean {same}?)" if same else ""
-        return f"{name}: there is no such setting of recipes/{recipe}.py{meant}; it is for {' and '.join(takers)}."
+        return f"{name}: there is no such setting of recipes/{recipe}.py; it is for {' and '.join(takers)}."
     close = difflib.get_close_matches(name, known, n=1) or [
         last[word] for word in difflib.get_close_matches(name.rpartition(".")[2], last, n=1)
     ]
