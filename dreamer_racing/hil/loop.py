@@ -197,7 +197,7 @@ class FlightLoop:
                 did = "disarmed the vehicle" if met is None else f"could not disarm the vehicle: {met}"
                 return f"cut: no command for more than {longest:g} s: the watchdog {did}"
             if flew and not armed:
-                return f"{outputs.verdict.state.value}: {words or 'disarmed'}"
+                return f"{outputs.verdict.state.value}: {words or 'disarmed'}" + self._refusal()
             most = duration if flew else patience
             if most is not None and start - began >= most:
                 return f"{most:g} s are over" + ("" if flew else f"; not armed: {words}")
@@ -217,6 +217,10 @@ class FlightLoop:
             self._log(logging.INFO, "%s: %s", verdict.state.value if flew else "not armed", words)
         self._said = said
         return words
+
+    def _refusal(self) -> str:
+        """Return why the flight controller did not arm, if it said so, to put after other words."""
+        return f"; the flight controller did not arm: {self._link.refusal}" if self._link.refusal else ""
 
     def _log(self, level: int, message: str, *values: object, error: Exception | None = None) -> None:
         """Log a line, and wait for nobody who is to read it."""

@@ -67,7 +67,12 @@ def at_rest() -> Command:
 
 
 class Link(Protocol):
-    """Carries commands to a vehicle, and back what it says of its battery."""
+    """Carries commands to a vehicle, and back what it says of its battery and of itself."""
+
+    @property
+    def refusal(self) -> str:
+        """Why the flight controller did not arm although it was told to, in its words; empty as far as is known."""
+        ...
 
     def send(self, command: Command) -> bytes:
         """Send a command now, without waiting; return the bytes that went out, none if it was dropped."""

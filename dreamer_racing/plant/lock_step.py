@@ -71,6 +71,8 @@ class LockStep:
         """Return nothing: this vehicle does not speak of its battery."""
         return []
 
+    refusal = ""  # this vehicle arms when it is told to
+
     def reckon_with(self, voltage: float) -> None:
         """Do nothing: thrust is sent as it is."""
 

@@ -86,6 +86,7 @@ class HilConfig:
     link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
     link_host: str = "127.0.0.1"  # to send to
     link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
+    serial_port: int | None = setting(5761, Range(1, 65535))  # link=betaflight_sitl: its MSP; null: it has none
     device: str | None = None  # serial port
     baud: int | None = setting(None, Range(1))  # null: the protocol's own
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
@@ -161,6 +162,7 @@ def check_read(config: HilConfig) -> None:
         (("renderer",), config.actor != PILOT, "an actor that sees"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
+        (("serial_port",), config.link == "betaflight_sitl", "link=betaflight_sitl"),
         (("arm_channel",), config.link in BETAFLIGHT, f"link={', '.join(BETAFLIGHT)}"),
         (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that takes a throttle"),
         (("voltage_tolerance", "voltage_smoothing"), config.link in HEARING, f"link={', '.join(HEARING)}"),
@@ -314,6 +316,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
         thrust,
         config.arm_channel,
         rate,
+        config.serial_port if config.link == "betaflight_sitl" else None,
     )
 
 

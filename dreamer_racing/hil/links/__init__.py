@@ -6,7 +6,7 @@
 | ``betaflight_sitl`` | UDP | channels | rates, thrust | |
 | ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR |
 | ``sbus`` | serial port | channels | device, rates, thrust | |
-| ``msp`` | serial port | channels | device, rates, thrust | BATTERY_STATE, which it asks for |
+| ``msp`` | serial port, or TCP | channels | device or port, rates, thrust | BATTERY_STATE, which it asks for |
 | ``mavlink`` | UDP, or serial port | body rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS |
 """
 
@@ -15,13 +15,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from dreamer_racing.hil.betaflight.status import REQUEST as STATUS_REQUEST
+from dreamer_racing.hil.betaflight.status import SerialOverTcp
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
 from dreamer_racing.hil.links.msp import BATTERY_REQUEST, MspTelemetry, encode_msp
 from dreamer_racing.hil.links.sbus import encode_sbus
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
-from dreamer_racing.hil.links.sitl import RC_PORT, encode_sitl
+from dreamer_racing.hil.links.sitl import RC_PORT, SitlTransport, encode_sitl
+from dreamer_racing.hil.links.tcp import TcpTransport
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
@@ -41,6 +44,8 @@ class LinkConfig:
         rates: What the flight controller makes of the sticks.
         thrust: What motors and battery make of the throttle.
         arm_channel: Index of the channel that arms, 4 for AUX1.
+        serial_port: For ``betaflight_sitl``: TCP port of the firmware's first serial port, whose answer is waited for
+            before any channels are sent; None: they are sent at once, and nothing is heard.
         rate: Commands a second, to refuse a serial port that is too slow for them; None: whatever comes.
 
     Raises:
@@ -56,6 +61,7 @@ class LinkConfig:
     thrust: ThrustMap | None = None
     arm_channel: int = FIRST_SWITCH
     rate: float | None = None
+    serial_port: int | None = None
 
     def __post_init__(self) -> None:
         check_arm_channel(self.arm_channel)
@@ -110,7 +116,11 @@ def _udp(config: LinkConfig) -> TransportLink:
 
 def _betaflight_sitl(config: LinkConfig) -> TransportLink:
     rates, thrust = _maps(config)
-    return ChannelLink(_datagrams(config, RC_PORT), encode_sitl, rates, thrust, config.arm_channel)
+    channels = _datagrams(config, RC_PORT)
+    if config.serial_port is None:
+        return ChannelLink(channels, encode_sitl, rates, thrust, config.arm_channel)
+    transport = SitlTransport(channels, SerialOverTcp(config.serial_port, config.host))
+    return ChannelLink(transport, encode_sitl, rates, thrust, config.arm_channel, MspTelemetry())
 
 
 def _radio(
@@ -138,7 +148,7 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "betaflight_sitl": _betaflight_sitl,
     "crsf": _radio(encode_crsf, CrsfTelemetry),
     "sbus": _radio(encode_sbus),
-    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST),
+    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST + STATUS_REQUEST),
     "mavlink": _mavlink,
 }
 """What makes a link, by its name."""
@@ -165,6 +175,8 @@ def _datagrams(config: LinkConfig, default_port: int | None = None) -> Transport
 
 
 def _wire(config: LinkConfig) -> Transport:
+    if config.name == "msp" and config.device is None and config.port is not None:
+        return TcpTransport(SerialOverTcp(config.port, config.host))
     return SerialPort(given(config.device, "device", f"the link {config.name}"), _wire_settings(config))
 
 

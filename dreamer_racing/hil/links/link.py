@@ -60,12 +60,14 @@ class TransportLink(ABC):
     Attributes:
         dropped: Commands so far that did not go out, because a buffer was full or nobody listened.
         thrust: As given, with the voltage of now.
+        refusal: Why the flight controller did not arm although it was told to, in its words; empty as far as is known.
     """
 
     def __init__(
         self, transport: Transport, thrust: ThrustMap | None = None, telemetry: Telemetry | None = None
     ) -> None:
         self.dropped = 0
+        self.refusal = ""
         self.thrust = thrust
         self._transport, self._telemetry = transport, telemetry
         self._armed = False  # whether the last command was
@@ -84,7 +86,14 @@ class TransportLink(ABC):
         if self._telemetry is None:
             return []
         arrived = self._transport.read()
-        return [Reading(time, voltage) for time, data in arrived for voltage in self._telemetry.read(data)]
+        readings = [Reading(time, voltage) for time, data in arrived for voltage in self._telemetry.read(data)]
+        if (status := self._telemetry.status) is not None:
+            self._telemetry.status = None
+            if status.armed:
+                self.refusal = ""
+            elif self._armed:
+                self.refusal = status.words or "it gives no reason"
+        return readings
 
     def reckon_with(self, voltage: float) -> None:
         """Let the thrust map reckon with a voltage, V, from now on, or with the nearest that it can (`ThrustMap.at`).

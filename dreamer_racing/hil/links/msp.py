@@ -1,11 +1,12 @@
-"""MSP version 1 (MultiWii serial protocol): SET_RAW_RC and BATTERY_STATE, over USB or a serial port.
+"""MSP version 1 (MultiWii serial protocol): SET_RAW_RC, BATTERY_STATE and STATUS, over USB or a serial port.
 
 38 bytes, little endian: ``b"$M<"``, size 32 of the payload, code 200, 16 u16 µs, and all after ``<`` combined by XOR.
 In Betaflight: ``feature RX_MSP``, and at least five messages a second.
 
-The battery is asked for (code 130, no payload). The answer begins with ``b"$M>"``; its payload of 11 bytes is: cells u8
-(0: no battery), capacity u16 (mAh), voltage u8 (0.1 V), drawn u16 (mAh), current i16 (0.01 A), alert u8, and voltage
-u16 (0.01 V), which is the one that is read. Releases before 4.0 lack it.
+The status (101, `hil.betaflight.status`) is asked for with the battery. That one is asked for (code 130, no payload).
+The answer begins with ``b"$M>"``; its payload of 11 bytes is: cells u8 (0: no battery), capacity u16 (mAh), voltage u8
+(0.1 V), drawn u16 (mAh), current i16 (0.01 A), alert u8, and voltage u16 (0.01 V), which is the one that is read.
+Releases before 4.0 lack it.
 
 Reference: Betaflight, src/main/msp/msp_serial.c, msp_protocol.h and msp.c (MSP_BATTERY_STATE).
 """
@@ -17,6 +18,7 @@ from collections.abc import Sequence
 from functools import reduce
 from operator import xor
 
+from dreamer_racing.hil.betaflight.status import STATUS, read_status
 from dreamer_racing.hil.links.telemetry import FrameTelemetry
 
 SET_RAW_RC, BATTERY_STATE = 200, 130
@@ -44,7 +46,7 @@ def decode_msp(frame: bytes) -> tuple[float, ...] | None:
 
 
 class MspTelemetry(FrameTelemetry):
-    """Reads answers to `BATTERY_REQUEST`."""
+    """Reads answers to `BATTERY_REQUEST`, and to `hil.betaflight.status.REQUEST`."""
 
     def frame_size(self, data: bytes) -> int | None:
         """Return the size of the frame that begins the data; see `FrameTelemetry`."""
@@ -59,6 +61,11 @@ class MspTelemetry(FrameTelemetry):
     def is_battery(self, frame: bytes) -> bool:
         """Whether a frame is a BATTERY_STATE, or says that the flight controller has none."""
         return frame[4] == BATTERY_STATE
+
+    def note(self, frame: bytes) -> None:
+        """Keep what a STATUS says."""
+        if frame[4] == STATUS and frame[2] == ord(">"):
+            self.status = read_status(frame[5:-1]) or self.status
 
     def voltage(self, frame: bytes) -> float | None:
         """Return the voltage, V, in steps of 0.01 V."""

@@ -1,8 +1,10 @@
-"""What comes back from a vehicle, as far as it is read: the voltage of its battery."""
+"""What comes back from a vehicle, as far as it is read: the voltage of its battery, and whether it has armed."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+
+from dreamer_racing.hil.betaflight.status import FlightControllerStatus
 
 
 class Telemetry(ABC):
@@ -10,10 +12,12 @@ class Telemetry(ABC):
 
     Attributes:
         rejected: Frames so far that were damaged or say no voltage, and stretches of bytes that were no frame.
+        status: What the flight controller last said of itself; None: nothing, or its protocol does not say.
     """
 
     def __init__(self) -> None:
         self.rejected = 0
+        self.status: FlightControllerStatus | None = None
 
     @abstractmethod
     def read(self, data: bytes) -> list[float]:
@@ -67,4 +71,9 @@ class FrameTelemetry(Telemetry):
                 voltage = self.voltage(frame)
                 self.rejected += voltage is None
                 voltages += [] if voltage is None else [voltage]
+            else:
+                self.note(frame)
         return voltages
+
+    def note(self, frame: bytes) -> None:
+        """Take in a whole frame that speaks of something else."""

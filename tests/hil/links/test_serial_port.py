@@ -15,6 +15,7 @@ import pytest
 
 serial = pytest.importorskip("serial")
 
+from dreamer_racing.hil.betaflight.status import REQUEST as STATUS_REQUEST  # noqa: E402
 from dreamer_racing.hil.links import LinkConfig, make_link  # noqa: E402
 from dreamer_racing.hil.links.crsf import crc8, decode_crsf  # noqa: E402
 from dreamer_racing.hil.links.msp import BATTERY_REQUEST, decode_msp  # noqa: E402
@@ -51,7 +52,7 @@ def read(descriptor: int, size: int) -> bytes:
     [
         ("crsf", decode_crsf),
         ("sbus", lambda data: decode_sbus(data).channels),
-        ("msp", lambda data: decode_msp(data.removesuffix(BATTERY_REQUEST))),
+        ("msp", lambda data: decode_msp(data.removesuffix(BATTERY_REQUEST + STATUS_REQUEST))),
     ],
 )
 def test_frames_arrive(wire, name, decode):

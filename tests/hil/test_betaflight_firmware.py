@@ -1,0 +1,167 @@
+"""What finds, sets up and questions a firmware, without one: `tests/plant/test_real_firmware.py` has a real one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dreamer_racing.hil.betaflight import firmware as firmwares
+from dreamer_racing.hil.betaflight.command_line import CommandLine
+from dreamer_racing.hil.betaflight.firmware import Firmware, Ports, find_firmware, takes_file
+from dreamer_racing.hil.betaflight.status import FlightControllerStatus, SerialOverTcp, read_status
+from dreamer_racing.hil.links.link import ChannelLink
+from dreamer_racing.hil.links.msp import MspTelemetry
+from dreamer_racing.hil.links.sitl import SitlTransport, encode_sitl
+from dreamer_racing.hil.sticks import RateMap, ThrustMap
+from dreamer_racing.hil.vehicle import Command, at_rest, hover
+
+
+def program(folder: Path, text: str) -> Path:
+    """A program that stands for a firmware."""
+    path = folder / "betaflight_SITL.elf"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def test_a_firmware_is_found_by_name_then_by_the_variable_then_in_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(firmwares.VARIABLE, raising=False)
+    monkeypatch.setattr(firmwares.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(FileNotFoundError, match=r"pip install 'dreamer_racing\[sitl\]' compiles a 4.6"):
+        find_firmware()
+    named = program(tmp_path, "true")
+    monkeypatch.setenv(firmwares.VARIABLE, str(named))
+    assert find_firmware() == named
+    with pytest.raises(FileNotFoundError, match="nowhere is no program of a Betaflight"):
+        find_firmware(tmp_path / "nowhere")
+
+
+def test_one_that_ends_at_once_is_said_with_its_last_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(firmwares, "_BOOTS_WITHIN", 0.5)
+    dies = program(tmp_path, "echo no such address; exit 3")
+    with pytest.raises(OSError, match="ended with status 3: …no such address"):
+        Firmware(dies, ["set a = 1"], Ports.free(9))
+
+
+def test_one_that_reads_a_file_is_given_one(tmp_path: Path) -> None:
+    assert takes_file(program(tmp_path, "# --config FILE"))
+    assert not takes_file(program(tmp_path, "# the address"))
+
+
+def test_ports_are_free_ones() -> None:
+    ports = Ports.free(9002)
+    assert len({*ports}) == 4 and ports.motors == 9002
+    assert Ports() == (9002, 9003, 9004, 5761)
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield listening
+
+
+def test_the_command_line_types_lines_and_names_those_that_are_not_taken(listener: socket.socket) -> None:
+    """The dialogue of 4.6.0, byte by byte."""
+    heard = []
+
+    def answer() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            assert connection.recv(1) == b"#"
+            connection.sendall(b"\r\nEntering CLI Mode, type 'exit' to reboot, or 'help'\r\n\r\n# ")
+            for said in (
+                b"set mid_rc = 1500\r\nmid_rc set to 1500\r\n",
+                b"set x = 0\r\n###ERROR IN set: INVALID NAME: x = 0###\r\n",
+            ):
+                heard.append(connection.recv(100))
+                connection.sendall(said + b"\r\n# ")
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    line = CommandLine(listener.getsockname()[1], patience=5.0)
+    refused = line.type_all(["# why", "set mid_rc = 1500", "", "set x = 0"])
+    thread.join()
+    line.close()
+    assert heard == [b"set mid_rc = 1500\n", b"set x = 0\n"]
+    assert refused == {"set x = 0": "ERROR IN set: INVALID NAME: x = 0"}
+
+
+STATUS_4_6 = bytes.fromhex("0000 0000 2300 00000000 00 0000 0000 03 000000 1d 04000010 00 0000 04".replace(" ", ""))
+"""Of 4.6.0 without a radio, told to arm: 29 flags, of which RXLOSS and the last."""
+
+
+def test_a_status_is_read_and_said_in_words() -> None:
+    status = read_status(STATUS_4_6)
+    assert status == FlightControllerStatus(armed=False, flags=1 << 2 | 1 << 28, count=29)
+    assert status.names == ("RXLOSS", "ARM_SWITCH")
+    assert status.words.startswith("RXLOSS: it hears no valid channels; ARM_SWITCH: ")
+    assert read_status(STATUS_4_6[:6] + b"\1" + STATUS_4_6[7:]).armed
+    assert FlightControllerStatus(False, 1 << 26, 29).names == ("flag 26",)
+    assert FlightControllerStatus(False, 0, 29).words == ""
+    for size in range(len(STATUS_4_6) - 4):
+        assert read_status(STATUS_4_6[:size]) is None
+
+
+class Channels:
+    """A transport that keeps what was written."""
+
+    def __init__(self) -> None:
+        self.written: list[bytes] = []
+
+    def write(self, data: bytes) -> bool:
+        self.written.append(data)
+        return True
+
+    def discard(self) -> None: ...
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        return iter(())
+
+    def close(self) -> None: ...
+
+
+def answer_to(payload: bytes) -> bytes:
+    body = bytes([len(payload), 101]) + payload
+    checksum = 0
+    for byte in body:
+        checksum ^= byte
+    return b"$M>" + body + bytes([checksum])
+
+
+def test_no_channels_are_sent_before_the_firmware_answers_and_its_refusal_is_kept(listener: socket.socket) -> None:
+    """A firmware that hears channels while it boots may stay in its failsafe (betaflight#12401)."""
+    channels = Channels()
+    transport = SitlTransport(channels, SerialOverTcp(listener.getsockname()[1]))
+    thrust = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)
+    link = ChannelLink(transport, encode_sitl, RateMap(10.0, 10.0, 4.0), thrust, telemetry=MspTelemetry())
+    assert link.send(at_rest()) == b"" and channels.written == []
+    firmware, _ = listener.accept()
+    assert firmware.recv(100) == b"$M<\x00\x65\x65"
+    assert link.listen() == [] and link.send(at_rest()) == b""
+    firmware.sendall(answer_to(STATUS_4_6))
+    while not transport._booted:
+        link.listen()
+    assert link.send(Command(True, hover())) == channels.written[0]
+    assert link.refusal == ""  # that was said before it was told to arm
+    firmware.sendall(answer_to(STATUS_4_6))
+    while not link.refusal:
+        link.listen()
+    assert "it hears no valid channels" in link.refusal
+    firmware.sendall(answer_to(STATUS_4_6[:6] + b"\1" + STATUS_4_6[7:]))
+    while link.refusal:
+        link.listen()
+    firmware.close()
+    link.close()
+
+
+def test_the_library_is_part_of_what_ships() -> None:
+    source = Path(firmwares.__file__).with_name("simulated_time.c")
+    assert source.is_file() and os.access(source, os.R_OK)
