@@ -100,7 +100,7 @@ STATUS_4_6 = bytes.fromhex("0000 0000 2300 00000000 00 0000 0000 03 000000 1d 04
 
 def test_a_status_is_read_and_said_in_words() -> None:
     status = read_status(STATUS_4_6)
-    assert status == FlightControllerStatus(armed=False, flags=1 << 2 | 1 << 28, count=29)
+    assert status == FlightControllerStatus(armed=False, flags=1 << 2 | 1 << 28, total=29)
     assert status.names == ("RXLOSS", "ARM_SWITCH")
     assert status.words.startswith("RXLOSS: it hears no valid channels; ARM_SWITCH: ")
     assert read_status(STATUS_4_6[:6] + b"\1" + STATUS_4_6[7:]).armed

@@ -56,12 +56,12 @@ class FlightControllerStatus(NamedTuple):
     Args:
         armed: Whether its motors may turn.
         flags: What keeps it from arming, one bit each.
-        count: How many flags it has.
+        total: How many flags it has.
     """
 
     armed: bool
     flags: int
-    count: int
+    total: int
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ class FlightControllerStatus(NamedTuple):
         return [self._reason(bit) for bit in range(32) if self.flags >> bit & 1]
 
     def _reason(self, bit: int) -> tuple[str, str]:
-        if bit == self.count - 1:
+        if bit == self.total - 1:
             return _SWITCH
         return _REASONS[bit] if bit < len(_REASONS) else (f"flag {bit}", "see `status` in its CLI")
 
