@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import yaml
 
+from dreamer_racing.commands import from_here, python
+
 FOLDER = Path(__file__).parents[1]
 OPTIONS = FOLDER.parent / "docs" / "options.md"
 TRAINING = ("dreamer_v3", "ppo", "sac")
@@ -40,14 +42,15 @@ def answer_help() -> None:
 
 
 def command(recipe: str) -> str:
-    """The words that start a recipe: from a clone its file, from an installed package, which holds it, the package."""
+    """The words that start a recipe from here: of a clone its file, of an installed package, which holds it, that."""
     installed = (FOLDER.parent / "__main__.py").is_file()
-    return f"python -m dreamer_racing {recipe}" if installed else f"python recipes/{recipe}.py"
+    return f"{python()} -m dreamer_racing {recipe}" if installed else f"{python()} {from_here(FOLDER / recipe)}.py"
 
 
 def usage(recipe: str) -> Iterator[str]:
     """Yield the lines of a recipe's help."""
     said = ast.get_docstring(ast.parse((FOLDER / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
+    said = re.sub(r"python recipes/(\w+)\.py", lambda match: command(match[1]), said)
     yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *said.splitlines(), "")
     if found := groups(recipe):
         yield "Groups: settings that go together (GROUP=CHOICE)"

@@ -48,7 +48,9 @@ sys.modules["torch"] = sys.modules["hydra"] = None
 @pytest.mark.parametrize(("name", "flag"), [*((name, "--help") for name in RECIPES), ("export", "-h")])
 def test_help_loads_neither_torch_nor_hydra(name: str, flag: str, tmp_path: Path) -> None:
     done = recipe(name, flag, cwd=tmp_path, before=WITHOUT_WHAT_TAKES_TIME)
-    assert done.returncode == 0 and done.stdout.startswith(f"usage: python recipes/{name}.py"), done.stderr
+    assert done.returncode == 0 and done.stdout.startswith(f"usage: {usage.python()} {ROOT}/recipes/{name}.py"), (
+        done.stderr
+    )
 
 
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
