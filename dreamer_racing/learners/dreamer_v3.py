@@ -61,10 +61,12 @@ class DreamerV3(WorldModelLearner):
         self.return_range = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - losses.return_decay, min_scale=1.0).to(
             device
         )
+        self._actor_learns = torch.ones((), device=device)  # 0 or 1, read by a captured graph too
         super().__init__(agent, losses, config)
 
     def update(self, batch: TensorDictBase, timed: Timer = untimed) -> dict[str, Tensor]:
         """Make one gradient step of all networks; as `WorldModelLearner.update`."""
+        self._actor_learns.fill_(self.updates >= self.loss_config.actor_begin)
         metrics = self.gradient_step(batch, timed)
         self.average_weights()
         return metrics
@@ -125,8 +127,8 @@ class DreamerV3(WorldModelLearner):
                 weight=weight,
                 scale=scale,
             )
-            losses["loss_actor"], metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
-            losses |= metrics
+            objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
+            losses |= metrics | {"loss_actor": self._actor_learns * objective}
 
             # Critic: two-hot regression of the λ-returns that were replayed, and of those imagined (Eq. 10). If every
             # record was a start, its first imagined return is a better value than the critic's.

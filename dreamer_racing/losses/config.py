@@ -102,11 +102,14 @@ class DreamerV3Losses(LossConfig):
         actor: Its objective: ``reinforce``, ``dynamics``, or ``module:function`` of your own.
         return_decay: Decay of the moving percentiles of returns.
         continuation: Whether predicted ends of episodes cut imagined returns.
+        actor_begin: Updates after which the actor begins to learn. The gradient of the dynamics is followed as surely
+            where the model is wrong: an actor that begins with the model is soon saturated. The reference has 0.
     """
 
     actor: str = "reinforce"
     return_decay: float = setting(0.99, SHARE)
     continuation: bool = True
+    actor_begin: int = setting(0, NOT_NEGATIVE)
 
 
 @dataclass

@@ -115,6 +115,16 @@ def test_resume_equals_never_having_stopped():
         assert torch.equal(value, resumed.agent.state_dict()[name]), name
 
 
+@pytest.mark.parametrize("actor", ["reinforce", "dynamics"])
+def test_the_actor_begins_after_so_many_updates(actor):
+    learner = learner_of(actor=actor, actor_begin=2, seed=0, **CONFIG)
+    first = [parameter.clone() for parameter in learner.agent.actor.parameters()]
+    for begun in (False, False, True):
+        learner.update(make_batch())
+        moved = [not torch.equal(a, b) for a, b in zip(first, learner.agent.actor.parameters(), strict=True)]
+        assert any(moved) == begun
+
+
 def test_return_normaliser_is_saved():
     learner = learner_of(seed=0, **CONFIG)
     learner.return_range.high.fill_(7.0)
