@@ -193,7 +193,7 @@ def test_each_agent_that_ships_is_restored(name: str) -> None:
     env = DroneRacingEnv(contract["source"]["track"], 1, seed=0, control_rate=contract["control"]["rate_hz"],
                          camera=Camera(64, 64, tilt=contract["camera"]["tilt_up_deg"]), num_threads=1)  # fmt: skip
     try:
-        assert ShippedAgent.load(folder, env).about["track"] == name
+        assert ShippedAgent.load(folder, env).about["track"] == name.partition("_")[0]
     finally:
         env.close()
 
@@ -203,7 +203,7 @@ def test_the_agents_that_ship_are_whole_and_small() -> None:
     for folder in folders:
         assert {path.name for path in folder.iterdir()} == set(FILES)
         assert OmegaConf.load(folder / "config.yaml").run_dir is None
-    assert sum(path.stat().st_size for folder in folders for path in folder.iterdir()) <= 10e6
+        assert sum(path.stat().st_size for path in folder.iterdir()) <= 3.3e6
 
 
 def test_an_agent_ships_with_the_starts_before_its_checkpoint(tmp_path: Path) -> None:
