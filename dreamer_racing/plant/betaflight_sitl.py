@@ -16,6 +16,7 @@ measured answers of the firmware.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from typing import NamedTuple
@@ -46,6 +47,23 @@ class Dialect(NamedTuple):
 
 DIALECTS = {"2026.6": Dialect((0, 1, 2, 3), 1.0), "before": Dialect((1, 2, 3, 0), -1.0)}
 """By the firmware's version: 2026.6 and later, or before."""
+
+
+def dialect_of(release: str) -> Dialect:
+    """Return how a release lays out its packets.
+
+    Args:
+        release: Its number, such as 4.6.0, 2025.12 or 2026.12.0-alpha, or ``before`` for any before 2026.6.
+
+    Raises:
+        ValueError: It is no number of a release.
+    """
+    if release in DIALECTS:
+        return DIALECTS[release]
+    number = re.match(r"(\d+)\.(\d+)", release)
+    if number is None:
+        raise ValueError(f"betaflight={release}: a release of the firmware, as 4.6 or 2026.6, or before for any older.")
+    return DIALECTS["2026.6" if (int(number[1]), int(number[2])) >= (2026, 6) else "before"]
 
 
 def encode_state(pose: Pose, specific_force: np.ndarray, dialect: Dialect) -> bytes:
@@ -81,7 +99,7 @@ class BetaflightSitl:
     Args:
         vehicle: Which; its delay and body-rate controller are out of play.
         send: Sends a state packet to the firmware.
-        firmware: One of `DIALECTS`.
+        firmware: Its release, see `dialect_of`.
         timeout: s, of `Failsafe`.
 
     Attributes:
@@ -90,15 +108,13 @@ class BetaflightSitl:
         failsafe: Decides whether motors may turn.
 
     Raises:
-        ValueError: Unknown firmware.
+        ValueError: It is no release.
     """
 
     def __init__(
         self, vehicle: PlantVehicle, send: Callable[[bytes], object], firmware: str, timeout: float = TIMEOUT
     ) -> None:
-        if firmware not in DIALECTS:
-            raise ValueError(f"betaflight={firmware}: the firmware's version is one of {', '.join(DIALECTS)}.")
-        self._vehicle, self._send, self._dialect = vehicle, send, DIALECTS[firmware]
+        self._vehicle, self._send, self._dialect = vehicle, send, dialect_of(firmware)
         self._sent = 0
         self.failsafe = Failsafe(timeout)
         self.received = self.malformed = 0

@@ -12,7 +12,7 @@ import pytest
 from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.hil.vehicle import Pose
-from dreamer_racing.plant.betaflight_sitl import DIALECTS, BetaflightSitl, decode_motors, encode_state
+from dreamer_racing.plant.betaflight_sitl import DIALECTS, BetaflightSitl, decode_motors, dialect_of, encode_state
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import Plant
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -164,5 +164,16 @@ def test_silence_of_the_firmware_cuts_the_motors_until_it_has_been_disarmed() ->
 
 
 def test_an_unknown_firmware_is_refused() -> None:
-    with pytest.raises(ValueError, match="betaflight=4.5: the firmware's version is one of 2026.6, before"):
-        BetaflightSitl(PlantVehicle("circle"), lambda data: None, "4.5")
+    with pytest.raises(ValueError, match="betaflight=new: a release of the firmware, as 4.6 or 2026.6, or before"):
+        BetaflightSitl(PlantVehicle("circle"), lambda data: None, "new")
+
+
+@pytest.mark.parametrize(
+    ("release", "dialect"),
+    [
+        *(("4.5", "before"), ("4.6.0", "before"), ("2025.12.1", "before"), ("before", "before")),
+        *(("2026.6", "2026.6"), ("2026.12.0-alpha", "2026.6"), ("2027.6", "2026.6")),
+    ],
+)
+def test_a_release_has_its_dialect(release: str, dialect: str) -> None:
+    assert dialect_of(release) is DIALECTS[dialect]

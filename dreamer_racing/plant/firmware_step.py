@@ -1,0 +1,193 @@
+"""The loop, a plant and a real Betaflight firmware without a clock: a flight takes as long as it takes to compute.
+
+The firmware is a process of its own in simulated time: each state packet lets one physics step pass in it. All packets
+are those of a flight in real time, but nothing depends on how busy the machine is, and a flight is the same each time.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
+
+from dreamer_racing.hil.battery import Reading
+from dreamer_racing.hil.betaflight.firmware import Firmware, Ports
+from dreamer_racing.hil.inlet import bind
+from dreamer_racing.hil.links.link import TransportLink
+from dreamer_racing.hil.vehicle import Command, at_rest
+from dreamer_racing.plant.betaflight_sitl import BetaflightSitl
+from dreamer_racing.plant.delivery import Delivery
+from dreamer_racing.plant.lock_step import LockStep
+from dreamer_racing.plant.process import Plant
+from dreamer_racing.plant.vehicle import PlantVehicle
+
+READY_AFTER = 1.5
+"""s that a firmware, which has booted, is told of a vehicle at rest before it is flown [choice]: it finds its level
+within 0.1 s and believes a radio after 0.6 s of valid channels (measured of 4.6.0)."""
+
+_STEP_DONE = b"step"  # of `simulated_time.c`
+_PATIENCE = 20.0  # s for a step; it takes 0.1 ms
+
+
+class SteppedFirmware:
+    """A firmware in simulated time; a context that starts and stops it.
+
+    Args:
+        program: Of `find_firmware`.
+        settings: Lines for its CLI.
+        step: s that each state packet lets pass.
+
+    Attributes:
+        firmware: The process.
+
+    Raises:
+        OSError: It does not start.
+    """
+
+    def __init__(self, program: Path, settings: Sequence[str], step: float = 0.001) -> None:
+        self._motors = bind("127.0.0.1", 0)
+        self._motors.settimeout(_PATIENCE)
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            ports = Ports.free(self._motors.getsockname()[1])
+            self.firmware = Firmware(program, settings, ports, step)
+        except BaseException:
+            self.close()
+            raise
+
+    def start(self) -> None:
+        """Start it anew, as it was set up."""
+        self.firmware.stop()
+        self._motors.setblocking(False)
+        with suppress(BlockingIOError):  # what the last one has said
+            while True:
+                self._motors.recv(64)
+        self._motors.settimeout(_PATIENCE)
+        self.firmware.start()
+        self._take_step()
+
+    def exchange(self, state: bytes) -> list[bytes]:
+        """Tell it of the vehicle, let a step pass, and return the motor packets that it sent.
+
+        Raises:
+            OSError: It has ended, or hangs.
+        """
+        self._out.sendto(state, ("127.0.0.1", self.firmware.ports.state))
+        return self._take_step()
+
+    def _take_step(self) -> list[bytes]:
+        """Return what it sends until a step, or its boot, is over."""
+        packets: list[bytes] = []
+        while True:
+            try:
+                data = self._motors.recv(64)
+            except TimeoutError as error:
+                self.firmware.check()
+                raise OSError(f"the firmware did not make a step within {_PATIENCE:g} s.") from error
+            if data == _STEP_DONE:
+                return packets
+            packets.append(data)
+
+    def hear(self, data: bytes) -> None:
+        """Give it a radio's packet; it takes it before the next step."""
+        self._out.sendto(data, ("127.0.0.1", self.firmware.ports.channels))
+
+    def close(self) -> None:
+        """Stop it, and give back the sockets."""
+        if hasattr(self, "firmware"):
+            self.firmware.close()
+        self._motors.close()
+        self._out.close()
+
+    def __enter__(self) -> Self:
+        """Start it."""
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop it."""
+        self.close()
+
+
+class Radio:
+    """A `Transport` of channels to a firmware that can be pulled out.
+
+    Args:
+        firmware: That hears it.
+
+    Attributes:
+        pulled: Whether what is written is lost.
+    """
+
+    def __init__(self, firmware: SteppedFirmware) -> None:
+        self._firmware = firmware
+        self.pulled = False
+
+    def write(self, data: bytes) -> bool:
+        """Have the firmware hear a packet; it always went out, as far as a radio knows."""
+        if not self.pulled:
+            self._firmware.hear(data)
+        return True
+
+    def discard(self) -> None:
+        """Do nothing: packets leave at once."""
+
+    def read(self) -> Iterator[tuple[float, bytes]]:
+        """Yield nothing: nothing comes back."""
+        return iter(())
+
+    def close(self) -> None:
+        """Do nothing: the firmware is its owner's."""
+
+
+class FirmwareStep(LockStep):
+    """A plant that a firmware flies by its motors, and the loop by a link to the firmware.
+
+    Args:
+        vehicle: The drone.
+        firmware: That has been started; it has flown nothing else since.
+        link: To it.
+        delivery: What becomes of poses.
+
+    Attributes:
+        disarmed_at: When its motors first stopped after they had turned, s of physics; None: never.
+    """
+
+    def __init__(
+        self,
+        vehicle: PlantVehicle,
+        firmware: SteppedFirmware,
+        link: TransportLink,
+        delivery: Delivery | None = None,
+    ) -> None:
+        super().__init__(vehicle, delivery)
+        self._firmware, self._link = firmware, link
+        self.controls = BetaflightSitl(vehicle, self._exchange, firmware.firmware.release)
+        self.plant = Plant(vehicle, self.controls, delivery or Delivery(), self._deliver)
+        self.disarmed_at: float | None = None
+        self.after_step: Callable[[], None] = lambda: None
+
+    def _exchange(self, state: bytes) -> None:
+        turned = self.plant.vehicle.armed
+        for packet in self._firmware.exchange(state):
+            self.plant.take(packet)
+        if turned and not self.plant.vehicle.armed and self.disarmed_at is None:
+            self.disarmed_at = self.elapsed
+        self.after_step()
+
+    def get_ready(self, rate: float = 50.0) -> None:
+        """Let it find its level and its radio, which says that nothing is to turn, until it would arm."""
+        for _ in range(round(READY_AFTER * rate)):
+            self._link.send(at_rest())
+            self.plant.advance_to(self.plant.time + 1.0 / rate)
+        self.enable_after += self.elapsed
+
+    def listen(self) -> list[Reading]:
+        """Return what the link has heard."""
+        return self._link.listen()
+
+    def send(self, command: Command) -> bytes:
+        """Send a command by the link."""
+        return self._link.send(command)
