@@ -87,7 +87,8 @@ def test_it_must_be_clear_what_is_meant(settings: dict[str, object], words: str)
 
 def test_what_holds_no_flight_is_refused_with_what_would_be_right(runs: Path) -> None:
     dashboard = recipe_module("dashboard")
-    with pytest.raises(FileNotFoundError, match="run=runs/nowhere: there is no such .* circle, circle_betaflight, figure8, kidney"):
+    named = "run=runs/nowhere: there is no such .* circle, circle_betaflight, figure8, kidney"
+    with pytest.raises(FileNotFoundError, match=named):
         dashboard.find(config(run="runs/nowhere"))
     (runs / "young").mkdir()
     with pytest.raises(FileNotFoundError, match="against=runs/young holds no flight: .* agent=runs/young flies"):
