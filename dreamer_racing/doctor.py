@@ -20,6 +20,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from dreamer_racing.caches import ensure_caches, warp_cache, why_not_writable
+from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.gl_variables import VARIABLES, refused
 from dreamer_racing.envs.simulator.opengl import GL_LIBRARIES, loads
 
@@ -117,7 +118,7 @@ def packages() -> Iterator[Diagnosis]:
             yield Diagnosis(requirement.name, state, found or "not installed", "" if fits else wanted)
     complete = sorted(extra for extra, missing in extras.items() if not missing)
     absent = sorted(extra for extra, missing in extras.items() if missing)
-    remedy = f"for {', '.join(absent)}: pip install 'dreamer_racing[NAME]'" if absent else ""
+    remedy = f"for {', '.join(absent)}: {install_extra('NAME')}" if absent else ""
     yield Diagnosis("extras", Verdict.fine, ", ".join(complete) or "none", remedy)
 
 

@@ -216,7 +216,7 @@ def training_command(trained: WorldModelRunConfig, checkpoint: Path) -> str | No
     if not path.exists():
         return None
     overrides = without_machine(map(str, read_yaml(path, ListConfig)))
-    return f"{command(trained.algorithm)} {shlex.join(overrides)}"
+    return f"python recipes/{trained.algorithm}.py {shlex.join(overrides)}"
 
 
 def without_machine(overrides: Iterable[str]) -> list[str]:

@@ -114,7 +114,16 @@ def test_no_class_of_a_learner_or_loss_has_a_grandparent_of_ours():
 
 def test_few_plain_modules_stand_at_the_top():
     top = {path.name for path in PACKAGE.glob("*.py")} - {"__init__.py"}
-    known = {"caches.py", "devices.py", "doctor.py", "machine.py", "parallel.py", "settings.py", "terminal.py"}
+    known = {
+        "caches.py",
+        "commands.py",
+        "devices.py",
+        "doctor.py",
+        "machine.py",
+        "parallel.py",
+        "settings.py",
+        "terminal.py",
+    }
     assert top == {"__main__.py", *known}
 
 

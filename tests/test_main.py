@@ -50,7 +50,7 @@ def test_an_unknown_recipe_is_refused(tmp_path: Path) -> None:
 
 def test_from_a_clone_it_is_the_recipe_s_own_file(tmp_path: Path) -> None:
     done = start("fly", "--help", cwd=tmp_path)
-    assert done.stdout.startswith("usage: python recipes/fly.py"), done.stderr
+    assert "recipes/fly.py [NAME=VALUE ...]" in done.stdout.splitlines()[0], done.stderr
     done = start("fly", "pilto=hover", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean pilot?" in done.stderr
 

@@ -18,6 +18,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from dreamer_racing.commands import install_extra
+
 KINDS = ("keyboard", "gamepad")
 WINDOW = 512  # pixels, side of the window
 KEYBOARD_SHARE = 0.35  # of the largest rates and thrust, at a key held down: keys know of no half way
@@ -104,7 +106,7 @@ def check_by_hand(kind: str, environment: Mapping[str, str] = os.environ) -> Non
         ValueError: pygame is not installed, or there is no display; the message says what would help.
     """
     if importlib.util.find_spec("pygame") is None:
-        raise ValueError(f"pilot={kind} needs the package pygame: pip install 'dreamer_racing[play]'.")
+        raise ValueError(f"pilot={kind} needs the package pygame: {install_extra('play')}.")
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
         raise ValueError(

@@ -25,6 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dreamer_racing.commands import install_extra
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, RECURRENT, OnnxActor, RecurrentActor, hash_file
 from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights
@@ -228,8 +229,7 @@ def check_output(output: str | Path) -> Path:
     missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise MissingPackagesError(
-            f"The export needs {', '.join(missing)}, not installed here: pip install 'dreamer_racing[export]' "
-            "(in a checkout: pip install -e '.[export]')."
+            f"The export needs {', '.join(missing)}, not installed here: {install_extra('export')}."
         )
     output = Path(output).expanduser().absolute()
     if output.suffix != ".onnx":

@@ -400,9 +400,7 @@ def _open_session(path: Path, threads: int) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise ImportError(
-            "onnxruntime is not installed: pip install 'dreamer_racing[hil]', or onnxruntime alone where this file is."
-        ) from error
+        raise ImportError("onnxruntime is not installed: pip install onnxruntime.") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

@@ -19,6 +19,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
+from dreamer_racing.commands import install_extra
 from dreamer_racing.figures.film import write_gif
 from dreamer_racing.training.directory import RunDirectory
 
@@ -65,7 +66,7 @@ def check_loggers(wandb: str) -> None:
         raise ValueError(f"logger.wandb={wandb}: there are {', '.join(WANDB_MODES)}.")
     if wandb != "none" and importlib.util.find_spec("wandb") is None:
         raise ValueError(
-            f"logger.wandb={wandb} needs the package wandb: pip install 'dreamer_racing[wandb]', or logger.wandb=none."
+            f"logger.wandb={wandb} needs the package wandb: {install_extra('wandb')}, or logger.wandb=none."
         )
 
 

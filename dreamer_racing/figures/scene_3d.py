@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 
+from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, GateShape, Track
@@ -40,7 +41,7 @@ def check_viser() -> None:
         ValueError: it is not installed; the message names the extra that brings it.
     """
     if importlib.util.find_spec("viser") is None:
-        raise ValueError("The dashboard needs the package viser: pip install 'dreamer_racing[dashboard]'.")
+        raise ValueError(f"The dashboard needs the package viser: {install_extra('dashboard')}.")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from dreamer_racing.commands import install_extra
+
 
 def import_messages(who: str) -> Any:
     """Return the module of MAVLink 2's common messages.
@@ -17,5 +19,5 @@ def import_messages(who: str) -> Any:
     try:
         from pymavlink.dialects.v20 import common
     except ImportError as error:
-        raise ImportError(f"{who} needs pymavlink: pip install 'dreamer_racing[hil]'.") from error
+        raise ImportError(f"{who} needs pymavlink: {install_extra('hil')}.") from error
     return common

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from dreamer_racing.commands import install_extra
 from dreamer_racing.envs.tracks import Track, load_track, read_track
 from dreamer_racing.hil.aside import Aside
 
@@ -197,4 +198,4 @@ def _import_mcap(module: str) -> Any:
     try:
         return importlib.import_module(f"mcap.{module}")
     except ImportError as error:
-        raise ImportError("mcap is not installed: pip install 'dreamer_racing[hil]'") from error
+        raise ImportError(f"mcap is not installed: {install_extra('hil')}.") from error

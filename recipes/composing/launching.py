@@ -30,6 +30,7 @@ from composing.saved import begun_with, changed_settings, keep_saved, saved_conf
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
+from dreamer_racing.commands import from_here
 from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
@@ -225,7 +226,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         left["best policy"] = directory.best.path
     if (evaluation := directory.latest_evaluation()) is not None:
         left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
-    place, longer = _from_here(directory.path), 2 * max(config.total_env_steps, directory.finished_env_steps())
+    place, longer = from_here(directory.path), 2 * max(config.total_env_steps, directory.finished_env_steps())
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
     noisy = " start_noise=1" if is_race(config) else ""  # else all of the deterministic policy's flights are alike
     commands = {
@@ -234,7 +235,7 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         "draw it": f"{command('plot')} {given['runs']} output=figures",
         "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{_rising(config)}",
     }
-    files = {what: _from_here(path) for what, path in left.items() if path.exists()}
+    files = {what: from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)
 
 
@@ -249,9 +250,3 @@ def _rising(config: RunConfig) -> str:
         if isinstance(ramp, Ramp) and ramp.to is not None and ramp.by is not RampClock.passes
     ]
     return f"  # sets back what moves with the share of the run: {', '.join(by_run)}" if by_run else ""
-
-
-def _from_here(path: Path) -> str:
-    """Return a path as one would type it: relative where it lies below."""
-    path, here = path.absolute(), Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)

@@ -1,7 +1,6 @@
 """Packages that are not there: how to run a recipe, in place of a traceback. The standard library alone."""
 
 import importlib.util
-import os
 import sys
 from pathlib import Path
 
@@ -25,19 +24,9 @@ def refuse_without_packages() -> None:
 
 def how_to_run(script: str) -> str:
     """Say which command starts a script of this clone with all its packages."""
-    dev = ROOT / "dev"
-    if not dev.is_file():
+    if not (ROOT / "dev").is_file():
         return "Install it in this Python: pip install dreamer_racing."
     return (
-        f"{from_here(dev)} python {from_here(Path(script))} runs it in the project's environment, which the first "
-        f"start makes; in one of your own, pip install -e {from_here(ROOT)} comes first (docs/installation.md)."
+        f"{ROOT / 'dev'} python {Path(script).absolute()} runs it in the project's environment, which the first start "
+        f"makes; in one of your own, pip install -e {ROOT} comes first (docs/installation.md)."
     )
-
-
-def from_here(path: Path) -> str:
-    """Return a path as one would type it in the working directory."""
-    path = path.absolute()
-    if not path.is_relative_to(Path.cwd()):
-        return str(path)
-    near = os.path.relpath(path)
-    return f"./{near}" if path.name == "dev" and os.sep not in near else near

@@ -23,12 +23,12 @@ NUM_ENVS = 32  # of the recipes with a world model
 SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 SETTINGS = {
-    "race": """which race from images on a CPU:
+    "race": """by which latent PPO races from images on a CPU:
   the world model decodes the simulator's state in training; whoever flies sees images only
   70 % of training episodes begin in flight on a planned racing line, until every gate is passed; then all come to begin
   at the start, as a race does; a missed gate ends one; 25 actions a second
   what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
-    "images": """which race Circle from images alone, on a CPU:
+    "images": """by which latent PPO races Circle from images alone, on a CPU:
   the world model reconstructs images, at a small weight; no network sees the simulator's state, not even in training
   half of the training episodes begin at rest, half before a gate; a missed gate ends one; 25 actions a second
   what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
@@ -38,7 +38,10 @@ SETTINGS = {
 }
 """What the files of the group `tuned` set, by their names."""
 ACTORS = {
-    "dreamer_v3": ("the actor learns in imagination, from latents of the replay on",),
+    "dreamer_v3": (
+        "the actor learns in imagination, from latents of the replay on; it has not raced yet: docs/learning.md",
+        "says how far it has come",
+    ),
     "latent_ppo": (
         "the actor learns by PPO from what was collected, in the model's latents, and so does its critic; nothing is",
         "imagined; where the model errs twice as much on new records as in training the actor waits for it",

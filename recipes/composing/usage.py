@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from textwrap import wrap
 
 from composing.messages import say_error
 from composing.options import FOLDER, groups, options, refuse_slips
+from dreamer_racing.commands import from_here, python
 
 WIDTH, COLUMN = 118, 42
 
@@ -34,14 +36,15 @@ def answer_early() -> None:
 
 
 def command(recipe: str) -> str:
-    """Return the words that start a recipe: from a clone its file, from an installed package, which holds it, that."""
+    """Return the words that start a recipe from here: of a clone its file, of an installed package, that."""
     installed = (FOLDER.parent / "__main__.py").is_file()
-    return f"python -m dreamer_racing {recipe}" if installed else f"python recipes/{recipe}.py"
+    return f"{python()} -m dreamer_racing {recipe}" if installed else f"{python()} {from_here(FOLDER / recipe)}.py"
 
 
 def usage(recipe: str) -> Iterator[str]:
     """Yield the lines of a recipe's help."""
     said = ast.get_docstring(ast.parse((FOLDER / f"{recipe}.py").read_text(encoding="utf-8"))) or ""
+    said = re.sub(r"python recipes/(\w+)\.py", lambda match: command(match[1]), said)
     yield from (f"usage: {command(recipe)} [NAME=VALUE ...]", "", *said.splitlines(), "")
     if found := groups(recipe):
         yield "Groups: settings that go together (GROUP=CHOICE)"

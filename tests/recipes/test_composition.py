@@ -395,7 +395,7 @@ def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytes
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu"))
     told = capsys.readouterr().out
-    assert "settings: tuned=images, which race Circle from images alone" in told
+    assert "settings: tuned=images, by which latent PPO races Circle from images alone" in told
     assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)

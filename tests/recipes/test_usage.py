@@ -79,7 +79,9 @@ atexit.register(lambda: print("loaded:", *(name for name in ("torch", "hydra") i
 @pytest.mark.parametrize(("name", "flag"), [*((name, "--help") for name in RECIPES), ("export", "-h")])
 def test_help_loads_neither_torch_nor_hydra(name: str, flag: str, tmp_path: Path) -> None:
     done = recipe(name, flag, cwd=tmp_path, before=WITHOUT_WHAT_TAKES_TIME)
-    assert done.returncode == 0 and done.stdout.startswith(f"usage: python recipes/{name}.py"), done.stderr
+    assert done.returncode == 0 and done.stdout.startswith(f"usage: {usage.python()} {ROOT}/recipes/{name}.py"), (
+        done.stderr
+    )
 
 
 @pytest.mark.parametrize(

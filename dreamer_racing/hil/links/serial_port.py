@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from dreamer_racing.commands import install_extra
+
 
 class SerialSettings(NamedTuple):
     """How bytes go over a wire: 8 bits each.
@@ -140,7 +142,7 @@ def open_port(device: str, settings: SerialSettings) -> Any:
     try:
         import serial
     except ImportError as error:
-        raise ImportError("A serial link needs pyserial: pip install 'dreamer_racing[hil]'.") from error
+        raise ImportError(f"A serial link needs pyserial: {install_extra('hil')}.") from error
     if settings.baud <= 0:
         raise ValueError(f"baud={settings.baud}: must be above 0.")
     try:
