@@ -106,7 +106,7 @@ def test_a_stick_arms_nothing():
 
 def test_without_pymavlink(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
-    with pytest.raises(ImportError, match=r"pip install 'dreamer_racing\[hil\]'"):
+    with pytest.raises(ImportError, match=r"pip install .*\[hil\]'"):
         make_link(LinkConfig("mavlink", port=14540, thrust=THRUST))
 
 
