@@ -159,7 +159,7 @@ def test_flights_of_different_rates_keep_their_own_time():
 
 def test_without_viser_the_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(scene_3d.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"dreamer_racing\[dashboard\]"):
+    with pytest.raises(ValueError, match=r"pip install .*\[dashboard\]"):
         dashboard.write_page(tmp_path / "page.html", CIRCLE, shown(circling()))
     assert not list(tmp_path.iterdir())
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamer_racing import commands
 from dreamer_racing.settings import ALLOWED
 from tests.running_recipes import ROOT, recipe, recipe_module
 
@@ -20,7 +21,8 @@ RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_help_has_what_it_does_and_every_option_with_a_meaning(name: str) -> None:
+def test_help_has_what_it_does_and_every_option_with_a_meaning(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "dev", lambda: "")  # which makes lines longer
     text = "\n".join(usage.usage(name))
     said = (ROOT / "recipes" / f"{name}.py").read_text(encoding="utf-8").splitlines()[0].lstrip('r"').rstrip('"')
     assert said in text and f"python recipes/{name}.py" in text
@@ -79,9 +81,8 @@ atexit.register(lambda: print("loaded:", *(name for name in ("torch", "hydra") i
 @pytest.mark.parametrize(("name", "flag"), [*((name, "--help") for name in RECIPES), ("export", "-h")])
 def test_help_loads_neither_torch_nor_hydra(name: str, flag: str, tmp_path: Path) -> None:
     done = recipe(name, flag, cwd=tmp_path, before=WITHOUT_WHAT_TAKES_TIME)
-    assert done.returncode == 0 and done.stdout.startswith(f"usage: {usage.python()} {ROOT}/recipes/{name}.py"), (
-        done.stderr
-    )
+    first = done.stdout.partition("\n")[0]
+    assert done.returncode == 0 and first.startswith("usage: ") and f" {ROOT}/recipes/{name}.py" in first, done.stderr
 
 
 @pytest.mark.parametrize(
