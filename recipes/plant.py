@@ -1,14 +1,16 @@
 """A drone to fly instead of a real one: this project's physics in a process of its own, not quite as in training.
 
     python recipes/plant.py track=figure8 mass=1.1 thrust=0.9 delay=0.02 packet_loss=0.01
-    python recipes/plant.py track=kidney betaflight=2026.6
+    python recipes/plant.py track=kidney firmware=auto      # flown by a Betaflight of this machine, which it starts
+    python recipes/plant.py track=kidney betaflight=2026.6  # the same, by one that runs already
 
 It takes commands from UDP port 9101 and sends poses to port 9100, both on this machine, until it is stopped by Ctrl+C
 or SIGTERM, and says at the end what came of it. The drone stands on a launch stand at the track's start pose, until a
 disarmed command and then armed ones with thrust have come.
 
-With betaflight= a Betaflight firmware built for this machine (SITL), which must be running, flies it by its motors:
-channels go to the firmware.
+With firmware= a Betaflight that was built for this machine (SITL) is set up for actor=, started, and flies it by its
+motors; channels go to the firmware. auto is the one of BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf, or of the extra
+sitl. With betaflight= one does that runs already.
 """
 
 from dataclasses import dataclass
@@ -19,8 +21,12 @@ from composing.entry import recipe
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
+from dreamer_racing.export.agents import existing_agent_path
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.hil.betaflight import print_settings
+from dreamer_racing.hil.configuration import PILOT, HilConfig, pilot_contract
 from dreamer_racing.plant.delivery import Delivery
-from dreamer_racing.plant.process import ProcessOptions, open_sockets, run
+from dreamer_racing.plant.process import ProcessOptions, by_firmware, open_sockets, run, start_firmware
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
 from dreamer_racing.settings import check_settings
 
@@ -31,6 +37,9 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
 
     track: str = "kidney"  # built-in track, or path to a YAML file
     preset: str = "faithful"  # physics of the nominal drone, without their randomisation: easy | faithful | betaflight
+    actor: str = (
+        "pilot"  # with firmware=: for whose largest body rates it is set up: pilot, an agent's name, or its path
+    )
 
 
 ConfigStore.instance().store(name="plant_schema", node=PlantConfig)
@@ -45,18 +54,32 @@ def main(config: DictConfig) -> None:
         check(settings)
         vehicle = PlantVehicle(settings.track, settings.preset, settings)
         sockets = open_sockets(settings)
-    run(vehicle, settings, settings, sockets)
+        firmware = None
+        if settings.firmware is not None:
+            firmware = start_firmware(settings.firmware, settings, sockets, settings_for(settings.actor))
+    run(vehicle, settings, settings, sockets, firmware)
+
+
+def settings_for(actor: str) -> list[str]:
+    """Return lines for the CLI of a firmware that an actor is to fly."""
+    if actor == PILOT:
+        return print_settings(pilot_contract(HilConfig(actor=PILOT)), "betaflight_sitl")
+    path = existing_agent_path("actor", actor)
+    contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
+    return print_settings(contract, "betaflight_sitl")
 
 
 def check(config: PlantConfig) -> None:
-    """Refuse numbers that cannot be, and a delay where nothing would be delayed.
+    """Refuse numbers that cannot be, a delay where nothing would be delayed, and an actor for whom nothing is set up.
 
     Raises:
         ValueError: The message names the setting and what is allowed.
     """
     check_settings(config)
-    if config.betaflight is not None and config.delay is not None:
-        raise ValueError(f"delay={config.delay} is of commands, and betaflight={config.betaflight}: leave one out.")
+    if config.delay is not None and (name := by_firmware(config)):
+        raise ValueError(f"delay={config.delay} is of commands, and {name}={getattr(config, name)}: leave one out.")
+    if config.actor != PILOT and config.firmware is None:
+        raise ValueError(f"actor={config.actor} is for firmware=, which is set up for it: add that, or leave it out.")
 
 
 if __name__ == "__main__":

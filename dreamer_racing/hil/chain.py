@@ -84,6 +84,7 @@ class Inputs(NamedTuple):
         voltages: Of the battery since the last tick, oldest first.
         dropped: Whether the command of the tick before did not go out.
         imu: What the IMU told since the last tick, oldest first; asked for only if the flyer needs it.
+        refusal: Of the flight controller, see `Tick`.
     """
 
     time: float
@@ -93,6 +94,7 @@ class Inputs(NamedTuple):
     voltages: Sequence[Reading] = ()
     dropped: bool = False
     imu: Sequence[ImuReading] = ()
+    refusal: str = ""
 
 
 class Outputs(NamedTuple):
@@ -210,6 +212,7 @@ class FlightChain:
             loop_overrun=inputs.overrun,
             finish=finish,
             command_dropped=inputs.dropped,
+            refusal=inputs.refusal,
             lift=None if self._flying else self._lift(inputs.time),
         )
         findings = self.safety.examine(tick)
@@ -310,6 +313,7 @@ def describe_inputs(inputs: Inputs) -> dict[str, Any]:
         "voltages": [list(reading) for reading in inputs.voltages],
         "dropped": inputs.dropped,
         **({"imu": [[felt.time, *felt.sample.tolist()] for felt in inputs.imu]} if inputs.imu else {}),
+        **({"refusal": inputs.refusal} if inputs.refusal else {}),
     }
 
 
@@ -324,7 +328,8 @@ def read_inputs(message: dict[str, Any]) -> Inputs:
     operator, dropped = Operator(*message["operator"]), message.get("dropped", False)
     overrun = int(message["overrun"])  # flights of old say whether
     felt = [ImuReading(arrived, np.array(sample)) for arrived, *sample in message.get("imu", ())]
-    return Inputs(message["time"], received, operator, overrun, voltages, dropped, felt)
+    refusal = message.get("refusal", "")
+    return Inputs(message["time"], received, operator, overrun, voltages, dropped, felt, refusal)
 
 
 def describe_outputs(outputs: Outputs) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import Flyer, check_contract, check_ranges, check_rate_loop
 from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
+from dreamer_racing.hil.links.sitl import MSP_PORT
 from dreamer_racing.hil.operator import (
     PORT,
     KeyboardOperator,
@@ -36,6 +37,7 @@ logger = logging.getLogger(__name__)
 PILOT, IDENTIFY = "pilot", "identify"
 PILOT_RATE = 50.0  # Hz
 SIMULATED = ("simulated", "betaflight_sitl")  # links with nobody to hurt
+ARMING = tuple(link for link in BETAFLIGHT if link != "msp_override")  # links that arm by a channel
 OPERATORS = ("keyboard", "udp", "timed")
 MADE_RATES = ("PoseStamped", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP")  # messages that have none
 SPARE = 5.0  # s that the flight of actor=identify has beyond its steps, for its take-off
@@ -88,9 +90,10 @@ class HilConfig:
     operator_host: str = "127.0.0.1"  # to listen on
     operator_port: int = setting(PORT, Range(1, 65535))
 
-    link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | mavlink
+    link: str = "simulated"  # simulated | udp | betaflight_sitl | crsf | sbus | msp | msp_override | mavlink
     link_host: str = "127.0.0.1"  # to send to
     link_port: int | None = setting(None, Range(1, 65535))  # null: 9101, or the firmware's own
+    serial_port: int = setting(MSP_PORT, Range(1, 65535))  # link=betaflight_sitl: TCP port of the firmware's MSP
     device: str | None = None  # serial port
     baud: int | None = setting(None, Range(1))  # null: the protocol's own
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
@@ -171,7 +174,8 @@ def check_read(config: HilConfig) -> None:
         (("vehicle",), config.actor not in (PILOT, IDENTIFY), "an actor that was trained"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
-        (("arm_channel",), config.link in BETAFLIGHT, f"link={', '.join(BETAFLIGHT)}"),
+        (("serial_port",), config.link == "betaflight_sitl", "link=betaflight_sitl"),
+        (("arm_channel",), config.link in ARMING, f"link={', '.join(ARMING)}"),
         (("mass", "full_thrust", "reference_voltage", "voltage"), throttle, "a link that takes a throttle"),
         (("voltage_tolerance", "voltage_smoothing"), config.link in HEARING, f"link={', '.join(HEARING)}"),
         (("pose_host", "pose_port"), config.pose_device is None and config.pose != "ros2", "poses over the network"),
@@ -234,6 +238,11 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
         notes.append(f"flight controller: {count} settings as wanted (betaflight_dump={config.betaflight_dump})")
     elif config.arm and config.link in BETAFLIGHT:
         notes.append("flight controller: its settings were not compared; betaflight_dump= of a `dump all` does that")
+    if config.link == "msp_override":
+        notes.append(
+            "link=msp_override: the pilot arms, hands over, takes back and disarms; a cut, or the end of the flight, "
+            "is throttle low: motors idle until the pilot disarms"
+        )
     return notes
 
 
@@ -309,6 +318,7 @@ def link_config(config: HilConfig, contract: dict[str, Any], rate: float) -> Lin
         config.arm_channel,
         rate,
         imu=contract.get("imu") is not None,
+        serial_port=config.serial_port,
     )
 
 

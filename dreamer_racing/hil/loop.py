@@ -227,7 +227,8 @@ class FlightLoop:
         operator = self._ask_operator(armed)
         heard = self._listen()
         felt = self._link.feel() if self._chain.feels else []
-        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, felt)
+        refusal = self._link.refusal
+        inputs = Inputs(start, self._take_poses(), operator, overrun, heard or [], self._dropped, felt, refusal)
         outputs = self._chain.tick(inputs)
         if outputs.voltage is not None:
             self._link.reckon_with(outputs.voltage)

@@ -16,6 +16,7 @@ class Reason(enum.Enum):
     CLOCK = "clock"
     OVERRUNS = "overruns"
     LINK_LOST = "link lost"
+    REFUSED = "refused"
     NOT_FINITE = "pose not finite"
     POSE_JUMP = "pose jump"
     ATTITUDE_JUMP = "attitude jump"

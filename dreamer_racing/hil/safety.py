@@ -60,6 +60,7 @@ class Tick(NamedTuple):
         loop_overrun: Deadlines that the tick before missed, as it took longer than its period.
         finish: Whether the flight is over.
         command_dropped: Whether the command of the tick before did not go out.
+        refusal: Why the flight controller does not fly what it is told, or would not; empty as far as is known.
         lift: What is sent in place of what the actor wants, if that is usable, until the vehicle is seen to rise.
     """
 
@@ -73,6 +74,7 @@ class Tick(NamedTuple):
     loop_overrun: int = 0
     finish: bool = False
     command_dropped: bool = False
+    refusal: str = ""
     lift: Setpoint | None = None
 
 
@@ -222,7 +224,7 @@ class Safety:
         self._overruns.clear()
         self._released_at: float | None = None
         self._ready = False  # the enable was released for long enough, and has not been given since
-        self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._now
+        self._upright_at = self._wanted_at = self._armed_at = self._delivered_at = self._accepted_at = self._now
         self._left_at = math.inf  # when it was first seen to move in this flight
         self._moved_at = -math.inf  # when it was last
 
@@ -275,6 +277,10 @@ class Safety:
         silent = self._now - self._delivered_at
         if silent > limits.cut_after:
             findings[Reason.LINK_LOST] = f"the link has taken no command for {silent:.3g} s"
+        if not tick.refusal:
+            self._accepted_at = self._now
+        elif not self.armed or self._now - max(self._accepted_at, self._armed_at) > limits.refusal_time:
+            findings[Reason.REFUSED] = f"the flight controller refuses: {tick.refusal}"
         return findings
 
     def _take_pose(self, tick: Tick) -> Findings:

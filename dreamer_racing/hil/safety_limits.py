@@ -40,6 +40,8 @@ class SafetyLimits:
         hold_after: s, age of a pose above which it holds.
         cut_after: s, age of a pose, time in which poses repeat, or in which there is no setpoint or the link takes
             none, above which it cuts.
+        refusal_time: s for which the flight controller may say in flight that it does not fly what it is told: it is
+            asked with every fifth command.
         tick_max: s from tick to tick above which the clock has jumped, or the loop has stood still, see `hil.watchdog`.
         overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
         overrun_window: s.
@@ -76,6 +78,7 @@ class SafetyLimits:
     arm_time: float = setting(0.1, _SECONDS)
     hold_after: float = setting(0.050, _SECONDS)
     cut_after: float = setting(0.150, _SECONDS)
+    refusal_time: float = setting(0.75, _SECONDS)
     tick_max: float = setting(0.200, _SECONDS)
     overruns_max: int = setting(3, Range(0, 1000))
     overrun_window: float = setting(1.0, Range(0, 60, open_below=True))

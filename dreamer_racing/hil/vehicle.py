@@ -68,7 +68,12 @@ def at_rest() -> Command:
 
 
 class Link(Protocol):
-    """Carries commands to a vehicle, and back what it says of its battery and its IMU."""
+    """Carries commands to a vehicle, and back what it says of its battery, of its IMU and of itself."""
+
+    @property
+    def refusal(self) -> str:
+        """Why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        ...
 
     def send(self, command: Command) -> bytes:
         """Send a command now, without waiting; return the bytes that went out, none if it was dropped."""

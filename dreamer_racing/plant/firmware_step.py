@@ -184,6 +184,11 @@ class FirmwareStep(LockStep):
             self.plant.advance_to(self.plant.time + 1.0 / rate)
         self.enable_after += self.elapsed
 
+    @property
+    def refusal(self) -> str:
+        """Why the firmware does not fly what it is told, as far as the link hears of it."""
+        return self._link.refusal
+
     def listen(self) -> list[Reading]:
         """Return what the link has heard."""
         return self._link.listen()

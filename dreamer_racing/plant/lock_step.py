@@ -76,6 +76,11 @@ class LockStep:
         """Return what the plant's IMU tells now."""
         return [ImuReading(self.now(), self.plant.vehicle.feel())]
 
+    @property
+    def refusal(self) -> str:
+        """Nothing: this vehicle flies what it is told."""
+        return ""
+
     def reckon_with(self, voltage: float) -> None:
         """Do nothing: thrust is sent as it is."""
 

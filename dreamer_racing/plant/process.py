@@ -11,15 +11,17 @@ import math
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from dreamer_racing.hil.betaflight.firmware import Firmware, Ports, find_firmware
 from dreamer_racing.hil.imu import encode_imu
 from dreamer_racing.hil.inlet import bind
+from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT
 from dreamer_racing.hil.links.udp import UdpTransport
-from dreamer_racing.plant.betaflight_sitl import DIALECTS, MOTOR_PORT, STATE_PORT, BetaflightSitl
+from dreamer_racing.plant.betaflight_sitl import MOTOR_PORT, STATE_PORT, BetaflightSitl, dialect_of
 from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver, Controls
 from dreamer_racing.plant.delivery import Delivery, PoseDelivery
 from dreamer_racing.plant.vehicle import PlantVehicle
@@ -48,9 +50,13 @@ class ProcessOptions:
     speed: float = setting(1.0, Range(0.05, 20))  # s of physics in one of the wall clock
     lock_step: bool = False  # no clock: each command flies one control step of the preset, each pose comes of one
     duration: float | None = setting(None, POSITIVE)  # s of physics; null: until it is stopped
-    betaflight: str | None = None  # 2026.6 | before: fly by the motors of that firmware (SITL) instead of commands
+    betaflight: str | None = None  # its release, as 4.6 or 2026.6: fly by the motors of a firmware (SITL), not commands
+    # auto, or a program: set up and start that firmware and fly by it; auto: BETAFLIGHT_SITL, or the extra sitl
+    firmware: str | None = None
     motor_port: int = setting(MOTOR_PORT, Range(0, 65535))  # the firmware's motors come in here
     state_port: int = setting(STATE_PORT, _PORT)  # the vehicle's state goes there
+    channel_port: int = setting(RC_PORT, _PORT)  # with firmware=: where that is to hear channels
+    serial_port: int = setting(MSP_PORT, _PORT)  # with firmware=: its first serial port (TCP): MSP and CLI
 
 
 class Plant:
@@ -204,18 +210,24 @@ def check_process(options: ProcessOptions) -> None:
     Raises:
         ValueError: The message names the settings.
     """
-    firmware, incoming, outgoing = options.betaflight, "command_port", ["pose_port"]
-    if firmware is not None:
+    incoming, outgoing = "command_port", ["pose_port"]
+    if options.betaflight is not None:
+        dialect_of(options.betaflight)
+    if name := by_firmware(options):
         incoming, outgoing = "motor_port", ["pose_port", "state_port"]
-        if firmware not in DIALECTS:
-            raise ValueError(f"betaflight={firmware}: the firmware's version is one of {', '.join(DIALECTS)}.")
         if options.lock_step or options.speed != 1.0:
-            raise ValueError(f"betaflight={firmware}: it keeps to the wall clock; leave lock_step=false and speed=1.")
+            given = getattr(options, name)
+            raise ValueError(f"{name}={given}: it keeps to the wall clock; leave lock_step=false and speed=1.")
     if options.lock_step and options.speed != 1.0:
         raise ValueError(f"speed={options.speed}: with lock_step=true there is no clock to be faster than; leave it.")
     for name in outgoing:
         if getattr(options, name) == getattr(options, incoming):
             raise ValueError(f"{incoming} and {name} are both {getattr(options, name)}: give each its own.")
+
+
+def by_firmware(options: ProcessOptions) -> str | None:
+    """Return the setting that says that a firmware's motors fly it; None if none does."""
+    return next((name for name in ("betaflight", "firmware") if getattr(options, name) is not None), None)
 
 
 class Sockets(NamedTuple):
@@ -245,13 +257,50 @@ def open_sockets(options: ProcessOptions) -> Sockets:
         OSError: A port is in use, or there is no such host.
     """
     check_process(options)
-    port = options.command_port if options.betaflight is None else options.motor_port
+    port = options.motor_port if by_firmware(options) else options.command_port
     incoming = bind(options.host, port)
     poses, state = (UdpTransport(options.host, port) for port in (options.pose_port, options.state_port))
     return Sockets(incoming, poses, state)
 
 
-def run(vehicle: PlantVehicle, delivery: Delivery, options: ProcessOptions, sockets: Sockets) -> Plant:
+def start_firmware(named: str, options: ProcessOptions, sockets: Sockets, settings: Sequence[str]) -> Firmware:
+    """Set up a firmware and start it, in real time.
+
+    Args:
+        named: Its program, or ``auto``, see `find_firmware`.
+        options: Where it is reached.
+        sockets: Of these options.
+        settings: Lines for its CLI.
+
+    Raises:
+        ValueError: It is of another release than ``betaflight=``.
+        OSError: There is none, or it does not start.
+    """
+    program = find_firmware(None if named == "auto" else named)
+    motors = int(sockets.incoming.getsockname()[1])
+    firmware = Firmware(program, settings, Ports(motors, options.state_port, options.channel_port, options.serial_port))
+    try:
+        given = options.betaflight
+        if given is not None and dialect_of(given) != dialect_of(firmware.release):
+            raise ValueError(f"betaflight={given}: the firmware says that it is {firmware.release}; leave it out.")
+        firmware.start()
+        firmware.wait_for_serial()
+    except BaseException:
+        firmware.close()
+        raise
+    logger.info("plant: Betaflight %s, set up in an empty folder: %s", firmware.release, program)
+    for line, words in firmware.refused.items():
+        logger.info("plant: it does not take %r: %s", line, words)
+    return firmware
+
+
+def run(
+    vehicle: PlantVehicle,
+    delivery: Delivery,
+    options: ProcessOptions,
+    sockets: Sockets,
+    firmware: Firmware | None = None,
+) -> Plant:
     """Fly until it is stopped by SIGINT or SIGTERM, or its time is up, and log a line of what happened.
 
     Args:
@@ -259,14 +308,16 @@ def run(vehicle: PlantVehicle, delivery: Delivery, options: ProcessOptions, sock
         delivery: What becomes of its poses.
         options: By which clock it flies, and by which firmware.
         sockets: Of these options; they are closed at the end.
+        firmware: That was started for it; it is stopped at the end.
 
     Returns:
         What has flown.
     """
     controls: Controls = CommandReceiver(vehicle, options.failsafe)
-    if options.betaflight is not None:
-        controls = BetaflightSitl(vehicle, sockets.state.write, options.betaflight, options.failsafe)
-    plant = Plant(vehicle, controls, delivery, sockets.poses.write, None if options.betaflight else sockets.incoming)
+    release = options.betaflight if firmware is None else firmware.release
+    if release is not None:
+        controls = BetaflightSitl(vehicle, sockets.state.write, release, options.failsafe)
+    plant = Plant(vehicle, controls, delivery, sockets.poses.write, sockets.incoming if release is None else None)
     duration = math.inf if options.duration is None else options.duration
     try:
         with GracefulExit() as stop:
@@ -278,5 +329,7 @@ def run(vehicle: PlantVehicle, delivery: Delivery, options: ProcessOptions, sock
                 fly_in_real_time(plant, sockets.incoming, stop, options.speed, duration)
     finally:
         sockets.close()
+        if firmware is not None:
+            firmware.close()
         logger.info(plant.summary())
     return plant

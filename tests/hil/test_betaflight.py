@@ -101,6 +101,7 @@ def test_every_line_can_be_pasted(contract, link):
         ("crsf", ["feature -RX_MSP", "feature RX_SERIAL", "set serialrx_provider = CRSF"]),
         ("sbus", ["feature -RX_MSP", "feature RX_SERIAL", "set serialrx_provider = SBUS"]),
         ("msp", ["feature -RX_SERIAL", "feature RX_MSP"]),
+        ("msp_override", ["feature -RX_MSP"]),
         ("betaflight_sitl", []),
     ],
 )
@@ -110,7 +111,7 @@ def test_the_receiver_is_that_of_the_link(contract, link, there):
 
 
 def test_an_unknown_link_is_refused(contract):
-    with pytest.raises(ValueError, match="one of crsf, sbus, msp, betaflight_sitl"):
+    with pytest.raises(ValueError, match="one of crsf, sbus, msp, msp_override, betaflight_sitl"):
         print_settings(contract, "ppm")
 
 
@@ -123,7 +124,7 @@ def test_what_is_printed_passes_the_check(contract, link):
 def test_each_setting_is_reported_where_it_differs_and_where_it_is_missing(contract, link):
     lines = print_settings(contract, link)
     for wanted in wanted_settings(contract, link):
-        if wanted.name in ("ARM", "levelling"):
+        if wanted.line.startswith(("aux", "#")):
             continue
         flipped = {f"feature {name}": f"feature -{name}" for name in ("RX_SERIAL", "RX_MSP", "AIRMODE")}
         flipped |= {other: line for line, other in flipped.items()}
@@ -160,6 +161,30 @@ def test_a_difference_is_said_with_what_was_found_and_what_is_wanted(contract):
 def test_only_aux1_arms(contract, aux, status):
     lines = [line for line in print_settings(contract, "crsf") if not line.startswith("aux")]
     assert statuses(dump_of(lines + aux), contract)["ARM"] is status
+
+
+@pytest.mark.parametrize(
+    ("aux", "arms", "overrides"),
+    [
+        (["aux 0 0 2 1300 2100 0 0", "aux 1 50 4 900 1200 0 0"], Status.OK, Status.OK),  # the pilot's own switches
+        (["aux 0 0 0 1700 2100 0 0"], Status.OK, Status.DIFFERS),
+        (["aux 0 0 0 1700 2100 0 0", "aux 1 50 0 1700 2100 0 0"], Status.OK, Status.DIFFERS),  # on whenever it is armed
+        (["aux 0 50 0 1700 2100 0 0", "aux 1 0 1 900 900 0 0"], Status.DIFFERS, Status.OK),
+    ],
+)
+def test_beside_a_receiver_the_pilot_has_a_switch_to_arm_and_another_to_hand_over(contract, aux, arms, overrides):
+    lines = [line for line in print_settings(contract, "msp_override") if not line.startswith("aux")]
+    found = statuses(dump_of(lines + aux), contract, "msp_override")
+    assert (found.pop("ARM by a switch"), found.pop("MSP OVERRIDE by another")) == (arms, overrides)
+    assert set(found.values()) == {Status.OK}
+
+
+def test_beside_a_receiver_msp_says_the_sticks_and_nothing_that_arms(contract):
+    wanted = {each.name: each.value for each in wanted_settings(contract, "msp_override")}
+    assert int(wanted["msp_override_channels_mask"]) == 0b1111
+    assert wanted["msp_override_failsafe"] == "OFF" and "serialrx_provider" not in wanted
+    text = dump_of(print_settings(contract, "msp_override")).replace("mask = 15", "mask = 31")
+    assert statuses(text, contract, "msp_override")["msp_override_channels_mask"] is Status.DIFFERS
 
 
 @pytest.mark.parametrize(

@@ -441,6 +441,24 @@ def test_a_link_that_takes_no_command_cuts_and_its_flight_plays_back(tmp_path):
     assert again.safety.state is State.CUT
 
 
+def test_a_flight_controller_that_takes_it_back_cuts_and_its_flight_plays_back(tmp_path):
+    class Refusing(Watched):
+        @property
+        def refusal(self):
+            return "" if self.elapsed < 1.5 else "the pilot flies it"
+
+    plant = Refusing(CIRCLE)
+    with FlightRecorder(tmp_path / FILE, {}) as recorder:
+        ended = plant.fly(chain_of(Hover(), plant), 50.0, 30.0, recorder)
+    assert ended == "cut: the flight controller refuses: the pilot flies it"
+    last = max(at for at, command in plant.sent if command.armed)
+    assert last == pytest.approx(1.5 + 0.75, abs=0.03)
+    again = chain_of(Hover(), plant)
+    for tick in Flight(tmp_path).ticks:
+        assert describe_outputs(again.tick(read_inputs(tick["in"])))["state"] == tick["out"]["state"]
+    assert again.safety.state is State.CUT
+
+
 @pytest.mark.parametrize("lift", [LIFT, 0.0])
 def test_until_it_moves_a_vehicle_is_lifted_and_its_flyer_begun_anew(lift):
     class Noted(Hover):

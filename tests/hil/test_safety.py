@@ -520,6 +520,28 @@ def test_a_link_that_takes_no_command_does_not_arm():
     assert verdict.state is State.DISARMED and verdict.reasons == (Reason.LINK_LOST,)
 
 
+def test_a_flight_controller_that_refuses_is_not_armed_and_in_flight_is_cut():
+    flight = Flight(refusal_time=0.5).ready()
+    verdict = flight.tick(refusal="CALIB: it is calibrating")
+    assert verdict.state is State.DISARMED and verdict.reasons == (Reason.REFUSED,)
+    assert verdict.refusals == ("the flight controller refuses: CALIB: it is calibrating",)
+    flight = Flight(refusal_time=0.5).flying()
+    for _ in range(2):  # what it says of a moment ago is no refusal
+        assert flight.ticks(16, refusal="ARM_SWITCH").state is State.FLYING
+        assert flight.tick().state is State.FLYING
+    assert flight.ticks(16, refusal="ARM_SWITCH").state is State.FLYING
+    verdict = flight.tick(refusal="ARM_SWITCH")
+    assert verdict.state is State.CUT and verdict.reasons == (Reason.REFUSED,)
+
+
+def test_a_refusal_counts_from_arming_on():
+    flight = Flight(refusal_time=0.5)
+    flight.ticks(64, operator=OFF, refusal="RXLOSS")
+    assert flight.tick().state is State.FLYING
+    assert flight.ticks(16, refusal="RXLOSS").state is State.FLYING
+    assert flight.tick(refusal="RXLOSS").state is State.CUT
+
+
 def test_overruns_before_a_flight_delay_it():
     flight = Flight(overruns_max=0, overrun_window=0.25).ready()
     flight.tick(operator=OFF, loop_overrun=True)
@@ -653,6 +675,7 @@ odd_ticks = st.builds(
     loop_overrun=st.integers(0, 9),
     finish=st.booleans(),
     command_dropped=st.booleans(),
+    refusal=st.sampled_from(("", "RXLOSS")),
 )
 small = st.builds(
     dict, after=st.floats(0.0, 0.06), setpoint=setpoints, lost=st.booleans(), loop_overrun=st.integers(0, 1)

@@ -32,6 +32,8 @@ class Wire:
             raise OSError("the device is gone")
         return b"frame"
 
+    refusal = ""
+
     def listen(self):
         return []
 

@@ -11,6 +11,7 @@ from dreamer_racing.hil.betaflight.firmware import find_firmware
 from dreamer_racing.plant.firmware_step import SteppedFirmware
 
 CONTRACT = Path(__file__).parents[2] / "agents" / "circle" / "contract.json"
+YAW = ("set p_yaw = 30", "set i_yaw = 5")  # of link=betaflight_sitl: the plant's rotors have no torque of speeding up
 
 
 @pytest.fixture(scope="session")
@@ -29,7 +30,7 @@ def set_up(program: Path) -> Iterator[Callable[[str], SteppedFirmware]]:
 
     def start(link: str = "betaflight_sitl") -> SteppedFirmware:
         if link not in firmwares:
-            firmwares[link] = SteppedFirmware(program, print_settings(read_contract(CONTRACT), link))
+            firmwares[link] = SteppedFirmware(program, [*print_settings(read_contract(CONTRACT), link), *YAW])
         firmwares[link].start()
         return firmwares[link]
 

@@ -225,7 +225,10 @@ def test_nothing_but_a_command_makes_a_lock_step(fresh: PlantVehicle, incoming: 
     [
         ({"command_port": 9100}, "command_port and pose_port are both 9100"),
         ({"betaflight": "2026.6", "state_port": 9100, "motor_port": 9100}, "motor_port and pose_port are both 9100"),
-        ({"betaflight": "4.5"}, "one of 2026.6, before"),
+        ({"betaflight": "4"}, "betaflight=4: a release of the firmware, as 4.6 or 2026.6"),
+        ({"betaflight": "4.6", "lock_step": True}, "betaflight=4.6: it keeps to the wall clock"),
+        ({"firmware": "auto", "speed": 2.0}, "firmware=auto: it keeps to the wall clock"),
+        ({"firmware": "auto", "state_port": 9002}, "motor_port and state_port are both 9002"),
         ({"betaflight": "before", "lock_step": True}, "wall clock"),
         ({"betaflight": "before", "speed": 2.0}, "wall clock"),
         ({"lock_step": True, "speed": 2.0}, "no clock to be faster than"),

@@ -13,9 +13,10 @@ from dreamer_racing.hil.betaflight import Status, check_dump, rate_map, wanted_s
 from dreamer_racing.hil.betaflight.status import REQUEST, SerialOverTcp
 from dreamer_racing.hil.chain import ChainConfig, FlightChain
 from dreamer_racing.hil.flyer import ActorFlyer
+from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.link import ChannelLink, TransportLink
 from dreamer_racing.hil.links.msp import MspTelemetry, encode_msp
-from dreamer_racing.hil.links.sitl import encode_sitl
+from dreamer_racing.hil.links.sitl import SitlTransport, encode_sitl
 from dreamer_racing.hil.links.tcp import TcpTransport
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.sticks import ThrustMap
@@ -137,10 +138,119 @@ def test_a_link_that_is_lost_stops_the_motors_by_the_firmwares_own_failsafe(set_
             "before 2026.6 the firmware's radio over UDP counts as heard for ever: its failsafe is tried by MSP"
         )
     step = ready(firmware, radio_link(Radio(firmware)) if link == "betaflight_sitl" else msp_link(firmware))
-    hover(step, rate=50.0)  # more than some 100 MSP messages a second wait for one another in the firmware
+    hover(step)
     lost = step.elapsed
     step.plant.advance_to(lost + 1.0)
     assert step.disarmed_at is not None and 0.3 < step.disarmed_at - lost <= LINK_LOST
+
+
+def test_what_does_not_arm_says_why(set_up: SetUp) -> None:
+    firmware = set_up()
+    serial = SerialOverTcp(firmware.firmware.ports.serial)
+    radio = Radio(firmware)
+    link = ChannelLink(SitlTransport(radio, serial), encode_sitl, RATES, THRUST, telemetry=MspTelemetry())
+    step = FirmwareStep(PlantVehicle("circle", "faithful"), firmware, link)
+    radio.pulled = True
+    assert talk(step, at_rest(), 2.0).startswith("RXLOSS: it hears no valid channels")
+    radio.pulled = False
+    assert talk(step, at_rest(), 2.0) == ""
+    assert "THROTTLE: the throttle is not low" in talk(step, asked(), 1.0) and not step.plant.vehicle.armed
+    assert "ARM_SWITCH" in talk(step, asked(thrust=0.0), 1.0), "low now, but the switch was on before"
+    link.close()
+
+
+class Receiver:
+    """A radio by which a pilot flies, arms (AUX1) and hands over (AUX2)."""
+
+    def __init__(self, firmware: SteppedFirmware) -> None:
+        self._radio, self._steps = Radio(firmware), 0
+        self.arms = self.hands_over = False
+        self.throttle = 1000
+
+    def __call__(self) -> None:
+        """Send channels at 50 Hz."""
+        if self._steps % 20 == 0:
+            switches = (1000 + 1000 * on for on in (self.arms, self.hands_over))
+            self._radio.write(encode_sitl((1500, 1500, self.throttle, 1500, *switches, *10 * (1000,))))
+        self._steps += 1
+
+
+def beside_a_receiver(firmware: SteppedFirmware) -> tuple[FirmwareStep, Receiver, TransportLink]:
+    """A firmware whose receiver stays, and which has heard that for long enough."""
+    config = LinkConfig("msp_override", port=firmware.firmware.ports.serial, rates=RATES, thrust=THRUST)
+    link = make_link(config)
+    step, receiver = FirmwareStep(PlantVehicle("circle", "faithful"), firmware, link), Receiver(firmware)
+    step.after_step = receiver
+    talk(step, at_rest(), 1.5)
+    return step, receiver, link
+
+
+def talk(step: FirmwareStep, command: Command, seconds: float) -> str:
+    """Tell it something at 50 Hz, and listen; return why it does not fly that."""
+    for _ in range(round(seconds * 50)):
+        step.listen()
+        tell(step, command, 0.02, 50.0)
+    return step.refusal
+
+
+def test_the_pilot_of_a_receiver_arms_hands_over_and_takes_back(set_up: SetUp) -> None:
+    step, receiver, link = beside_a_receiver(set_up("msp_override"))
+    vehicle = step.plant.vehicle
+    assert talk(step, asked(thrust=0.0), 0.5).startswith("the pilot has not armed it") and not vehicle.armed
+    receiver.arms = True
+    assert talk(step, asked(), 0.5) == "the pilot flies it: MSP OVERRIDE is off"
+    assert vehicle.armed and vehicle.on_stand, "by the receiver, whose throttle is low"
+    receiver.hands_over = True
+    assert talk(step, at_rest(), 0.5) == ""
+    talk(step, asked(thrust=1.1 * GRAVITY), 0.4)
+    talk(step, asked(), 0.2)
+    talk(step, asked(x=3.0), 0.25)
+    assert vehicle.pose().body_rates[0] == pytest.approx(3.0, rel=0.2)
+    receiver.hands_over, receiver.throttle = False, 1550
+    assert talk(step, asked(x=3.0), 0.3) == "the pilot flies it: MSP OVERRIDE is off"
+    assert abs(vehicle.pose().body_rates[0]) < 0.3, "the receiver's sticks are centred"
+    receiver.arms = False
+    told = step.elapsed
+    talk(step, asked(), 0.2)
+    assert step.disarmed_at is not None and step.disarmed_at - told <= 0.05
+    link.close()
+
+
+def test_what_a_dead_computer_said_last_stands_or_is_dropped_as_the_guide_says(set_up: SetUp) -> None:
+    firmware = set_up("msp_override")
+    step, receiver, link = beside_a_receiver(firmware)
+    receiver.arms = receiver.hands_over = True
+    talk(step, at_rest(), 0.5)
+    receiver.throttle = 1550
+    talk(step, asked(thrust=1.3 * GRAVITY), 0.6)
+    talk(step, asked(x=0.7), 0.4)
+    step.plant.advance_to(step.plant.time + 0.6)
+    rate = step.plant.vehicle.pose().body_rates[0]
+    if dialect_of(firmware.firmware.release) is DIALECTS["before"]:
+        assert rate == pytest.approx(0.7, rel=0.2), "for ever"
+        receiver.hands_over = False
+        step.plant.advance_to(step.plant.time + 0.3)
+    assert abs(step.plant.vehicle.pose().body_rates[0]) < 0.1, "the receiver's sticks are centred"
+    link.close()
+
+
+@pytest.mark.slow
+def test_a_lap_beside_a_receiver_until_the_pilot_takes_back(set_up: SetUp) -> None:
+    step, receiver, link = beside_a_receiver(set_up("msp_override"))
+    vehicle, steps = step.plant.vehicle, [0]
+
+    def take_part() -> None:
+        steps[0] += 1
+        receiver.arms, receiver.hands_over = steps[0] > 500, steps[0] > 1000 and vehicle.gates_passed < 5
+        receiver()
+
+    step.after_step = take_part
+    step.enable_after = step.elapsed + 2.0
+    ended = step.fly(chain_of(step, PilotFlyer(vehicle.track, "faithful"), laps=3), 50.0, 40.0)
+    print(step.elapsed, vehicle.fate, vehicle.gates_passed, vehicle.lap_times, step.refusal)
+    assert ended == "cut: the flight controller refuses: the pilot flies it: MSP OVERRIDE is off"
+    assert vehicle.gates_passed == 5 and len(vehicle.lap_times) == 1
+    link.close()
 
 
 @pytest.mark.slow

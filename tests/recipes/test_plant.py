@@ -17,9 +17,12 @@ import numpy as np
 import pytest
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.betaflight.firmware import Ports, find_firmware
 from dreamer_racing.hil.inlet import bind
+from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.udp import UdpLink
 from dreamer_racing.hil.pose import UdpPose
+from dreamer_racing.hil.sticks import RateMap, ThrustMap
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest
 from tests.plant.test_betaflight_sitl import Firmware
 from tests.running_recipes import ROOT, recipe
@@ -31,14 +34,16 @@ def plant(*overrides: str) -> Iterator[tuple[int, Callable[[int], str]]]:
     command = [sys.executable, str(ROOT / "recipes" / "plant.py"), *overrides]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
-    first = process.stdout.readline()
-    listens = re.search(r"listens on 127\.0\.0\.1:(\d+)", first)
+    first, listens = "", None
+    while listens is None and (line := process.stdout.readline()):
+        first += line
+        listens = re.search(r"listens on 127\.0\.0\.1:(\d+)", line)
 
     def stop(number: int) -> str:
         process.send_signal(number)
         said, _ = process.communicate(timeout=20)
         assert process.returncode == 0, said
-        return said
+        return first + said
 
     try:
         assert listens, first + process.stdout.read()
@@ -104,6 +109,38 @@ def test_a_stand_in_for_the_firmware_flies_it_over_loopback_until_sigint() -> No
     assert int(re.search(r"(\d+) motor packets \(0 malformed\), 0 failsafe", said)[1]) > 300, said
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("betaflight")
+def test_one_command_starts_a_real_firmware_that_flies_it_and_stops_it() -> None:
+    try:
+        find_firmware()
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    poses, ports = UdpPose(0), Ports.free(0)
+    where = (f"state_port={ports.state}", f"channel_port={ports.channels}", f"serial_port={ports.serial}")
+    with plant("firmware=auto", "track=circle", *where, "motor_port=0", f"pose_port={poses.address[1]}") as (_, stop):
+        rates, thrust = RateMap(10.0, 10.0, 4.0), ThrustMap(0.6, 16.0, 15.0, 15.0)
+        link = make_link(
+            LinkConfig("betaflight_sitl", port=ports.channels, serial_port=ports.serial, rates=rates, thrust=thrust)
+        )
+        height, accepted, deadline = 0.0, 0, time.monotonic() + 90.0
+        while height < 1.5 and time.monotonic() < deadline:
+            link.listen()
+            thrust_now = 0.0 if accepted < 100 else 1.2 * GRAVITY
+            armed = Command(True, Setpoint(thrust_now, np.zeros(3)))
+            sent = link.send(armed if accepted > 50 else at_rest())
+            accepted = accepted + 1 if sent and (accepted > 50 or not link.refusal) else 0
+            height = max([height, *(one.packet.position[2] for one in poses.poll())])
+            time.sleep(0.02)
+        said = stop(signal.SIGTERM)
+        link.close()
+    poses.close()
+    assert height >= 1.5, said
+    assert "set up in an empty folder" in said and "the stand let go" in said
+    with socket.socket() as gone:
+        assert gone.connect_ex(("127.0.0.1", ports.serial)) != 0, "it was stopped"
+
+
 def test_a_port_in_use_is_one_paragraph(tmp_path: Path) -> None:
     with bind("127.0.0.1", 0) as busy:
         done = recipe("plant", f"command_port={busy.getsockname()[1]}", cwd=tmp_path)
@@ -117,6 +154,8 @@ def test_a_port_in_use_is_one_paragraph(tmp_path: Path) -> None:
         (["track=nowhere"], "unknown track 'nowhere'"),
         (["mass=9"], "mass=9.0: must be at least 0.5 and at most 2"),
         (["betaflight=2026.6", "delay=0.01"], "delay=0.01 is of commands"),
+        (["actor=circle"], "actor=circle is for firmware="),
+        (["firmware=/nowhere", "motor_port=0"], "/nowhere is no program of a Betaflight"),
     ],
 )
 def test_refusals_say_what_is_wrong(overrides: list[str], message: str, tmp_path: Path) -> None:

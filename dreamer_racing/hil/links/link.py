@@ -77,6 +77,11 @@ class TransportLink(ABC):
         """What has come back so far and was not understood, see `Telemetry`."""
         return 0 if self._telemetry is None else self._telemetry.rejected
 
+    @property
+    def refusal(self) -> str:
+        """Why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        return "" if self._telemetry is None else self._telemetry.refusal(self._armed)
+
     def listen(self) -> list[Reading]:
         """Return the battery's voltages that have come back since the last call, oldest first, without waiting.
 

@@ -1,7 +1,10 @@
-"""MSP version 1 (MultiWii serial protocol): SET_RAW_RC, BATTERY_STATE and RAW_IMU, over USB or a serial port.
+"""MSP version 1 (MultiWii serial protocol): SET_RAW_RC, BATTERY_STATE, RAW_IMU and STATUS, over a serial port or TCP.
 
 38 bytes, little endian: ``b"$M<"``, size 32 of the payload, code 200, 16 u16 µs, and all after ``<`` combined by XOR.
-In Betaflight: ``feature RX_MSP``, and at least five messages a second.
+In Betaflight: ``feature RX_MSP``, and at least five messages a second. Where a receiver stays and MSP overrides its
+sticks, only these four are sent, 14 bytes: what is not there cannot arm.
+
+What the flight controller says of itself (101, `hil.betaflight.status`) is asked for with the battery.
 
 The battery is asked for (code 130, no payload). The answer begins with ``b"$M>"``; its payload of 11 bytes is: cells u8
 (0: no battery), capacity u16 (mAh), voltage u8 (0.1 V), drawn u16 (mAh), current i16 (0.01 A), alert u8, and voltage
@@ -25,12 +28,27 @@ from operator import xor
 import numpy as np
 
 from dreamer_racing.envs.drone.parameters import GRAVITY
+from dreamer_racing.hil.betaflight.status import (
+    ANGLE,
+    BOXIDS,
+    BOXIDS_REQUEST,
+    HORIZON,
+    MSP_OVERRIDE,
+    REQUEST,
+    STATUS,
+    FlightControllerStatus,
+    read_status,
+)
 from dreamer_racing.hil.imu import make_sample
 from dreamer_racing.hil.links.telemetry import FrameTelemetry
 
 SET_RAW_RC, BATTERY_STATE, RAW_IMU = 200, 130, 102
 BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])
 """Asks for the battery's state: 6 bytes."""
+MSP_REQUEST = BATTERY_REQUEST + REQUEST
+"""Asks for all that is heard of a flight controller now and then."""
+OVERRIDE_REQUEST = MSP_REQUEST + BOXIDS_REQUEST
+"""The same, with which modes there are."""
 _BATTERY_PAYLOAD = 11
 IMU_REQUEST = b"$M<" + bytes([0, RAW_IMU, RAW_IMU])
 """Asks for what the IMU tells: 6 bytes."""
@@ -39,35 +57,53 @@ GYRO_COUNTS = 16.4
 G_COUNTS, G_COUNTS_SITL = 512.0, 256.0
 """To 9.81 m/s²: of sensors, and of a firmware that was built for a computer."""
 _IMU = struct.Struct("<6h")
-_FRAME = struct.Struct("<3sBB16HB")
-_PAYLOAD_SIZE = 32
-_HEADER = b"$M<" + bytes([_PAYLOAD_SIZE, SET_RAW_RC])
-FRAME_SIZE = _FRAME.size
-"""Bytes of a message: 38."""
+_STICKS = 4
+FRAME_SIZE = 38
+"""Bytes of a message of 16 channels."""
 
 
 def encode_msp(channels: Sequence[float]) -> bytes:
-    """Return the message of 16 channels in µs, rounded to 1 µs."""
-    frame = _FRAME.pack(b"$M<", _PAYLOAD_SIZE, SET_RAW_RC, *(round(value) for value in channels), 0)
+    """Return the message of channels in µs, rounded to 1 µs: 16 as a rule."""
+    words = struct.pack(f"<{len(channels)}H", *(round(value) for value in channels))
+    frame = b"$M<" + bytes([len(words), SET_RAW_RC]) + words + b"\0"
     return frame[:-1] + bytes([_checksum(frame)])
 
 
+def encode_sticks(channels: Sequence[float]) -> bytes:
+    """Return the message of the four sticks of 16 channels."""
+    return encode_msp(channels[:_STICKS])
+
+
 def decode_msp(frame: bytes) -> tuple[float, ...] | None:
-    """Return the 16 channels, in µs, of a message; None if it is none, or damaged."""
-    if len(frame) != FRAME_SIZE or not frame.startswith(_HEADER) or _checksum(frame) != frame[-1]:
+    """Return the channels, in µs, of a message; None if it is none, or damaged."""
+    size = len(frame) - 6
+    if (
+        size < 0
+        or size % 2
+        or not frame.startswith(b"$M<" + bytes([size, SET_RAW_RC]))
+        or _checksum(frame) != frame[-1]
+    ):
         return None
-    return tuple(float(value) for value in _FRAME.unpack(frame)[3:-1])
+    return tuple(float(value) for value in struct.unpack(f"<{size // 2}H", frame[5:-1]))
 
 
 class MspTelemetry(FrameTelemetry):
-    """Reads answers to `BATTERY_REQUEST` and `IMU_REQUEST`.
+    """Reads answers to `OVERRIDE_REQUEST` and `IMU_REQUEST`.
 
     Args:
         g_counts: Of acceleration, to 9.81 m/s².
+        override: Whether a receiver stays, and its pilot arms, hands over and takes back.
+
+    Attributes:
+        status: What the flight controller last said of itself; None: nothing.
+        boxes: Numbers of its modes, in the order of the status' bits; None: it has not said.
     """
 
-    def __init__(self, g_counts: float = G_COUNTS) -> None:
+    def __init__(self, g_counts: float = G_COUNTS, override: bool = False) -> None:
         super().__init__()
+        self.status: FlightControllerStatus | None = None
+        self.boxes: bytes | None = None
+        self._override = override
         self._scale = math.radians(1.0 / GYRO_COUNTS), GRAVITY / g_counts
 
     def frame_size(self, data: bytes) -> int | None:
@@ -83,6 +119,38 @@ class MspTelemetry(FrameTelemetry):
     def is_battery(self, frame: bytes) -> bool:
         """Whether a frame is a BATTERY_STATE, or says that the flight controller has none."""
         return frame[4] == BATTERY_STATE
+
+    def note(self, frame: bytes) -> None:
+        """Keep what a STATUS, or a BOXIDS, says."""
+        if frame[2] != ord(">"):
+            return
+        if frame[4] == STATUS:
+            self.status = read_status(frame[5:-1]) or self.status
+        elif frame[4] == BOXIDS:
+            self.boxes = frame[5:-1]
+
+    def refusal(self, armed: bool) -> str:
+        """Return why the flight controller does not fly what it is told, or would not; empty as far as is known."""
+        status = self.status
+        if self._override:
+            return self._taken_back()
+        if status is None or status.armed:
+            return ""
+        return status.words or ("it has not armed, and gives no reason: is arm_channel= its switch?" if armed else "")
+
+    def _taken_back(self) -> str:
+        """Return why the pilot does not let it fly; empty if he does."""
+        status, boxes = self.status, self.boxes
+        if status is None or boxes is None:
+            return "nothing was heard of it"
+        if MSP_OVERRIDE not in boxes:
+            return "it has no mode MSP OVERRIDE: see msp_override_channels_mask, and put the mode on a switch"
+        on = {box for bit, box in enumerate(boxes) if status.modes >> bit & 1}
+        if not status.armed:
+            return "the pilot has not armed it" + (f": {status.words}" if status.words else "")
+        if MSP_OVERRIDE not in on:
+            return "the pilot flies it: MSP OVERRIDE is off"
+        return "it levels itself: switch ANGLE and HORIZON off" if on & {ANGLE, HORIZON} else ""
 
     def voltage(self, frame: bytes) -> float | None:
         """Return the voltage, V, in steps of 0.01 V."""

@@ -33,6 +33,7 @@ PROTOCOLS = {
     "crsf": SerialSettings(420_000, "N", 1),
     "sbus": SerialSettings(100_000, "E", 2),
     "msp": SerialSettings(115_200, "N", 1),
+    "msp_override": SerialSettings(115_200, "N", 1),
     "mavlink": SerialSettings(57_600, "N", 1),  # PX4's default on TELEM1
 }
 """Settings by name of the protocol."""

@@ -1,5 +1,8 @@
 """Betaflight's firmware in a process of its own (SITL): channels to its UDP port 9004, and MSP by its TCP port 5761.
 
+A firmware that hears channels while it boots may stay in its receiver failsafe for good (betaflight#12401): none are
+sent before it has said that it has booted.
+
 The packet, 40 bytes, little endian: a time stamp f64 and 16 u16 µs. The stamp is constant: where the firmware reads the
 time from stamps, their jitter becomes its clock's.
 
@@ -8,14 +11,16 @@ Reference: Betaflight, src/platform/SIMULATOR/sitl.c (rc_packet).
 
 from __future__ import annotations
 
-import socket
+import logging
 import struct
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 
-from dreamer_racing.hil.links.msp import IMU_REQUEST
-from dreamer_racing.hil.links.udp import UdpTransport
+from dreamer_racing.hil.betaflight.status import NOT_READY, REQUEST, SerialOverTcp
+from dreamer_racing.hil.links.link import ASK_EVERY, Transport
+from dreamer_racing.hil.links.msp import IMU_REQUEST, MspTelemetry
+
+logger = logging.getLogger(__name__)
 
 RC_PORT, MSP_PORT = 9004, 5761
 _PACKET = struct.Struct("<d16H")
@@ -27,49 +32,59 @@ def encode_sitl(channels: Sequence[float]) -> bytes:
     return _PACKET.pack(_STAMP, *(round(value) for value in channels))
 
 
-class FeelingTransport:
-    """A `Transport`: datagrams to the firmware, with each of which it is asked over MSP what its IMU tells.
+class SitlTransport:
+    """A `Transport` of channels to a firmware on this machine, which holds them back until it has booted.
 
     Args:
-        channels: Takes the datagrams.
-        host: Of the firmware.
-        port: Of its MSP.
-
-    Raises:
-        OSError: Nobody answers there.
+        channels: To where it hears channels.
+        serial: Its first serial port.
+        imu: Whether it is asked with each command what its IMU tells.
     """
 
-    _SIZE = 4096  # bytes read at a time: many answers
+    ANSWERS_WITHIN = 10.0
+    """s after which one that was asked and does not answer is sent channels all the same [choice]: somebody else may
+    have its serial port, which takes one connection."""
 
-    def __init__(self, channels: UdpTransport, host: str, port: int = MSP_PORT) -> None:
-        self._channels = channels
-        try:
-            self._serial = socket.create_connection((host, port), timeout=2.0)
-        except OSError as error:
-            channels.close()
-            raise OSError(f"host={host}, port={port}: no firmware answers there, for its IMU: {error}") from error
-        self._serial.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._serial.setblocking(False)
+    def __init__(self, channels: Transport, serial: SerialOverTcp, imu: bool = False) -> None:
+        self._channels, self._serial = channels, serial
+        self._always = IMU_REQUEST if imu else b""
+        self._written = 0
+        self._asked_at: float | None = None  # when it was first, s
+        self._boots: MspTelemetry | None = MspTelemetry()  # what it says until it has booted
 
     def write(self, data: bytes) -> bool:
-        """Send a datagram, and ask; return whether the datagram went out."""
-        with suppress(BlockingIOError, ConnectionError):  # what is not answered grows old, and counts as lost
-            self._serial.send(IMU_REQUEST)
-        return self._channels.write(data)
+        """Send channels, and ask what is to be asked now; return whether the channels went out."""
+        request = (b"" if self._written % ASK_EVERY else REQUEST) + self._always
+        self._written += 1
+        if request and self._serial.write(request) and self._asked_at is None:
+            self._asked_at = time.monotonic()
+        self._look()
+        return self._boots is None and self._channels.write(data)
+
+    def _look(self) -> None:
+        """See whether it has booted."""
+        if self._boots is None or self._asked_at is None:
+            return
+        status = self._boots.status
+        if status is not None and not NOT_READY.intersection(status.names):
+            logger.info("the firmware has booted: it is sent channels from now on")
+            self._boots = None
+        elif status is None and time.monotonic() - self._asked_at > self.ANSWERS_WITHIN:
+            logger.warning("the firmware does not say whether it has booted: it is sent channels all the same")
+            self._boots = None
 
     def discard(self) -> None:
-        """Do nothing: datagrams leave at once, or not at all."""
+        """Throw away what was written and has not left yet."""
+        self._channels.discard()
 
     def read(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the answers that have come, with the time now, s (``time.monotonic``)."""
-        try:
-            data = self._serial.recv(self._SIZE)
-        except (BlockingIOError, ConnectionError):
-            return
-        if data:
+        """Yield what its serial port has said, with the time now, s (``time.monotonic``)."""
+        if data := self._serial.read():
+            if self._boots is not None:
+                self._boots.read(data)
             yield time.monotonic(), data
 
     def close(self) -> None:
         """Close both."""
-        self._serial.close()
         self._channels.close()
+        self._serial.close()

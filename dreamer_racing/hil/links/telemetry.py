@@ -1,4 +1,4 @@
-"""What comes back from a vehicle, as far as it is read: the voltage of its battery, and what its IMU tells."""
+"""What comes back from a vehicle, as far as it is read: voltages, what its IMU tells, why it does not arm."""
 
 from __future__ import annotations
 
@@ -22,6 +22,14 @@ class Telemetry(ABC):
     @abstractmethod
     def read(self, data: bytes) -> list[float]:
         """Take in bytes; return the voltages in them, V, oldest first. It never raises."""
+
+    def refusal(self, armed: bool) -> str:
+        """Return why the flight controller does not fly what it is told, or would not; empty as far as is known.
+
+        Args:
+            armed: Whether it was told to be armed.
+        """
+        return ""
 
 
 class FrameTelemetry(Telemetry):
@@ -59,6 +67,9 @@ class FrameTelemetry(Telemetry):
         """Return what a frame that speaks of the IMU says, (6,); None if it is too short, or there is none."""
         raise NotImplementedError(f"{type(self).__name__} reads no IMU.")
 
+    def note(self, frame: bytes) -> None:
+        """Take in a whole frame that speaks of something else."""
+
     def read(self, data: bytes) -> list[float]:
         """Take in bytes; return the voltages in them, V, oldest first."""
         self._buffer += data
@@ -83,4 +94,6 @@ class FrameTelemetry(Telemetry):
                 sample = self.sample(frame)
                 self.rejected += sample is None
                 self.felt += [] if sample is None else [sample]
+            else:
+                self.note(frame)
         return voltages

@@ -15,9 +15,8 @@ from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.hil.imu import PACKET_SIZE, decode_imu, encode_imu, unlike_rest
 from dreamer_racing.hil.links import LinkConfig, make_link
 from dreamer_racing.hil.links.mavlink import MavlinkTelemetry
-from dreamer_racing.hil.links.msp import IMU_REQUEST, MspTelemetry
-from dreamer_racing.hil.links.sitl import FeelingTransport
-from dreamer_racing.hil.links.udp import PacketTelemetry, UdpLink, UdpTransport
+from dreamer_racing.hil.links.msp import MspTelemetry
+from dreamer_racing.hil.links.udp import PacketTelemetry, UdpLink
 from dreamer_racing.hil.vehicle import at_rest
 
 RATES, FORCE = (0.5, -1.0, 2.0), (1.0, -2.0, 9.81)
@@ -109,34 +108,6 @@ def test_a_link_gives_samples_once_with_their_time_of_arrival() -> None:
     assert link.feel() == []
     link.close()
     vehicle.close()
-
-
-def test_a_firmware_is_asked_with_each_command_and_its_answer_is_read() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        transport = FeelingTransport(UdpTransport("127.0.0.1", 9), "127.0.0.1", server.getsockname()[1])
-        firmware = server.accept()[0]
-        firmware.settimeout(5.0)
-        transport.write(b"channels")
-        assert firmware.recv(100) == IMU_REQUEST
-        assert list(transport.read()) == []
-        firmware.sendall(raw_imu())
-        firmware.close()
-    answers: list[bytes] = []
-    while not answers:
-        answers = [data for _, data in transport.read()]
-    assert answers == [raw_imu()]
-    for _ in range(3):  # who has gone is asked in vain
-        transport.write(b"channels")
-    assert list(transport.read()) == []
-    transport.close()
-
-
-def test_without_a_firmware_the_message_says_what_was_wanted_of_it() -> None:
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        port = nobody.getsockname()[1]
-        with pytest.raises(OSError, match=f"port={port}: no firmware answers there, for its IMU"):
-            FeelingTransport(UdpTransport("127.0.0.1", 9), "127.0.0.1", port)
 
 
 @pytest.mark.parametrize("name", ["crsf", "sbus"])

@@ -30,10 +30,6 @@ def hears_command(data):
     return decode_command(data).command.armed is False
 
 
-def hears_channels(data):
-    return len(data) == 40 and int.from_bytes(data[12:14], "little") == 1000
-
-
 def hears_mavlink(data):
     common = pytest.importorskip("pymavlink.dialects.v20.common")
     return len(common.MAVLink(None).parse_buffer(data)) == 1
@@ -44,7 +40,6 @@ def hears_mavlink(data):
     [
         ("udp", hears_command),
         ("simulated", hears_command),
-        ("betaflight_sitl", hears_channels),
         ("mavlink", hears_mavlink),
     ],
 )
@@ -55,18 +50,17 @@ def test_links_over_udp(listener, name, hears):
     link.close()
 
 
-def test_port_of_the_firmware(monkeypatch):
+def test_ports_of_the_firmware(monkeypatch):
     opened = []
     monkeypatch.setattr("dreamer_racing.hil.links.UdpTransport", lambda *address: opened.append(address))
+    monkeypatch.setattr("dreamer_racing.hil.links.SerialOverTcp", lambda *address: opened.append(address))
     make_link(LinkConfig("betaflight_sitl", rates=RATES, thrust=THRUST))
-    assert opened == [("127.0.0.1", 9004)]
+    assert opened == [(5761, "127.0.0.1"), ("127.0.0.1", 9004)]
 
 
-def test_the_arm_channel_is_the_one_chosen(listener):
-    link = make_link(
-        LinkConfig("betaflight_sitl", port=listener.getsockname()[1], rates=RATES, thrust=THRUST, arm_channel=7)
-    )
-    sent = link.send(at_rest()._replace(armed=True))
+def test_the_arm_channel_is_the_one_chosen():
+    link = make_link(LinkConfig("betaflight_sitl", rates=RATES, thrust=THRUST, arm_channel=7))
+    sent = link.encode(at_rest()._replace(armed=True))
     assert [int.from_bytes(sent[8 + 2 * n : 10 + 2 * n], "little") for n in (4, 7)] == [1000, 2000]
     link.close()
 
@@ -84,8 +78,11 @@ def test_unknown_links():
         (LinkConfig("mavlink", port=14540), "thrust"),
         (LinkConfig("betaflight_sitl", thrust=THRUST), "rates"),
         (LinkConfig("betaflight_sitl", rates=RATES), "thrust"),
-        *[(LinkConfig(name, rates=RATES, thrust=THRUST), "device") for name in ("crsf", "sbus", "msp")],
-        *[(LinkConfig(name, device="/dev/ttyUSB0", thrust=THRUST), "rates") for name in ("crsf", "sbus", "msp")],
+        *[(LinkConfig(name, rates=RATES, thrust=THRUST), "device") for name in ("crsf", "sbus", "msp", "msp_override")],
+        *[
+            (LinkConfig(name, device="/dev/ttyUSB0", thrust=THRUST), "rates")
+            for name in ("crsf", "sbus", "msp", "msp_override")
+        ],
     ],
 )
 def test_what_is_missing_is_named(config, field):

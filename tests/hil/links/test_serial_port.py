@@ -17,7 +17,7 @@ serial = pytest.importorskip("serial")
 
 from dreamer_racing.hil.links import LinkConfig, make_link  # noqa: E402
 from dreamer_racing.hil.links.crsf import crc8, decode_crsf  # noqa: E402
-from dreamer_racing.hil.links.msp import BATTERY_REQUEST, decode_msp  # noqa: E402
+from dreamer_racing.hil.links.msp import MSP_REQUEST, OVERRIDE_REQUEST, decode_msp  # noqa: E402
 from dreamer_racing.hil.links.sbus import decode_sbus  # noqa: E402
 from dreamer_racing.hil.links.serial_port import PROTOCOLS, SerialPort, SerialSettings  # noqa: E402
 from dreamer_racing.hil.sticks import RateMap, ThrustMap  # noqa: E402
@@ -51,7 +51,8 @@ def read(descriptor: int, size: int) -> bytes:
     [
         ("crsf", decode_crsf),
         ("sbus", lambda data: decode_sbus(data).channels),
-        ("msp", lambda data: decode_msp(data.removesuffix(BATTERY_REQUEST))),
+        ("msp", lambda data: decode_msp(data.removesuffix(MSP_REQUEST))),
+        ("msp_override", lambda data: (*decode_msp(data.removesuffix(OVERRIDE_REQUEST)), *RESTING[4:])),
     ],
 )
 def test_frames_arrive(wire, name, decode):
