@@ -96,7 +96,7 @@ class RaceWorlds:
             lead past it.
         action_change_weight: b₃, penalty in training for each unit of ‖aₜ − aₜ₋₁‖², but in a step that ends in a crash
             and the first of an episode; 0 as in the paper. Champion-level drone racing (Kaufmann et al., Nature 620,
-            2023, Extended Data Table 1) has 1e-4 where a metre of progress is 1, too.
+            2023, Extended Data Table 1a: λ₅, with λ₁ = 1 for a metre of progress, as here) has 1e-4.
         control_rate: actions a second, Hz; if None the preset's, 50.
         camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
             one, and none is drawn in between; if None the camera's, a frame at every control step.
