@@ -4,7 +4,7 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
     python recipes/hil.py actor=circle arm=true laps=3                    # in another: an agent flies it
     python recipes/hil.py actor=pilot track=circle preset=easy arm=true laps=3   # or the scripted pilot
     python recipes/hil.py actor=identify track=circle arm=true     # or small steps, for recipes/identification.py
-    python recipes/hil.py actor=kidney arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
+    python recipes/hil.py actor=circle_betaflight arm=true link=crsf device=/dev/ttyUSB0 operator=keyboard \
         mass=0.62 full_thrust=17 reference_voltage=15.2 voltage=15.8      # or a real vehicle, by a radio's receiver
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
     python recipes/hil.py report=runs/hil_kidney_20260101-120000

@@ -15,7 +15,13 @@ from dreamer_racing.hil.betaflight import LINKS as BETAFLIGHT
 from dreamer_racing.hil.betaflight import rate_map, require_dump
 from dreamer_racing.hil.camera import NoseCamera
 from dreamer_racing.hil.chain import LIFT, ChainConfig, FlightChain
-from dreamer_racing.hil.flyer import Flyer, check_contract, check_ranges, check_rate_loop
+from dreamer_racing.hil.flyer import (
+    Flyer,
+    check_contract,
+    check_flown_by_betaflight,
+    check_ranges,
+    check_rate_loop,
+)
 from dreamer_racing.hil.links import HEARING, LINKS, LinkConfig
 from dreamer_racing.hil.links.sitl import MSP_PORT
 from dreamer_racing.hil.operator import (
@@ -97,9 +103,10 @@ class HilConfig:
     device: str | None = None  # serial port
     baud: int | None = setting(None, Range(1))  # null: the protocol's own
     arm_channel: int = 4  # index of the channel that arms: 4 is AUX1
-    # what the vehicle is, a preset or the file of recipes/identification.py: an actor of another rate loop is refused
+    # what the vehicle is, a preset or the file of recipes/identification.py: an actor of another rate loop is refused;
+    # null: a link to a Betaflight arms none that was trained with a proportional one
     vehicle: str | None = None
-    force: bool = False  # fly what vehicle= refuses all the same
+    force: bool = False  # fly all the same what is refused for its rate loop
     betaflight_dump: str | None = None  # what `dump all` gave; settings that are not the actor's: nothing is armed
     mass: float | None = setting(None, POSITIVE)  # kg, with battery
     full_thrust: float | None = setting(None, POSITIVE)  # N, of all motors at full command and the reference voltage
@@ -170,7 +177,7 @@ def check_read(config: HilConfig) -> None:
     for names, is_read, reader in (
         (("preset",), config.actor == PILOT, "actor=pilot"),
         (("renderer",), config.actor not in (PILOT, IDENTIFY), "an actor that sees"),
-        (("force",), config.vehicle is not None, "vehicle="),
+        (("force",), config.vehicle is not None or config.link in BETAFLIGHT, "vehicle=, or a link to a Betaflight"),
         (("vehicle",), config.actor not in (PILOT, IDENTIFY), "an actor that was trained"),
         (("baud",), config.device is not None, "device="),
         (("link_host", "link_port"), config.device is None, "a link over the network, without device="),
@@ -218,11 +225,14 @@ def check_flight(config: HilConfig, contract: dict[str, Any], track: Track) -> l
         ValueError: The message names what differs, line by line where settings of the flight controller do.
         OSError: There is no such dump.
     """
-    notes = []
-    if config.actor not in (PILOT, IDENTIFY) and (note := check_contract(contract, track, config.rate)):
-        notes.append(note)
-    if config.vehicle is not None and (note := check_rate_loop(contract, config.vehicle, config.force)):
-        notes.append(note)
+    found: list[str | None] = []
+    if config.actor not in (PILOT, IDENTIFY):
+        found.append(check_contract(contract, track, config.rate))
+        if config.vehicle is not None:
+            found.append(check_rate_loop(contract, config.vehicle, config.force))
+        elif config.arm and config.link in BETAFLIGHT:
+            found.append(check_flown_by_betaflight(contract, config.link, config.force))
+    notes = [note for note in found if note is not None]
     notes += check_ranges(contract, limits_of(config, track), given_limits(config))
     if config.betaflight_dump is not None:
         if config.link not in BETAFLIGHT:

@@ -147,29 +147,67 @@ def check_rate_loop(contract: dict[str, Any], vehicle: str, force: bool) -> str 
     Raises:
         ValueError: They differ; the message names both. Or there is no such vehicle.
     """
-    trained, there = contract.get("rate_loop"), load_preset(vehicle)
-    if trained is None:
-        preset = contract.get("source", {}).get("preset")
-        trained = {"kind": "proportional"} if preset in ("easy", "faithful") else None
+    trained, there = _trained_loop(contract), load_preset(vehicle)
     if trained is None:
         return f"the contract says nothing of a rate loop: it was not compared with vehicle={vehicle}"
     if (misfit := _unlike_loop(trained, there)) is None:
         return None
     words = f"The actor was trained with {misfit[0]}, and vehicle={vehicle} has {misfit[1]}"
+    return _refuse_loop(words, f"env=betaflight env.preset={vehicle}", force)
+
+
+def check_flown_by_betaflight(contract: dict[str, Any], link: str, force: bool) -> str | None:
+    """Refuse an actor that was not trained with the rate loop of the flight controllers at the other end of a link.
+
+    Args:
+        contract: Of the actor.
+        link: By which a Betaflight is told.
+        force: Whether to fly it all the same.
+
+    Returns:
+        As `check_rate_loop`.
+
+    Raises:
+        ValueError: It was trained with another one; the message names both.
+    """
+    trained = _trained_loop(contract)
+    if trained is None or trained["kind"] == "betaflight":
+        return None
+    words = f"The actor was trained with {_name_loop(trained['kind'])}, and link={link} tells a Betaflight"
+    return _refuse_loop(words, "env=betaflight", force)
+
+
+def _trained_loop(contract: dict[str, Any]) -> dict[str, Any] | None:
+    """Return what a contract says of the rate loop of training; of an older one, what its preset had."""
+    preset = contract.get("source", {}).get("preset")
+    old = {"kind": "proportional"} if preset in ("easy", "faithful") else None
+    return contract.get("rate_loop", old)
+
+
+def _refuse_loop(words: str, remedy: str, force: bool) -> str:
+    """Return what differs in words, where it is forced.
+
+    Raises:
+        ValueError: It is not.
+    """
     if force:
         return f"{words}; it flies all the same (force=true)"
     raise ValueError(
-        f"{words}: it would not answer as the actor has learned. Train with env=betaflight env.preset={vehicle}, or "
-        "add force=true to fly all the same."
+        f"{words}: it would not answer as the actor has learned. Train with {remedy}, or add force=true to fly all the "
+        "same."
     )
+
+
+def _name_loop(kind: str) -> str:
+    """Return a kind of rate loop in words."""
+    return {"proportional": "a proportional rate loop", "betaflight": "a Betaflight's rate loop"}.get(kind, kind)
 
 
 def _unlike_loop(trained: dict[str, Any], there: QuadrotorParameters) -> tuple[str, str] | None:
     """Return what a contract says of its rate loop, and what a vehicle has instead; None if it is within its widths."""
-    kinds = {"proportional": "a proportional rate loop", "betaflight": "a Betaflight's rate loop"}
     kind = "proportional" if there.betaflight is None else "betaflight"
     if trained["kind"] != kind:
-        return kinds.get(trained["kind"], str(trained["kind"])), kinds[kind]
+        return _name_loop(trained["kind"]), _name_loop(kind)
     if there.betaflight is None:
         return None
     widths = trained.get("trained_half_widths", {})

@@ -13,7 +13,7 @@ from dreamer_racing.envs.drone.parameters import load_preset, save_drone
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.export.contract import describe_rate_loop
 from dreamer_racing.export.onnx_actor import read_contract
-from dreamer_racing.hil.flyer import check_contract, check_ranges, check_rate_loop
+from dreamer_racing.hil.flyer import check_contract, check_flown_by_betaflight, check_ranges, check_rate_loop
 from dreamer_racing.hil.safety_limits import SafetyLimits
 
 AGENTS = Path(__file__).parents[2] / "agents"
@@ -99,6 +99,17 @@ def test_an_actor_of_another_rate_loop_is_refused_with_both_and_flies_if_forced(
         check_rate_loop(old, "betaflight", force=False)
     unknown = check_rate_loop({"source": {"preset": "mine"}}, "betaflight", force=False)
     assert unknown is not None and "says nothing of a rate loop" in unknown
+
+
+def test_a_link_to_a_betaflight_is_for_actors_of_its_rate_loop():
+    words = r"trained with a proportional rate loop, and link=crsf tells a Betaflight.*env=betaflight.*force=true"
+    for contract in (trained_with("faithful"), {"source": {"preset": "easy"}}):
+        with pytest.raises(ValueError, match=words):
+            check_flown_by_betaflight(contract, "crsf", force=False)
+    forced = check_flown_by_betaflight(trained_with("easy"), "crsf", force=True)
+    assert forced is not None and forced.endswith("it flies all the same (force=true)")
+    for contract in (trained_with("betaflight"), {"source": {"preset": "mine"}}):
+        assert check_flown_by_betaflight(contract, "crsf", force=False) is None
 
 
 @pytest.mark.parametrize(

@@ -150,13 +150,14 @@ def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_pat
     drone = {"mass": 0.6, "full_thrust": 16.0, "reference_voltage": 15.0, "voltage": 15.0}
     config = hil.HilConfig(
         actor="kidney", arm=True, link="crsf", device="/dev/none", run_dir=str(tmp_path / "run"), **drone,
-        betaflight_dump=str(path),
+        betaflight_dump=str(path), force=True,
     )  # fmt: skip
     contract = hil.make_flyer(config)[1]
     kidney = load_track("kidney")
     lines = [line for line in print_settings(contract, "crsf") if not line.startswith("#")]
     path.write_text("\n".join(["# Betaflight / STM32F405 (S405) 4.5.1 Jul 28 2024 / 05:09:33 (77d01ba3b)", *lines]))
-    assert [note.partition(":")[0] for note in flights.check_flight(config, contract, kidney)] == ["flight controller"]
+    forced, compared = flights.check_flight(config, contract, kidney)
+    assert forced.endswith("(force=true)") and compared.startswith("flight controller: ")
     wrong = path.read_text().replace("yaw_srate = 23", "yaw_srate = 67").replace("set failsafe_delay = 5\n", "")
     path.write_text(wrong)
     with ExitStack() as opened, pytest.raises(ValueError, match="2 of .* settings of the flight controller") as refused:
@@ -164,7 +165,12 @@ def test_a_flight_controller_with_other_settings_is_refused_line_by_line(tmp_pat
     said = [" ".join(line.split()[:2]) for line in str(refused.value).splitlines()[1:]]
     assert sorted(said) == ["differs set", "missing set"] and "found 67" in str(refused.value)
     config.betaflight_dump = None
-    assert "its settings were not compared" in flights.check_flight(config, contract, kidney)[0]
+    assert "its settings were not compared" in flights.check_flight(config, contract, kidney)[1]
+    config.force = False
+    with pytest.raises(ValueError, match="trained with a proportional rate loop, and link=crsf tells a Betaflight"):
+        flights.check_flight(config, contract, kidney)
+    config.arm = False  # to be carried by hand
+    assert flights.check_flight(config, contract, kidney) == []
 
 
 def test_a_limit_that_was_set_may_clip_and_is_said():
