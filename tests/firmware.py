@@ -1,10 +1,15 @@
-"""A stand-in for Betaflight's SITL firmware, from the firmware's side: it uses nothing of what it is to test."""
+"""A stand-in for Betaflight's SITL firmware, from the firmware's side: the model of its rate loop behind its packets.
+
+It uses nothing of what it is to test: packets, links and plant. The model is held against recordings elsewhere.
+"""
 
 from __future__ import annotations
 
 import struct
 
 import numpy as np
+
+from tests.rate_controller import RateController
 
 IDLE = 0.055  # of the motors, armed
 MIN_CHECK = 1050  # µs: arms below, and the throttle begins there
@@ -14,14 +19,12 @@ STATE_DT = 0.001  # s from one state packet to the next, and so its clock: the s
 
 
 class Firmware:
-    """A rate controller that reads and writes the firmware's packets.
+    """A rate loop that reads and writes the firmware's packets.
 
-    It turns the rates around as sitl.c does, holds a rate with a mixer for motors in Betaflight's order, and idles when
-    armed. With `hear` it is flown by a radio: it arms by AUX1 at low throttle only, once it has been seen disarmed, and
-    drops when the radio falls silent; without, what it is to do is set from outside.
+    It turns the rates around as sitl.c does, and flies by the rate loop of ``preset=betaflight`` once armed. With
+    `hear` it is flown by a radio: it arms by AUX1 at low throttle only, once it has been seen disarmed, and drops when
+    the radio falls silent; without, what it is to do is set from outside.
     """
-
-    GAIN = np.array((0.045, 0.045, 0.12))  # motor command per rad/s
 
     def __init__(self, version: str) -> None:
         self.version = version
@@ -31,7 +34,8 @@ class Firmware:
         self.accelerometer = np.zeros(3)
         self.time, self.refused = 0.0, 0
         self._heard: float | None = None  # when the radio last spoke; None: never, or not since it was lost
-        self._may_arm = False
+        self._may_arm = self._was_armed = False
+        self._controller = RateController()
 
     def hear(self, data: bytes) -> None:
         """Read a packet of the radio: f64 stamp, 16 u16 µs in the order AETR, then AUX1."""
@@ -62,11 +66,12 @@ class Firmware:
 
     def motors(self) -> np.ndarray:
         """M1 … M4: rear right, front right, rear left, front left."""
+        if self.armed and not self._was_armed:
+            self._controller.reset()
+        self._was_armed = self.armed
         if not self.armed:
             return np.zeros(4)
-        roll, pitch, yaw = self.GAIN * (self.rates - self.gyro)
-        mix = np.array((-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw))
-        return np.clip(self.throttle + mix, IDLE, 1.0) if self.throttle > 0.0 else np.full(4, IDLE)
+        return self._controller.motors(self._controller.thrust_max * self.throttle**2, self.rates, self.gyro)
 
     def pack(self, motors: np.ndarray) -> bytes:
         """Return the packet of four motors, in this version's order."""
