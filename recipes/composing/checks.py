@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -393,17 +394,25 @@ def check_schedule(config: WorldModelRunConfig) -> None:
 def check_deviations(config: WorldModelRunConfig) -> None:
     """Refuse a smallest deviation of actions above the largest, also where a ramp leads.
 
+    Bounds that move on one clock are compared at its begin and at its end, others at every pair of those.
+
     Raises:
         ValueError: the message names both settings.
     """
-    least, most = (
-        {f"loss.{name}": getattr(config.loss, name)}
-        | ({} if (to := getattr(config.schedule, name).to) is None else {f"schedule.{name}.to": to})
-        for name in ("min_std", "max_std")
-    )
-    low, high = max(least, key=least.__getitem__), min(most, key=most.__getitem__)
-    if least[low] >= most[high]:
-        raise ValueError(f"{low}={least[low]} must be below {high}={most[high]}: the bounds of the actions' deviation.")
+    ramps = {name: getattr(config.schedule, name) for name in ("min_std", "max_std")}
+    ends = {
+        name: [
+            (f"loss.{name}", getattr(config.loss, name)),
+            *([(f"schedule.{name}.to", ramp.to)] if ramp.to is not None else []),
+        ]
+        for name, ramp in ramps.items()
+    }
+    lowest, highest = ends["min_std"], ends["max_std"]
+    one_clock = len({(ramp.begin, ramp.end, ramp.by) for ramp in ramps.values()}) == 1
+    pairs = zip(lowest, highest, strict=True) if one_clock and len(lowest) == len(highest) else product(lowest, highest)
+    for (low, least), (high, most) in pairs:
+        if least >= most:
+            raise ValueError(f"{low}={least} must be below {high}={most}: the bounds of the actions' deviation.")
 
 
 def check_kl(ppo: PPOUpdateConfig, to: float | None) -> None:

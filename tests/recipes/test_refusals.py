@@ -215,6 +215,15 @@ def test_what_is_read_or_left_out_or_may_be_read_passes(
     recipe_module("composing.checks").check_read(compose(taker(overrides), *overrides), overrides)
 
 
+def test_deviations_that_fall_together_are_compared_by_their_clock() -> None:
+    check = recipe_module("composing.checks").check_deviations
+    ramps = ["loss.min_std=0.5", "schedule.min_std.to=0.1", "schedule.max_std.to=0.15"]
+    one_clock = [f"schedule.{name}.{key}" for name in ("min_std", "max_std") for key in ("begin=0.4", "end=0.8")]
+    check(compose("dreamer_v3", *ramps, *one_clock, "schedule.min_std.by=known", "schedule.max_std.by=known"))
+    with pytest.raises(ValueError, match=r"loss.min_std=0.5 must be below schedule.max_std.to=0.15"):
+        check(compose("dreamer_v3", *ramps, *one_clock, "schedule.min_std.by=run", "schedule.max_std.by=known"))
+
+
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
