@@ -8,9 +8,10 @@
   critic's value of where that led, 0 after a crash; `return` the λ-return, with `return_correlation` between the two
   over all starts. `value` is the critic's mean on the first half of the flights, `monte_carlo` the mean discounted sum
   of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of it is cut off.
-* `gradient`: of REINFORCE's objective at the present actor, from `starts` latents of the run's own replay as many as
-  an update imagines from, and from eight times as many: `cosine` between gradients from independent draws, and
-  `signal` power over noise power.
+* `gradient`: at the present actor, by each of the two objectives of imagined steps, from `starts` latents of the run's
+  own replay as many as an update imagines from, and from eight times as many: `cosine` between gradients from
+  independent draws, `signal` power over noise power, and `seconds` of the process for one; `agreement` is the cosine
+  between the mean gradients of the two.
 * `drift`: how far the world model's learning moves a policy whose actor stands still, where records keep latents
   (`replay.context=true`): the divergence, nats, of the policy at the latents that a record had when it was last trained
   on, or flown, from the policy at what the model makes of it now; mean and quantiles, `of` windows of the newest
@@ -21,6 +22,7 @@ The trained weights are measured, not the averaged ones. Where the checkpoint ho
 """
 
 import argparse
+import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
@@ -35,10 +37,11 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.evaluation.held_out import correlation
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.update import WorldModelLearner
-from dreamer_racing.losses import choose_starts, imagine, lambda_return
+from dreamer_racing.losses import OBJECTIVES, choose_starts, gradient_of_actions, imagine, lambda_return
 from dreamer_racing.modules.world_model import join_features
 
 PARTS = ("returns", "gradient", "drift")
+OF_IMAGINED_STEPS = ("reinforce", "dynamics")
 EVERY = 8  # steps of a flight between two starts of imagination
 GRADIENTS, TIMES = 8, (1, 8)  # independent gradients, and from how many times an update's starts
 BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # of the drift
@@ -78,8 +81,17 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
     if "gradient" in parts:
         starts = model.imagination_starts or model.batch_size * model.batch_length
         for times in TIMES:
-            gradients = [gradient(learner, draw_starts(learner, replay, starts * times)) for _ in range(GRADIENTS)]
-            yield {"measured": "gradient", "starts": starts * times, **noise_of(torch.stack(gradients))}
+            drawn = [draw_starts(learner, replay, starts * times) for _ in range(GRADIENTS)]
+            means = []
+            for objective in OF_IMAGINED_STEPS:
+                began = time.process_time()
+                gradients = torch.stack([gradient(learner, some, objective) for some in drawn])
+                seconds = (time.process_time() - began) / GRADIENTS
+                means.append(gradients.mean(0))
+                row = {"measured": "gradient", "objective": objective, "starts": starts * times, "seconds": seconds}
+                yield row | noise_of(gradients)
+            agreement = F.cosine_similarity(*means, dim=0).item()
+            yield {"measured": "agreement", "starts": starts * times, "cosine": agreement}
     if "drift" in parts and trained.config.replay.context:
         yield from drift(learner, replay)
 
@@ -101,7 +113,6 @@ class Rollout(NamedTuple):
         return torch.cat((torch.ones_like(self.value[:1]), self.continuation)).cumprod(0)
 
 
-@torch.no_grad()
 def imagined(learner: WorldModelLearner, belief: Tensor, state: Tensor) -> tuple[Rollout, Tensor, Tensor]:
     """Imagine from latents ``(N, ...)``; return it with its features ``(H + 1, N, F)`` and actions ``(H, N, A)``."""
     model, actor, critic = learner.agent.world_model, learner.agent.actor, learner.agent.critic
@@ -162,14 +173,17 @@ def draw_starts(learner: WorldModelLearner, replay: StreamReplay, number: int) -
     return cast(TensorDict, torch.cat(cast(Any, parts)))[:number]
 
 
-def gradient(learner: WorldModelLearner, starts: TensorDict) -> Tensor:
-    """Return the gradient of REINFORCE's objective, without entropy and scale, from starts ``[N]``: ``(P,)``."""
-    actor = learner.agent.actor
-    rollout, features, action = imagined(learner, starts["belief"], starts["state"])
+def gradient(learner: WorldModelLearner, starts: TensorDict, objective: str) -> Tensor:
+    """Return the gradient of an objective's gain, without entropy and scale, from starts ``[N]``: ``(P,)``."""
+    agent = learner.agent
+    with gradient_of_actions(OBJECTIVES[objective], agent.world_model, agent.critic):
+        rollout, features, action = imagined(learner, starts["belief"], starts["state"])
+        returns = rollout.returns(learner)
     discounts = learner.discount ** torch.arange(learner.horizon).view(-1, 1, 1)
-    weight = (1.0 - starts["terminated"].float()) * discounts * rollout.reached()[:-1]
-    gain = actor(features[:-1]).log_prob(action) * (rollout.returns(learner) - rollout.value[:-1])
-    gradients = torch.autograd.grad(-(weight * gain).mean(), list(actor.parameters()))
+    weight = (1.0 - starts["terminated"].float()) * discounts * rollout.reached()[:-1].detach()
+    through = objective == "dynamics"
+    gain = returns if through else agent.actor(features[:-1]).log_prob(action) * (returns - rollout.value[:-1])
+    gradients = torch.autograd.grad(-(weight * gain).mean(), list(agent.actor.parameters()))
     return torch.cat([part.flatten() for part in gradients])
 
 

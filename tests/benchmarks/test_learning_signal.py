@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from dreamer_racing.modules.actor import ActionDistribution
 from tests.running_recipes import module_of
 
 learning_signal = module_of("benchmarks", "learning_signal")
@@ -40,3 +41,40 @@ def test_signal_and_noise_are_told_apart(share: float, signal: float) -> None:
     found = learning_signal.noise_of(noise + share * torch.nn.functional.normalize(torch.ones(1000), dim=0))
     assert found["signal"] == pytest.approx(signal, abs=0.02 + 0.02 * signal)
     assert found["cosine"] == pytest.approx(signal / (1 + signal), abs=0.02)
+
+
+class LineActor(torch.nn.Module):
+    """A policy with one mean everywhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mean = torch.nn.Parameter(torch.zeros(1))
+
+    def forward(self, features: torch.Tensor) -> ActionDistribution:
+        return ActionDistribution(self.mean.expand(*features.shape[:-1], 1), torch.full_like(features, 0.3))
+
+
+class LineModel(torch.nn.Module):
+    """What is done is where one is and what is paid, and nothing ends."""
+
+    few_kernels = False
+
+    def imagine_step(self, belief: torch.Tensor, state: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return action, state
+
+
+@pytest.mark.parametrize("objective", learning_signal.OF_IMAGINED_STEPS)
+def test_gradients_of_both_objectives_are_that_of_what_is_paid(objective: str) -> None:
+    actor, model, critic = LineActor(), LineModel(), torch.nn.Module()
+    model.rssm, critic.value = model, torch.zeros_like
+    model.reward_head = SimpleNamespace(mean=lambda features: features)
+    model.continue_head = SimpleNamespace(probability=torch.ones_like)
+    learner = SimpleNamespace(
+        horizon=1,
+        discount=0.9,
+        loss_config=SimpleNamespace(lambda_=0.95),
+        agent=SimpleNamespace(actor=actor, critic=critic, world_model=model),
+    )
+    still = torch.zeros(4000, 1)
+    starts = TensorDict({"belief": still, "state": still[:, :0], "terminated": still}, [4000])
+    assert learning_signal.gradient(learner, starts, objective).item() == pytest.approx(-1.0, abs=0.1)
