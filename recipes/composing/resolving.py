@@ -39,8 +39,8 @@ SETTINGS = {
 """What the files of the group `tuned` set, by their names."""
 ACTORS = {
     "dreamer_v3": (
-        "the actor learns in imagination, from latents of the replay on; it has not raced yet: docs/learning.md",
-        "says how far it has come",
+        "the actor learns in imagination, from latents of the replay on; docs/learning.md says how far that has come,",
+        "and recipes/latent_ppo.py is the surest way on a CPU",
     ),
     "latent_ppo": (
         "the actor learns by PPO from what was collected, in the model's latents, and so does its critic; nothing is",
