@@ -33,8 +33,8 @@ from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.dashboard import write_page
 from dreamer_racing.figures.dashboard_live import serve
 from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
+from dreamer_racing.figures.evaluations import evaluation_files
 from dreamer_racing.figures.plotting import run_of, stage_name
-from dreamer_racing.figures.runs import evaluation_files
 from dreamer_racing.figures.scene_3d import check_viser
 from dreamer_racing.settings import SEED, Range, check_settings, setting
 from dreamer_racing.training.directory import RunDirectory
@@ -146,7 +146,7 @@ def locate(setting_name: str, place: str) -> Path | str:
 
 def stored_flights(folder: Path) -> list[Path]:
     """List the flights of a run's evaluations, the last one last; or those that a recipe left in its own folder."""
-    if evaluated := list(evaluation_files(folder, NUMBERS).values()):
+    if evaluated := evaluation_files(folder, NUMBERS):
         return evaluated
     places = (folder, RunDirectory(folder).evaluations)
     return [file for place in places for name in STORED if (file := place / f"{name}{NUMBERS}").is_file()]

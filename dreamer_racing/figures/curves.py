@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
-from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs
+from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics
 
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
@@ -219,19 +219,26 @@ def resample(steps: np.ndarray, values: np.ndarray, grid: np.ndarray, window: fl
         window: env_steps around each, over which to average.
 
     Returns:
-        (P,): the mean of the values within the window; without any, between the neighbours, or NaN if one of them is;
-        NaN beyond the ends.
+        (P,): at a row the mean of the values within the window, and straight lines from row to row, so that a window
+        that holds few rows makes no steps; NaN beside a row where the metric was not found, if the window reaches no
+        value, and beyond the ends.
     """
     if not len(steps):
         return np.full(len(grid), np.nan)
-    first = np.searchsorted(steps, grid - window / 2, "left")
-    last = np.searchsorted(steps, grid + window / 2, "right")
+    rows = np.where(np.isfinite(values), _within(steps, values, steps, window), np.nan)  # (R,)
+    lines = np.interp(grid, steps, rows, left=np.nan, right=np.nan)
+    return np.where(np.isfinite(lines), lines, _within(steps, values, grid, window))
+
+
+def _within(steps: np.ndarray, values: np.ndarray, places: np.ndarray, window: float) -> np.ndarray:
+    """Average the values (R,) within the window around each of some places (K,); NaN (K,) where there is none."""
+    first = np.searchsorted(steps, places - window / 2, "left")
+    last = np.searchsorted(steps, places + window / 2, "right")
     found = np.isfinite(values)
     sums = np.concatenate(([0.0], np.cumsum(np.where(found, values, 0.0))))
     counts = np.concatenate(([0], np.cumsum(found)))
     count = counts[last] - counts[first]
-    mean = (sums[last] - sums[first]) / np.maximum(count, 1)
-    return np.where(count > 0, mean, np.interp(grid, steps, values, left=np.nan, right=np.nan))
+    return np.where(count > 0, (sums[last] - sums[first]) / np.maximum(count, 1), np.nan)
 
 
 def weight_raises(run: RunData) -> np.ndarray:
@@ -353,6 +360,12 @@ def write_curves(path: str | Path, curves: LearningCurves) -> None:
                 writer.writerow((curve.quantity, *curve.key, f"{x:{form}}", *cells, seeds))
         for key, raises in curves.raises.items():
             writer.writerows((_RAISE, *key, f"{x:{form}}", "", "", "", "") for x in raises)
+
+
+def holds_curves(path: str | Path) -> bool:
+    """Whether a file is named like one of `write_curves`, and is no run's `metrics*.csv`."""
+    path = Path(path).expanduser()
+    return path.suffix == ".csv" and path.is_file() and not is_metrics(path)
 
 
 def read_curves(path: str | Path) -> LearningCurves:

@@ -201,7 +201,7 @@ def _seeds_at_the_end(curve: Curve) -> int:
 
 def _label(key: CurveKey) -> str:
     name = ALGORITHMS.get(key.algorithm, (key.algorithm, MUTED))[0]
-    return f"{name}, {key.variant}" if key.variant else name
+    return ", ".join(filter(None, (name, key.variant)))
 
 
 def line_styles(keys: Sequence[CurveKey]) -> Styles:

@@ -4,7 +4,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,15 @@ from typing import Any, NamedTuple
 from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
-from dreamer_racing.figures.curves import LearningCurves, learning_curves, read_curves, wanted_columns, write_curves
+from dreamer_racing.figures.curves import (
+    LearningCurves,
+    holds_curves,
+    learning_curves,
+    read_curves,
+    wanted_columns,
+    write_curves,
+)
+from dreamer_racing.figures.evaluations import evaluation_files, evaluation_score, first_readable
 from dreamer_racing.figures.film import write_gif, write_video
 from dreamer_racing.figures.flights import NamedFlight, plot_dreams, plot_flights
 from dreamer_racing.figures.hud import dream_video
@@ -20,11 +28,8 @@ from dreamer_racing.figures.learning import plot_comparison, plot_learning_curve
 from dreamer_racing.figures.profiles import PROFILE_AXES
 from dreamer_racing.figures.runs import (
     RunData,
-    evaluation_files,
-    evaluation_score,
     find_runs,
     first_of_each_curve,
-    first_readable,
     group_runs,
     read_runs,
 )
@@ -43,7 +48,9 @@ class Aggregate(Enum):
 class PlotConfig:
     """`recipes/plot.py`."""
 
-    runs: Any = "runs"  # run directory, folder of some, pattern, or a list [a,b]; or a learning_curves.csv
+    runs: Any = (
+        "runs"  # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv
+    )
     figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
     output: str = "figures"  # folder
     quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
@@ -51,10 +58,10 @@ class PlotConfig:
     axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
     # of the curves' running mean, in units of their axis; null: 2 % of the longest run
     window: float | None = setting(None, NOT_NEGATIVE)
-    flights: list[str] = field(default_factory=list)  # files *_trajectory.csv; empty: of each curve the first seed's
+    flights: Any = field(default_factory=list)  # file *_trajectory.csv or a list; empty: of each curve the first seed's
     flight: str = "last"  # of the evaluations of a run: last | best (by gates, then return)
     over: str = "distance"  # axis of the speed profile: distance | time
-    dreams: list[str] = field(default_factory=list)  # files *_dream.npz; empty: a run's first, middle and last
+    dreams: Any = field(default_factory=list)  # file *_dream.npz or a list; empty: a run's first, middle and last
 
 
 logger = logging.getLogger(__name__)
@@ -78,10 +85,11 @@ def draw(config: PlotConfig) -> None:
     Raises:
         ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
+    config = replace(config, flights=as_list(config.flights), dreams=as_list(config.dreams))
     check_plot(config)
     output = ensure_writable(config.output, "output")
-    places = config.runs if isinstance(config.runs, list) else [config.runs]
-    if [Path(str(place)).suffix for place in places] == [".csv"]:
+    places = as_list(config.runs)
+    if len(places) == 1 and holds_curves(places[0]):
         refuse_for_curves(config)
         draw_curves(read_curves(places[0]), output)
         logger.info("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
@@ -95,6 +103,11 @@ def draw(config: PlotConfig) -> None:
         draw_all(config, output, runs, problems)
     elif not draw_one(config.figure, config, output, runs, problems):
         raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
+
+
+def as_list(value: Any) -> list[str]:
+    """Take a single path for a list of one."""
+    return [str(one) for one in (value if isinstance(value, list) else [value] if value else [])]
 
 
 def refuse_for_curves(config: PlotConfig) -> None:
@@ -205,11 +218,11 @@ def stages_of_training(run: RunData) -> tuple[dict[Path, Dream], list[str]]:
     Returns:
         The dreams, each once, by file, and what was left out.
     """
-    files = list(evaluation_files(run.directory, "_dream.npz").values())
+    files = evaluation_files(run.directory, "_dream.npz")
     problems: list[str] = []
     choices = (files, files[len(files) // 2 :: -1], files[::-1])  # before the first there is none: the one after it
     found = [first_readable(choice, Dream.load, problems) for choice in choices]
-    return dict(sorted(filter(None, found), key=lambda pair: pair[0])), problems
+    return dict(sorted(filter(None, found), key=lambda pair: files.index(pair[0]))), problems
 
 
 def draw_dreams(name: str, stages: dict[Path, Dream], problems: list[str], output: Path) -> Drawn:
@@ -249,11 +262,10 @@ def chosen_flights(runs: list[RunData], which: str, problems: list[str]) -> list
 
 def stored_flights(run: RunData, which: str) -> list[Path]:
     """List the flights of a run, the last or the best first."""
-    files = evaluation_files(run.directory, "_trajectory.csv")
-    order = sorted(files, reverse=which == "last")
+    files = evaluation_files(run.directory, "_trajectory.csv")[:: -1 if which == "last" else 1]
     if which == "best":
-        order.sort(key=lambda env_steps: evaluation_score(run.directory, env_steps), reverse=True)
-    return [files[env_steps] for env_steps in order]
+        files.sort(key=lambda file: evaluation_score(file, "_trajectory.csv"), reverse=True)
+    return files
 
 
 def named_flight(file: str | Path) -> NamedFlight:

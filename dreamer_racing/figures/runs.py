@@ -4,30 +4,27 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import json
-import math
 import os
 import re
-import textwrap
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 
+from dreamer_racing.envs.tracks.loading import BUILTIN_TRACKS
 from dreamer_racing.training.clock import CPU_CLOCK, WALL_CLOCK
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.metrics import MetricsTable, read_metrics
 
-T = TypeVar("T")
-
 DEFAULT_ALGORITHM = "dreamer_v3"  # of configurations from before there was a choice
+PPO_ACTORS = ("flown_ppo", "latent_ppo", "asymmetric_ppo")
+"""Values of loss.actor of what is the algorithm latent_ppo, in runs from before it had its name."""
 REFERENCE = "default"  # the variant that others are compared with; so is one without a name
-REASON_LETTERS = 160  # of why a file cannot be read
 SAME_CURVE = (
     "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
     "replay.device", "evaluation.every", "evaluation.stochastic", "evaluation.video_steps", "model.compile",
@@ -89,8 +86,8 @@ class RunData:
     """A run directory, read.
 
     Args:
-        directory: of the run.
-        config: settings of `config.yaml` by dotted name.
+        directory: of the run; or the file, of a table of metrics that was kept alone.
+        config: settings of `config.yaml` by dotted name; empty of a table alone.
         metrics: its `metrics.csv`.
         overrides: what its command line set, by dotted name, as text; empty if that was not stored.
     """
@@ -107,27 +104,48 @@ class RunData:
 
     @property
     def seed(self) -> int:
-        """Of the run."""
-        return int(self.config.get("seed", 0))
+        """Of the run, or as the name of a table says."""
+        named = re.search(r"_seed(\d+)", self.directory.stem) if not self.config else None
+        return int(self.config.get("seed", named[1] if named else 0))
 
     @property
     def key(self) -> CurveKey:
         """Which curve the run belongs to, by its folder's name; `group_runs` looks at the settings, too."""
+        if not self.config:
+            return _key_of_table(self.directory)
         algorithm = str(self.config.get("algorithm", DEFAULT_ALGORITHM))
         scene = "task" if self.config.get("env.suite") == "dmc" else "track"
         track = Path(str(self.config.get(scene, "unknown"))).stem
         named = re.fullmatch(rf"{re.escape(f'{algorithm}_{track}')}(?:_(?P<variant>.+))?_seed\d+", self.name)
+        if algorithm == DEFAULT_ALGORITHM and self.config.get("loss.actor") in PPO_ACTORS:
+            algorithm = "latent_ppo"
         return CurveKey(track, algorithm, (named and named["variant"]) or "")
 
 
+def is_metrics(path: Path) -> bool:
+    """Whether a file is a table of metrics by its name: `metrics.csv`, or `metrics_<what>.csv` as results keep them."""
+    return re.fullmatch(r"metrics(_.+)?\.csv", path.name) is not None and path.is_file()
+
+
+def _key_of_table(path: Path) -> CurveKey:
+    """Read off the name `metrics_<track>_<variant>_seed<k>.csv` what it says; who learned, it does not say."""
+    words = re.sub(r"^metrics_?|(?:^|_)seed\d+", "", path.stem)
+    track = next(
+        (name for name in sorted(BUILTIN_TRACKS, key=len, reverse=True) if re.search(rf"(?:^|_){name}(?:_|$)", words)),
+        "unknown",
+    )
+    rest = re.sub(rf"(?:^|_){track}(?=_|$)", "", words).strip("_")
+    return CurveKey(track, "", " ".join(filter(None, (path.absolute().parent.name, rest))))
+
+
 def find_runs(places: Sequence[str | Path]) -> list[Path]:
-    """Find run directories: folders with a `config.yaml` or a `metrics.csv`.
+    """Find run directories: folders with a `config.yaml` or a `metrics.csv`; and tables `metrics_<what>.csv`.
 
     Args:
-        places: run directories, folders that hold some at any depth, or patterns with `*` of either.
+        places: run directories, tables, folders that hold some at any depth, or patterns with `*` of either.
 
     Returns:
-        The folders, sorted, each once; what lies inside of a run (`best`, `evaluation`) is no run.
+        The folders and tables, sorted, each once; what lies inside of a run (`best`, `evaluation`) is no run.
 
     Raises:
         ValueError: there is none in one of the places.
@@ -137,16 +155,23 @@ def find_runs(places: Sequence[str | Path]) -> list[Path]:
         folders = sorted(glob.glob(os.path.expanduser(str(place)), recursive=True))
         inside = {run for folder in folders for run in _runs_below(Path(folder))}
         if not inside:
-            raise ValueError(f"runs={place}: there is no run directory (a folder with config.yaml or metrics.csv).")
+            raise ValueError(
+                f"runs={place}: there is no run directory (a folder with config.yaml or metrics.csv) "
+                "and no table metrics*.csv."
+            )
         found |= inside
     return sorted(found)
 
 
 def _runs_below(folder: Path) -> Iterator[Path]:
+    if is_metrics(folder):
+        yield folder
     for path, folders, files in os.walk(folder):
         if RunDirectory(Path(path)).config.name in files or RunDirectory(Path(path)).metrics.name in files:
             folders.clear()
             yield Path(path)
+        else:
+            yield from (table for name in files if is_metrics(table := Path(path, name)))
         folders.sort()
 
 
@@ -163,8 +188,11 @@ def read_runs(directories: Sequence[Path], wanted: Collection[str] | None = None
     runs, problems = [], []
     for directory in directories:
         try:
-            metrics = read_metrics(RunDirectory(directory).metrics, wanted)
-            run = RunData(directory, _read_config(directory), metrics, _read_overrides(directory))
+            if directory.is_file():
+                run = RunData(directory, {}, read_metrics(directory, wanted))
+            else:
+                metrics = read_metrics(RunDirectory(directory).metrics, wanted)
+                run = RunData(directory, _read_config(directory), metrics, _read_overrides(directory))
         except FileNotFoundError as error:
             problems.append(f"{directory.name} left out: it has no {Path(error.filename).name}")
         except (ValueError, OSError) as error:
@@ -339,57 +367,3 @@ def _name_by(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> lis
 
 def _tells_apart(settings: Sequence[Mapping[str, Any]], names: Sequence[str]) -> bool:
     return len(set(_name_by(settings, names))) == len(settings)
-
-
-def evaluation_files(directory: Path, ending: str) -> dict[int, Path]:
-    """Find what the evaluations of a training run have left.
-
-    Args:
-        directory: of the run.
-        ending: of the files' names, after the env_steps.
-
-    Returns:
-        The files by env_steps, rising; those of stochastic policies are left out.
-    """
-    files = sorted(RunDirectory(directory).evaluations.glob(f"*{ending}"))
-    return {int(name): file for file in files if (name := file.name.removesuffix(ending)).isdigit()}
-
-
-def evaluation_score(directory: Path, env_steps: int) -> tuple[float, float]:
-    """Say how good an evaluation was: gates per episode, then the return; the worst if its numbers are missing."""
-    try:
-        numbers = json.loads(
-            (RunDirectory(directory).evaluations / f"{env_steps:09d}.json").read_text(encoding="utf-8")
-        )
-        return float(numbers["gates_per_episode"]), float(numbers["return_mean"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return -math.inf, -math.inf
-
-
-def first_readable(files: Iterable[Path], read: Callable[[Path], T], problems: list[str]) -> tuple[Path, T] | None:
-    """Read the first of some files of a run's evaluations that can be read.
-
-    Args:
-        files: which, in the order of preference.
-        read: raises ValueError or OSError at what it cannot read.
-        problems: gets a line if files were passed over, with the run, the first of them and why.
-
-    Returns:
-        The file and what is in it; None if none of them can be read.
-    """
-    failures: list[tuple[Path, Exception]] = []
-    found = None
-    for file in files:
-        try:
-            found = file, read(file)
-            break
-        except (ValueError, OSError) as error:
-            failures.append((file, error))
-    if failures:
-        first, failure = failures[0]
-        more = len(failures) - 1
-        others = f" and {more} other{'s' if more > 1 else ''}" if more else ""
-        reason = textwrap.shorten(str(failure).replace(f"{first.parent}{os.sep}", ""), REASON_LETTERS).rstrip(".")
-        line = f"{RunDirectory.of(first).path.name} without {first.name}{others}: {reason}"
-        problems += [line] if line not in problems else []
-    return found

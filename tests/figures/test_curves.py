@@ -19,10 +19,9 @@ from dreamer_racing.figures.curves import (
     weight_raises,
     write_curves,
 )
+from dreamer_racing.figures.evaluations import evaluation_files, evaluation_score
 from dreamer_racing.figures.runs import (
     CurveKey,
-    evaluation_files,
-    evaluation_score,
     find_runs,
     first_of_each_curve,
     group_runs,
@@ -58,7 +57,7 @@ def at(curve, env_steps: float) -> tuple[float, float, float, int]:
 def test_running_mean_between_and_beyond_rows():
     steps, values = np.array([10.0, 20, 30, 60]), np.array([1.0, 2, 6, 12])
     grid = np.array([-1.0, 0, 20, 45, 60, 71])
-    expected = [np.nan, 1, (1 + 2 + 6) / 3, 9, 12, np.nan]  # 45: halfway between the rows at 30 and 60
+    expected = [np.nan, 1, (1 + 2 + 6) / 3, 8, 12, np.nan]  # 45: halfway between 4, of the row at 30, and 12
     np.testing.assert_allclose(resample(steps, values, grid, window=20.0), expected)
     values[2] = np.nan  # looked for at 30, and not found
     expected = [np.nan, 1, (1 + 2) / 2, np.nan, 12, np.nan]
@@ -270,6 +269,8 @@ def test_runs_are_found_but_not_inside_of_runs(tmp_path):
          ("figure8_decoys", "ppo", "no_noise")),
         ("sac_mine_seed0", {"algorithm": "sac", "track": "tracks/mine.yaml"}, ("mine", "sac", "")),
         ("dreamer_v3_circle_20260101-120000", {}, ("circle", "dreamer_v3", "")),
+        ("dreamer_v3_circle_old_seed0", {"algorithm": "dreamer_v3", "loss": {"actor": "asymmetric_ppo"}},
+         ("circle", "latent_ppo", "old")),
         ("dreamer_v3_cartpole_swingup_wide_seed0", {"task": "cartpole_swingup", "env": {"suite": "dmc"}},
          ("cartpole_swingup", "dreamer_v3", "wide")),
     ],
@@ -421,13 +422,46 @@ def test_what_a_run_does_not_log_is_named(tmp_path):
         curves_of(tmp_path, quantities=["speed"])
 
 
-def test_evaluations_by_env_steps(tmp_path):
+def test_evaluations_by_env_steps_then_those_after_training(tmp_path):
     folder = tmp_path / "evaluations"
     folder.mkdir()
     for name in ("000000200_dream.npz", "000000100_dream.npz", "000000100_stochastic_dream.npz"):
         (folder / name).touch()
-    assert list(evaluation_files(tmp_path, "_dream.npz")) == [100, 200]
+    assert evaluation_files(tmp_path, "_dream.npz") == [folder / f"000000{n}00_dream.npz" for n in (1, 2)]
+    after = [
+        tmp_path / name / "evaluations" for name in ("evaluation", "evaluation_2", "evaluation_10", "evaluation_x")
+    ]
+    for place in after:
+        place.mkdir(parents=True)
+        (place / "deterministic_dream.npz").touch()
+        (place / "stochastic_dream.npz").touch()
+    assert evaluation_files(tmp_path, "_dream.npz")[2:] == [place / "deterministic_dream.npz" for place in after[:3]]
+    first, second = evaluation_files(tmp_path, "_dream.npz")[:2]
     (folder / "000000100.json").write_text('{"gates_per_episode": 2, "return_mean": 7.5}')
-    assert evaluation_score(tmp_path, 100) == (2.0, 7.5) > evaluation_score(tmp_path, 200)
+    assert evaluation_score(first, "_dream.npz") == (2.0, 7.5) > evaluation_score(second, "_dream.npz")
     (folder / "000000100.json").write_text('{"gates_per_episode": null, "return_mean": 7.5}')
-    assert evaluation_score(tmp_path, 100) == evaluation_score(tmp_path, 200)
+    assert evaluation_score(first, "_dream.npz") == evaluation_score(second, "_dream.npz")
+
+
+def test_tables_that_results_keep_are_drawn_by_their_names(tmp_path):
+    folder = tmp_path / "ppo_state"
+    for name in ("circle_seed0", "circle_seed1", "figure8_decoys_wide_seed3"):
+        run = write_run(tmp_path / "made", name)
+        folder.mkdir(exist_ok=True)
+        (run / "metrics.csv").rename(folder / f"metrics_{name}.csv")
+    for place in (folder, tmp_path / "ppo_*" / "metrics_*.csv"):
+        runs, problems = read_runs(find_runs([place]))
+        assert [(run.key, run.seed) for run in runs] == [
+            (CurveKey("circle", "", "ppo_state"), 0),
+            (CurveKey("circle", "", "ppo_state"), 1),
+            (CurveKey("figure8_decoys", "", "ppo_state wide"), 3),
+        ]
+        assert problems == []
+    assert [at(curve, 2000)[0] for curve in learning_curves(runs).curves] == [10.0, 10.0]
+
+
+def test_a_short_run_is_drawn_without_steps():
+    steps = np.arange(1.0, 21.0) * 500
+    grid = np.linspace(500, 10_000, 240)
+    np.testing.assert_allclose(resample(steps, steps, grid, window=200.0), grid)  # 2 % of the run: less than a row
+    np.testing.assert_allclose(resample(steps, steps, grid, window=1400.0)[30:-30], grid[30:-30])  # two or three rows

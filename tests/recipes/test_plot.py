@@ -74,6 +74,20 @@ def test_flights_and_dreams_by_name_need_no_runs(runs, recipe):
     }  # fmt: skip
 
 
+def test_a_single_flight_and_what_an_evaluation_after_training_left_are_drawn(runs):
+    evaluations = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
+    done = plot(f"flights={evaluations}/000001000_trajectory.csv", "figure=trajectories", "output=one", cwd=runs)
+    assert done.returncode == 0 and (runs / "one" / "trajectories.png").is_file(), done.stderr
+    after = evaluations.parent / "evaluation"
+    after.mkdir()
+    evaluations.rename(after / "evaluations")
+    for file in (after / "evaluations").glob("000001000*"):
+        file.rename(file.with_name(file.name.replace("000001000", "deterministic")))
+    done = plot(f"runs={after.parent}", "output=after", cwd=runs)
+    made = {path.name for path in (runs / "after").iterdir()}
+    assert {"trajectories.png", "imagined_dreamer_v3_circle_paper_seed0.png"} <= made, done.stderr
+
+
 @pytest.mark.parametrize(("which", "expected"), [("best", "1,000"), ("last", "2,000")])
 def test_last_and_best_flight(runs, recipe, which, expected):
     read, _ = recipe.read_runs(recipe.find_runs([runs / "runs"]))
