@@ -227,8 +227,17 @@ def _receiver(link: str) -> list[Wanted]:
         return [*_OVERRIDE, _MSP_RATE]
     serial = link != "msp"
     alone = "" if serial else "; nobody else can take over, so for the bench or a cage"
-    rx_serial = Wanted("feature RX_SERIAL", "ON" if serial else "OFF", "a receiver at a UART: see the Ports tab", "ON")
-    rx_msp = Wanted("feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF")
+    # a firmware that was built without one of them does not have it on
+    rx_serial = Wanted(
+        "feature RX_SERIAL",
+        "ON" if serial else "OFF",
+        "a receiver at a UART: see the Ports tab",
+        "ON",
+        absent=not serial,
+    )
+    rx_msp = Wanted(
+        "feature RX_MSP", "OFF" if serial else "ON", f"MSP as the only receiver{alone}", "OFF", absent=serial
+    )
     if not serial:
         return [rx_serial, rx_msp, _MSP_RATE]
     # The one that is off comes first: the firmware keeps one receiver, and not always the last.
@@ -287,7 +296,7 @@ _MSP_RATE = Wanted(
     "100",
 )
 _OVERRIDE = (
-    Wanted("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF"),
+    Wanted("feature RX_MSP", "OFF", "the receiver stays as it is: MSP must not be the receiver", "OFF", absent=True),
     Wanted("msp_override_channels_mask", "15", "MSP says roll, pitch, yaw and throttle, and nothing else", "0"),
     Wanted(
         "msp_override_failsafe", "OFF", "a receiver that is lost is a failsafe, whatever MSP says", "OFF", absent=True

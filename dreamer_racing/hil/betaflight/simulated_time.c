@@ -32,6 +32,7 @@ static int (*real_select)(int, fd_set *, fd_set *, fd_set *, struct timeval *);
 static ssize_t (*real_recvfrom)(int, void *, size_t, int, struct sockaddr *, socklen_t *);
 static ssize_t (*real_sendto)(int, const void *, size_t, int, const struct sockaddr *, socklen_t);
 static int (*real_bind)(int, const struct sockaddr *, socklen_t);
+static int (*real_listen)(int, int);
 static int (*real_clock_gettime)(clockid_t, struct timespec *);
 static int (*real_nanosleep)(const struct timespec *, struct timespec *);
 
@@ -39,6 +40,7 @@ static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t changed = PTHREAD_COND_INITIALIZER;
 static int64_t now_ns = 1000000000, granted_ns, step_ns; /* by the firmware's clock */
 static bool main_waits;                                  /* it has used up what was granted */
+static bool listens;                                     /* at its serial port */
 static pthread_t main_thread;
 static struct { int from, to; } ports[MOST_PORTS];
 static int port_count, state_socket = -1;
@@ -62,6 +64,7 @@ __attribute__((constructor)) static void begin(void) {
     real_recvfrom = dlsym(RTLD_NEXT, "recvfrom");
     real_sendto = dlsym(RTLD_NEXT, "sendto");
     real_bind = dlsym(RTLD_NEXT, "bind");
+    real_listen = dlsym(RTLD_NEXT, "listen");
     real_clock_gettime = dlsym(RTLD_NEXT, "clock_gettime");
     real_nanosleep = dlsym(RTLD_NEXT, "nanosleep");
     main_thread = pthread_self();
@@ -140,7 +143,27 @@ static void let_a_step_pass(void) {
     say_done();
 }
 
+/* The thread of the serial port sweeps away sockets that are not open, and one that the main thread is about to open with
+   them: such a firmware never answers. It has nothing to select from until then, and is held there. */
+static void wait_for_serial_port(void) {
+    pthread_mutex_lock(&lock);
+    bool too_early = !listens;
+    while (!listens) pthread_cond_wait(&changed, &lock);
+    pthread_mutex_unlock(&lock);
+    if (too_early) usleep(50000); /* in which the main thread notes that the socket is open */
+}
+
+int listen(int socket, int backlog) {
+    int status = real_listen(socket, backlog);
+    pthread_mutex_lock(&lock);
+    listens = true;
+    pthread_cond_broadcast(&changed);
+    pthread_mutex_unlock(&lock);
+    return status;
+}
+
 int select(int end, fd_set *reads, fd_set *writes, fd_set *errors, struct timeval *timeout) {
+    if (reads == NULL && writes == NULL && !pthread_equal(pthread_self(), main_thread)) wait_for_serial_port();
     if (step_ns == 0 || reads == NULL || pthread_equal(pthread_self(), main_thread))
         return real_select(end, reads, writes, errors, timeout);
     if (own < 0 && listener_count < MOST_THREADS) {
