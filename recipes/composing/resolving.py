@@ -110,7 +110,6 @@ def tune(config: DictConfig) -> str:
     """Choose the file of the group `tuned` for what is to be trained with a world model."""
     device, size, budget = choose_device(config.device).type, config.model.size, config.budget
     others = {
-        f"device={device}": device != "cpu",
         "env.from_pixels=false": not config.env.from_pixels,
         f"model={size}": size not in ("auto", "cpu_small"),
         f"budget={budget}": budget in ("smoke", "paper"),
@@ -118,7 +117,14 @@ def tune(config: DictConfig) -> str:
     if reasons := [setting for setting, other in others.items() if other]:
         print(f"settings: tuned=none, the algorithm as published: none are chosen for {', '.join(reasons)}")
         return "none"
-    return "race" if config.env.suite == "race" else "suite"
+    chosen = "race" if config.env.suite == "race" else "suite"
+    if device != "cpu":
+        more = "; tuned=gpu has more worlds and updates, unmeasured, too" if chosen == "race" else ""
+        print(
+            f"settings: tuned={chosen}, known from CPUs; no whole run on {device} has been measured. model=size12m is "
+            f"the algorithm as published{more}"
+        )
+    return chosen
 
 
 def resolve_world_model(config: DictConfig) -> DictConfig:
@@ -163,7 +169,7 @@ def tell_of_tuned(config: DictConfig) -> None:
     print("\n  ".join(said))
     if changed := changed_from_tuned(config):
         print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
-    if config.algorithm == "latent_ppo" and config.tuned != "gpu":
+    if config.algorithm == "latent_ppo" and config.tuned != "gpu" and config.device == "cpu":
         minutes = config.total_env_steps / RACE_SPEED / 60
         time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
         print(f"length: {config.total_env_steps:,} env_steps, {time} at one core's {RACE_SPEED} a second")

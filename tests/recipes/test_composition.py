@@ -265,6 +265,20 @@ def test_what_learns_is_chosen_where_it_does(
     assert ("settings: tuned=none, the algorithm as published: none are chosen for" in told) == (expected == "none")
 
 
+@pytest.mark.parametrize("algorithm", ["latent_ppo", "dreamer_v3"])
+def test_a_gpu_trains_by_the_settings_that_are_known_and_says_first_what_is_not(
+    algorithm: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resolving = recipe_module("composing.resolving")
+    monkeypatch.setattr(resolving, "choose_device", lambda device: torch.device("cuda" if device == "auto" else device))
+    assert resolving.tune(compose(algorithm, "track=kidney", "device=auto")) == "race"
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first.startswith("settings: tuned=race, known from CPUs; no whole run on cuda has been measured.")
+    assert "tuned=gpu" in first and "model=size12m" in first and not others
+    assert resolving.tune(compose(algorithm, "device=auto", "model=size12m")) == "none"
+    assert "none are chosen for model=size12m" in capsys.readouterr().out
+
+
 def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
     saved = OmegaConf.create({"algorithm": "dreamer_v3", "model": {"size": "debug", "decay_updates": 8}, "old": 1})
     config = recipe_module("composing.saved").with_schema(saved, "dreamer_v3")
