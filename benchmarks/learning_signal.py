@@ -82,7 +82,7 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
         starts = model.imagination_starts or model.batch_size * model.batch_length
         for times in TIMES:
             drawn = [draw_starts(learner, replay, starts * times) for _ in range(GRADIENTS)]
-            means = []
+            means: list[Tensor] = []
             for objective in OF_IMAGINED_STEPS:
                 began = time.process_time()
                 gradients = torch.stack([gradient(learner, some, objective) for some in drawn])
@@ -90,7 +90,7 @@ def measure(trained: Trained, parts: tuple[str, ...], num_envs: int, steps: int)
                 means.append(gradients.mean(0))
                 row = {"measured": "gradient", "objective": objective, "starts": starts * times, "seconds": seconds}
                 yield row | noise_of(gradients)
-            agreement = F.cosine_similarity(*means, dim=0).item()
+            agreement = F.cosine_similarity(means[0], means[1], dim=0).item()
             yield {"measured": "agreement", "starts": starts * times, "cosine": agreement}
     if "drift" in parts and trained.config.replay.context:
         yield from drift(learner, replay)

@@ -48,9 +48,8 @@ class Aggregate(Enum):
 class PlotConfig:
     """`recipes/plot.py`."""
 
-    runs: Any = (
-        "runs"  # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv
-    )
+    # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv
+    runs: Any = "runs"
     figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
     output: str = "figures"  # folder
     quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py

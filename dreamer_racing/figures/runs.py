@@ -105,8 +105,10 @@ class RunData:
     @property
     def seed(self) -> int:
         """Of the run, or as the name of a table says."""
-        named = re.search(r"_seed(\d+)", self.directory.stem) if not self.config else None
-        return int(self.config.get("seed", named[1] if named else 0))
+        if "seed" in self.config:
+            return int(self.config["seed"])
+        named = re.search(r"_seed(\d+)", self.directory.stem)
+        return int(named[1]) if named and not self.config else 0
 
     @property
     def key(self) -> CurveKey:
