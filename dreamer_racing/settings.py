@@ -157,6 +157,17 @@ def shortened(text: str, length: int = 80) -> str:
     return text if len(text) <= length else f"{text[:length]}…"
 
 
+def check_flags(**flags: object) -> None:
+    """Refuse what is neither True nor False: a word like "no" would count as yes.
+
+    Raises:
+        ValueError: the message names the argument and its value.
+    """
+    for name, value in flags.items():
+        if value is not True and value is not False:
+            raise ValueError(f"{name}={quoted(value)}: must be True or False.")
+
+
 def quoted(value: object) -> str:
     """Return a value as a message quotes it."""
     try:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, cast
 
 from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
+from composing.usage import command
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -166,6 +167,9 @@ def prepare(config: HilConfig, opened: ExitStack) -> Prepared:
     print(f"take-off: {lifted if config.lift else 'by'} {config.actor}")
     if preset := contract["source"].get("preset"):
         print(f"its drone: {config.actor} flies that of preset={preset}: a plant needs preset={preset}, too")
+    if config.pose == "udp":
+        plant = f"{command('plant')} track={config.track or track.name}{f' preset={preset}' if preset else ''}"
+        print(f"it waits for poses: if no vehicle sends any, start one in another terminal: {plant}")
     loop = FlightLoop(chain, poses, operator, link, flyer.rate, recorder, watchers)
     return Prepared(folder, track, chain, poses, link, loop)
 

@@ -53,7 +53,7 @@ from dreamer_racing.envs.simulator.scene import (
 )
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.envs.worlds import ACTION_SIZE
-from dreamer_racing.settings import check_numbers, without_none
+from dreamer_racing.settings import check_flags, check_numbers, without_none
 
 FRAMEBUFFER = (1280, 960)  # width and height of the largest image that `physics.render` can make
 
@@ -104,6 +104,7 @@ def load(
         1.0
     """
     check_numbers({}, without_none(control_rate=control_rate, time_limit=time_limit))
+    check_flags(evaluation=evaluation, from_pixels=from_pixels)
     camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu)
     track, parameters = load_track(track), load_preset(preset)
     if control_rate is not None:

@@ -36,8 +36,8 @@ from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions
-from dreamer_racing.settings import FINITE, check_setting
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, check_options
+from dreamer_racing.settings import FINITE, check_flags, check_setting
 
 OBSERVATIONS = ("pixels", "pixels_imu", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
@@ -106,6 +106,7 @@ class GymWorlds:
         preset: str | QuadrotorParameters,
         worlds: WorldOptions,
     ) -> None:
+        check_flags(privileged=privileged)
         if observation not in OBSERVATIONS:
             raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
         if render_mode not in (None, "rgb_array"):
@@ -295,6 +296,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         preset: str | QuadrotorParameters = "easy",
         **worlds: Unpack[WorldOptions],
     ) -> None:
+        check_options(DroneRaceGymEnv, worlds, WorldOptions)
         self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.render_mode = render_mode

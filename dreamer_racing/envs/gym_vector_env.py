@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, with_rows
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import WorldOptions
+from dreamer_racing.envs.worlds import WorldOptions, check_options
 from dreamer_racing.settings import check_numbers, without_none
 
 
@@ -70,6 +70,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **worlds: Unpack[WorldOptions],
     ) -> None:
+        check_options(DroneRaceVectorEnv, worlds, WorldOptions)
         self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
             steps = worlds.get("episode_steps")

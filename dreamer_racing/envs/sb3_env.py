@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import GymWorlds, Observation, row_of, rows_of, with_rows
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import WorldOptions
+from dreamer_racing.envs.worlds import WorldOptions, check_options
 
 _ONE_OBJECT = (
     "the drones of DroneRaceVecEnv share one object, so that there is none to each. Arguments go to its constructor; "
@@ -61,6 +61,7 @@ class DroneRaceVecEnv(VecEnv):
         preset: str | QuadrotorParameters = "easy",
         **worlds: Unpack[WorldOptions],
     ) -> None:
+        check_options(DroneRaceVecEnv, worlds, WorldOptions)
         self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
         self.render_mode = render_mode
         self._actions = np.zeros((num_envs, *self.race.action_space().shape), np.float32)

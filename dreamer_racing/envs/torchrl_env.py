@@ -16,7 +16,8 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds, check_options
+from dreamer_racing.settings import check_flags
 
 
 class DroneRacingEnv(EnvBase):
@@ -53,6 +54,8 @@ class DroneRacingEnv(EnvBase):
         **worlds: Unpack[RaceOptions],
     ) -> None:
         # before TorchRL, which would refuse arguments in torch's own words
+        check_options(DroneRacingEnv, worlds, RaceOptions)
+        check_flags(privileged=privileged)
         race = RaceWorlds(track, num_envs, preset, from_pixels=from_pixels, device=device, seed=seed, **worlds)
         super().__init__(device=device, batch_size=[race.num_envs])
         self.from_pixels = from_pixels

@@ -3,6 +3,7 @@
 The TorchRL and Gymnasium environments are thin adapters of this class. Shapes: N worlds, A action (4). SI units.
 """
 
+import inspect
 import os
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -31,7 +32,15 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
-from dreamer_racing.settings import NOT_NEGATIVE, check_numbers, check_setting, quoted, without_none
+from dreamer_racing.settings import (
+    NOT_NEGATIVE,
+    check_flags,
+    check_numbers,
+    check_setting,
+    quoted,
+    suggestion,
+    without_none,
+)
 
 ACTION_SIZE = 4
 START_LINE = LineLimits(speed=0.7)
@@ -65,6 +74,28 @@ class WorldOptions(RaceOptions, total=False):
 
     device: torch.device | str
     seed: int | None
+
+
+def check_options(environment: type, given: Mapping[str, object], options: type) -> None:
+    """Refuse arguments that an environment neither has nor hands on to `RaceWorlds`.
+
+    Args:
+        environment: whose `__init__` was called, with what it has no argument for.
+        given: those.
+        options: `RaceOptions` or `WorldOptions`.
+
+    Raises:
+        TypeError: the message names environment, argument and the nearest that there is.
+    """
+    own = [name for name in inspect.signature(environment.__init__).parameters if name not in ("self", "worlds")]
+    known = [*own, *options.__annotations__]
+    for name in given:
+        if name not in known:
+            images = "; observation= says whether images are drawn" if name == "from_pixels" else ""
+            raise TypeError(
+                f"{environment.__name__} has no argument {name!r}{suggestion(name, known)}{images}. It takes "
+                f"{', '.join(known)}."
+            )
 
 
 class RaceWorlds:
@@ -142,6 +173,7 @@ class RaceWorlds:
         imu: str | ImuErrors | None = None,
     ) -> None:
         _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
+        check_flags(evaluation=evaluation, from_pixels=from_pixels)
         check_device(device)
         self.camera, errors = load_camera(camera, camera_rate, from_pixels), load_imu(imu, from_pixels)
         self._process, self._from_pixels = os.getpid(), from_pixels

@@ -48,7 +48,6 @@ ACTORS = {
     ),
 }
 """What the actor of each algorithm learns from."""
-RACE_SPEED = 450  # env_steps/s of latent PPO with tuned=race on one core with bfloat16 and AMX, two runs side by side
 FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
 
 
@@ -169,10 +168,7 @@ def tell_of_tuned(config: DictConfig) -> None:
     print("\n  ".join(said))
     if changed := changed_from_tuned(config):
         print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
-    if config.algorithm == "latent_ppo" and config.tuned != "gpu" and config.device == "cpu":
-        minutes = config.total_env_steps / RACE_SPEED / 60
-        time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
-        print(f"length: {config.total_env_steps:,} env_steps, {time} at one core's {RACE_SPEED} a second")
+    print(f"length: {config.total_env_steps:,} env_steps; how long they take here is measured, and said in progress")
 
 
 def shorten_windows(config: DictConfig, device: torch.device) -> None:

@@ -16,6 +16,7 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing
+from dreamer_racing.envs.dm_control_env import load
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv
 from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
@@ -60,6 +61,26 @@ def test_each_track_is_the_one_of_its_name(name: str) -> None:
     assert env.unwrapped.race.worlds.track.name == track
     vector = gymnasium.make_vec(identifier, num_envs=2, observation="state")
     assert vector.race.worlds.track.name == track
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), [(gymnasium.make, "DroneRaceGymEnv"), (gymnasium.make_vec, "DroneRaceVectorEnv")]
+)
+def test_an_unknown_argument_is_refused_by_the_class_that_was_asked_for(make: Callable, name: str) -> None:
+    with pytest.raises(TypeError, match=rf"^{name} has no argument 'start_nois' \(did you mean start_noise\?\)"):
+        make(IDS[0], start_nois=1.0)
+    with pytest.raises(TypeError, match=f"^{name} has no argument 'from_pixels'; observation= says"):
+        make(IDS[0], from_pixels=False)
+
+
+def test_words_for_yes_and_no_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"^DroneRacingEnv has no argument 'trak' \(did you mean track\?\)"):
+        DroneRacingEnv(trak="circle")
+    for make, name in ((DroneRacingEnv, "from_pixels"), (load, "from_pixels"), (DroneRacingEnv, "privileged")):
+        with pytest.raises(ValueError, match=f"^{name}='yes': must be True or False"):
+            make("circle", **{name: "yes"})
+    with pytest.raises(ValueError, match="^evaluation=1: must be True or False"):
+        gymnasium.make(IDS[0], observation="state", evaluation=1)
 
 
 def test_names_that_others_build_on_stay() -> None:

@@ -312,3 +312,15 @@ def test_a_replay_says_at_which_tick_it_parts(tmp_path, capsys):
     assert "replayed: 5 ticks, every one as it was written" in said and "taken as it is now" in said
     assert hil.replay(hil.HilConfig(replay=str(tmp_path / "wrong"))) == 1
     assert "tick 3: target_gate was 3, and is 0 now" in capsys.readouterr().err
+
+
+def test_without_a_plant_it_says_how_to_start_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    config = hil.HilConfig(
+        actor="pilot", track="circle", preset="easy", record=False, run_dir=str(tmp_path),
+        pose_port=free_port(), link_port=free_port(),
+    )  # fmt: skip
+    with ExitStack() as opened:
+        hil.prepare(config, opened)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "if no vehicle sends any" in line)
+    assert line.endswith("python recipes/plant.py track=circle preset=easy")

@@ -21,6 +21,7 @@ import logging
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import cache
 from itertools import zip_longest
 from queue import SimpleQueue
 from threading import Thread
@@ -295,9 +296,15 @@ def make_renderer(
             continue
         why = f"; {' '.join(reasons)}" if reasons else ""
         level = logging.WARNING if reasons else logging.INFO  # it is slower than what is missing
-        logger.log(level, "renderer: %s, %d thread(s)%s", candidate, num_workers, why)
+        say_once(level, f"renderer: {candidate}, {num_workers} thread(s){why}")
         return renderer
     raise RendererUnavailableError(" ".join(reasons))
+
+
+@cache
+def say_once(level: int, words: str) -> None:
+    """Log what a process need not hear again of its next worlds: those of evaluations, say."""
+    logger.log(level, words)
 
 
 def _worker_factory(

@@ -332,6 +332,7 @@ def without(*libraries: str):
 
 def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(opengl.ctypes, "CDLL", without("libEGL", "libOSMesa"))
+    rendering.say_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         made = simulator(2, "auto")
     assert made.renderer is not None
@@ -343,9 +344,11 @@ def test_auto_falls_back_and_says_why(monkeypatch: pytest.MonkeyPatch, caplog: p
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_a_renderer_that_was_asked_for_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_renderer_that_was_asked_for_is_no_warning_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    rendering.say_once.cache_clear()
     with caplog.at_level(logging.INFO, logger=rendering.__name__):
         simulator(2, "warp").close()
+        simulator(2, "warp").close()  # of evaluations, say
     assert [(record.levelname, record.message[:14]) for record in caplog.records] == [("INFO", "renderer: warp")]
 
 
