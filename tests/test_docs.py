@@ -25,7 +25,10 @@ from dreamer_racing.losses import TARGETS
 from tests.running_recipes import module_of
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")),
+    *(ROOT / "docs").rglob("*.md"),
+]
 
 
 @pytest.fixture(scope="module")

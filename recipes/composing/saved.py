@@ -11,6 +11,7 @@ from yaml import YAMLError
 
 from composing.command_line import override_key
 from composing.schema import RECIPES, RunConfig, WorldModelRunConfig
+from dreamer_racing.figures.runs import flatten
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
 
@@ -68,7 +69,7 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
     """Read a file that a run left.
 
     Raises:
-        ValueError: it is damaged, and not that at all.
+        ValueError: it is damaged, is not that at all, or refers to what lies outside of it.
     """
     try:
         content = OmegaConf.load(path)
@@ -76,7 +77,22 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
         raise ValueError(f"{path} is damaged: {shortened(' '.join(str(error).split()), 200)}") from error
     if not isinstance(content, kind) or (kind is DictConfig and not content):
         raise ValueError(f"{path} is damaged: it holds no {'list' if kind is ListConfig else 'settings'}.")
+    if isinstance(content, DictConfig):
+        refuse_references(content, path)
     return content
+
+
+def refuse_references(saved: DictConfig, path: Path) -> None:
+    """Refuse what a run never writes and a stranger might: ``${oc.env:NAME}`` would read this machine's environment.
+
+    Raises:
+        ValueError: a value refers to another; the message names it.
+    """
+    for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved, resolve=False))):
+        if "${" in str(value):
+            raise ValueError(
+                f"{path}: {shortened(f'{name}: {value}')}. A saved configuration says values, it refers to none."
+            )
 
 
 def is_known(name: str, schema: DictConfig) -> bool:
