@@ -28,8 +28,12 @@ NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 Made by `python docs/results.py` from the `provenance.json` files in [results/](../results): change those, not this
-page. Only what was run is here; [experiments.md](experiments.md) says what was learned from it, failures included, and
+page. Only what was run is here. [What we know](what_we_know.md) says what follows from it, and
 [figures.md](figures.md) how to draw such figures from runs of your own.
+
+A command runs at the commit beside it. Until 2c16a57 the recipe that is `recipes/latent_ppo.py` today was called
+`recipes/dreamer_v3.py`, so commands of older results name that one. Flights are deterministic where nothing is said: the
+policy's mean, without sampling.
 """
 
 
@@ -73,11 +77,12 @@ def make_page(results: Path) -> str:
     """Make the text of docs/results.md from a folder of results."""
     entries = [entry for path in sorted(results.rglob("provenance.json")) for entry in read_entries(path)]
     planned = json.loads((results / "planned.json").read_text(encoding="utf-8"))
-    known = {cell for table in planned for cell in cells_of(table)}
+    known = [cell for table in planned for cell in cells_of(table)]
     for entry in entries:
-        if unknown := set(entry.fills) - known:
+        if unknown := set(entry.fills) - set(known):
             raise ValueError(f"{entry.folder / 'provenance.json'}: fills {sorted(unknown)}: not in planned.json.")
     tables = [table_text(table, entries) for table in planned]
+    entries.sort(key=lambda entry: min(map(known.index, entry.fills), default=len(known)))  # as the tables link to them
     return "\n".join([HEAD, *tables, *(entry_text(entry, results) for entry in entries)])
 
 

@@ -45,7 +45,7 @@ class ActionDistribution(NamedTuple):
 
         It is what the deterministic policy flies. Near a bound, noise keeps what is practised below ``mean``, by 0.06
         at 1 with a deviation of 0.15, and an agent that has learned to fly a gate's width from its frame knows no
-        other flight (docs/experiments.md, 37).
+        other flight (docs/what_we_know.md).
         """
         return clipped_mean(self.mean, self.std)
 
