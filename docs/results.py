@@ -32,8 +32,8 @@ page. Only what was run is here. [What we know](what_we_know.md) says what follo
 [figures.md](figures.md) how to draw such figures from runs of your own.
 
 A command runs at the commit beside it. Until 2c16a57 the recipe that is `recipes/latent_ppo.py` today was called
-`recipes/dreamer_v3.py`, so commands of older results name that one. Flights are deterministic where nothing is said: the
-policy's mean, without sampling.
+`recipes/dreamer_v3.py`, so commands of older results name that one. Where nothing is said, flights are deterministic:
+by the policy's mean, without sampling.
 """
 
 
