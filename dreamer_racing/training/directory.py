@@ -228,6 +228,12 @@ def complete_checkpoints(path: str | Path) -> list[Path]:
                 logger.warning("Passing over %s: it is not a complete checkpoint%s.", candidate, lost)
         if found:
             return found
+    run = RunDirectory(path.parent)
+    if path == run.best.path and (run.config.exists() or run.starts.exists()):
+        raise FileNotFoundError(
+            f"No complete checkpoint at {path}: the run's first evaluation makes it, and there was none yet. Wait for "
+            f"it (evaluation.first=, evaluation.every=), or give {run.path} for its newest checkpoint."
+        )
     state = "exists, but holds none" if path.exists() else "does not exist"
     raise FileNotFoundError(
         f"No complete checkpoint at {path}: the path {state}. Give a run directory (with a subfolder "

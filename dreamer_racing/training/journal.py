@@ -13,6 +13,7 @@ class Periods:
     """Says when something that happens every so many env_steps is due.
 
     Args:
+        first: env_steps at which a kind is due once more, before or between its periods, by its name.
         every: env_steps between two of a kind, by its name; 0: never.
 
     Attributes:
@@ -24,8 +25,8 @@ class Periods:
         [110, 210]
     """
 
-    def __init__(self, **every: int) -> None:
-        self._every = every
+    def __init__(self, first: Mapping[str, int] | None = None, **every: int) -> None:
+        self._every, self._first = every, dict(first or {})
         self.latest = dict.fromkeys(every, 0)
 
     def due(self, name: str, env_steps: int, last: bool = False) -> bool:
@@ -36,8 +37,9 @@ class Periods:
             env_steps: made by now.
             last: whether the run ends here, so that no period comes to its end.
         """
-        period, latest = self._every[name], self.latest[name]
-        if not period or (env_steps // period <= latest // period and not (last and env_steps > latest)):
+        period, latest, first = self._every[name], self.latest[name], self._first.get(name, 0)
+        early = latest < first <= env_steps
+        if not period or not (early or env_steps // period > latest // period or (last and env_steps > latest)):
             return False
         self.latest[name] = env_steps
         return True

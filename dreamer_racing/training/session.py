@@ -72,7 +72,7 @@ class Session:
 
     Args:
         config: of the recipe: any object with the fields `total_env_steps`, `seed`, `resume`, `logger` (`every`,
-            `media`), `evaluation` (`every`, `stochastic`) and `checkpoint` (`every`, `minutes`, `keep`).
+            `media`), `evaluation` (`every`, `first`, `stochastic`) and `checkpoint` (`every`, `minutes`, `keep`).
         lock: holds the run directory.
         note_start: writes what the run is started with to its directory, at so many env_steps.
         make_loggers: makes what takes metrics beside ``metrics.csv``, for a run that goes on behind its row at so many
@@ -122,7 +122,8 @@ class Session:
         self.metrics = UnwrittenMetrics()
         self.say: Callable[[str], None] = logger.info
         self._lock, self._note_start, self._make_loggers = lock, note_start, make_loggers
-        self._periods = Periods(log=config.logger.every, evaluate=config.evaluation.every, save=config.checkpoint.every)
+        every = {"log": config.logger.every, "evaluate": config.evaluation.every, "save": config.checkpoint.every}
+        self._periods = Periods({"evaluate": config.evaluation.first}, **every)
         self._minutes = Interval(config.checkpoint.minutes, FIRST_CHECKPOINT if config.checkpoint.every else 0.0)
         self._memory = KeptMemory()
         self._unsaved: dict[str, int] = {}  # since which env_steps what cannot be written

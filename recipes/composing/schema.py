@@ -130,6 +130,7 @@ class EvaluationConfig:
     """Evaluation during training."""
 
     every: int = setting(25_000, NOT_NEGATIVE)  # env_steps; 0 never
+    first: int = setting(0, NOT_NEGATIVE)  # env_steps at which there is one before that, to look at; 0 none
     episodes: int = setting(8, COUNT)
     stochastic: bool = False  # also fly the sampling policy
     # of starts, as a multiple of the noise of training; 0: all begin at the start pose

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from dreamer_racing.training import directory
-from dreamer_racing.training.directory import RunDirectory, replace_text
+from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, replace_text
 
 
 def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path: Path) -> None:
@@ -100,3 +101,11 @@ def test_a_file_is_as_it_was_or_as_it_is_to_be(call: str, tmp_path: Path, monkey
     assert path.read_text() == "old"
     replace_text(path, "new")
     assert path.read_text() == "new" and [file.name for file in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_the_best_of_a_run_before_there_is_one_says_what_to_do(tmp_path: Path) -> None:
+    RunDirectory(tmp_path).config.touch()
+    with pytest.raises(FileNotFoundError, match=rf"first evaluation makes it.* or give {re.escape(str(tmp_path))} for"):
+        complete_checkpoints(tmp_path / "best")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        complete_checkpoints(tmp_path / "better")

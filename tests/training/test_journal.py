@@ -46,3 +46,11 @@ def test_the_first_time_of_an_interval_may_come_sooner(monkeypatch: pytest.Monke
         for minutes, interval in intervals.items():
             due[minutes] += [minute] if interval.due() else []
     assert due == {0.0: [2], 1.0: list(range(1, 25)), 10.0: [2, 12, 22]}
+
+
+def test_a_first_one_comes_before_the_periods_once_and_costs_none_of_them():
+    periods = Periods({"evaluate": 30}, evaluate=100, log=100)
+    places = (10, 29, 31, 60, 99, 105, 150, 210)
+    assert [place for place in places if periods.due("evaluate", place)] == [31, 105, 210]
+    assert [place for place in places if periods.due("log", place)] == [105, 210]
+    assert not Periods({"evaluate": 30}, evaluate=0).due("evaluate", 40)

@@ -75,7 +75,7 @@ class Run:
             seed=0,
             resume=str(path) if resume else None,
             logger=SimpleNamespace(every=0, media=False),
-            evaluation=SimpleNamespace(every=10 * total, stochastic=False),
+            evaluation=SimpleNamespace(every=10 * total, first=0, stochastic=False),
             checkpoint=SimpleNamespace(every=save_every, minutes=0.0, keep=99),
         )
         self.events: list[tuple[str, int]] = []
