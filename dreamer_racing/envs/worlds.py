@@ -79,6 +79,8 @@ class WorldOptions(RaceOptions, total=False):
 def check_options(environment: type, given: Mapping[str, object], options: type) -> None:
     """Refuse arguments that an environment neither has nor hands on to `RaceWorlds`.
 
+    In Python's own words, by which TorchRL's `GymEnv` knows that an environment takes no frameskip.
+
     Args:
         environment: whose `__init__` was called, with what it has no argument for.
         given: those.
@@ -93,8 +95,8 @@ def check_options(environment: type, given: Mapping[str, object], options: type)
         if name not in known:
             images = "; observation= says whether images are drawn" if name == "from_pixels" else ""
             raise TypeError(
-                f"{environment.__name__} has no argument {name!r}{suggestion(name, known)}{images}. It takes "
-                f"{', '.join(known)}."
+                f"{environment.__name__} got an unexpected keyword argument {name!r}{suggestion(name, known)}{images}. "
+                f"It takes {', '.join(known)}."
             )
 
 
