@@ -53,7 +53,7 @@ def test_hover_thrust_holds_altitude_for_ten_seconds_within_a_centimetre(preset:
 
 def test_hover_action_is_the_documented_number() -> None:
     assert QuadrotorParameters().hover_action == pytest.approx(HOVER, abs=1e-5)
-    for page in ("README.md", "docs/environment.md", "docs/simulation.md", "docs/library.md"):
+    for page in ("docs/environment.md", "docs/simulation.md", "docs/library.md"):
         assert f"{abs(HOVER)}" in (ROOT / page).read_text(encoding="utf-8"), page
 
 
