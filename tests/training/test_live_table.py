@@ -66,7 +66,7 @@ def open_terminal(monkeypatch: pytest.MonkeyPatch, columns: int = 100, terminal:
     terminal = terminal or Terminal()
     for stream in ("stdout", "stderr"):
         monkeypatch.setattr(sys, stream, terminal)
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_: os.terminal_size((columns, 40)))
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((columns, 40)))
     return terminal
 
 
