@@ -114,7 +114,10 @@ class Rollout(NamedTuple):
 
 
 def imagined(learner: WorldModelLearner, belief: Tensor, state: Tensor) -> tuple[Rollout, Tensor, Tensor]:
-    """Imagine from latents ``(N, ...)``; return it with its features ``(H + 1, N, F)`` and actions ``(H, N, A)``."""
+    """Imagine from latents ``(N, ...)``; return it with its features ``(H + 1, N, F)`` and actions ``(H, N, A)``.
+
+    With gradient where the caller lets it flow.
+    """
     model, actor, critic = learner.agent.world_model, learner.agent.actor, learner.agent.critic
     features, action = imagine(model.rssm, actor, belief, state, learner.horizon)
     reward, continuation = model.reward_head.mean(features[1:]), model.continue_head.probability(features[1:])
@@ -175,14 +178,14 @@ def draw_starts(learner: WorldModelLearner, replay: StreamReplay, number: int) -
 
 def gradient(learner: WorldModelLearner, starts: TensorDict, objective: str) -> Tensor:
     """Return the gradient of an objective's gain, without entropy and scale, from starts ``[N]``: ``(P,)``."""
-    agent = learner.agent
+    agent, through_dynamics = learner.agent, hasattr(OBJECTIVES[objective], "through_dynamics")
     with gradient_of_actions(OBJECTIVES[objective], agent.world_model, agent.critic):
         rollout, features, action = imagined(learner, starts["belief"], starts["state"])
         returns = rollout.returns(learner)
     discounts = learner.discount ** torch.arange(learner.horizon).view(-1, 1, 1)
     weight = (1.0 - starts["terminated"].float()) * discounts * rollout.reached()[:-1].detach()
-    through = objective == "dynamics"
-    gain = returns if through else agent.actor(features[:-1]).log_prob(action) * (returns - rollout.value[:-1])
+    score = None if through_dynamics else agent.actor(features[:-1]).log_prob(action)
+    gain = returns if score is None else score * (returns - rollout.value[:-1])
     gradients = torch.autograd.grad(-(weight * gain).mean(), list(agent.actor.parameters()))
     return torch.cat([part.flatten() for part in gradients])
 

@@ -37,9 +37,8 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
 
     track: str = "kidney"  # built-in track, or path to a YAML file
     preset: str = "faithful"  # physics of the nominal drone, without their randomisation: easy | faithful | betaflight
-    actor: str = (
-        "pilot"  # with firmware=: for whose largest body rates it is set up: pilot, an agent's name, or its path
-    )
+    # with firmware=: for whose largest body rates it is set up: pilot, an agent's name, or its path
+    actor: str = "pilot"
 
 
 ConfigStore.instance().store(name="plant_schema", node=PlantConfig)
