@@ -89,7 +89,9 @@ def check_options(environment: type, given: Mapping[str, object], options: type)
     Raises:
         TypeError: the message names environment, argument and the nearest that there is.
     """
-    own = [name for name in inspect.signature(environment.__init__).parameters if name not in ("self", "worlds")]
+    own = [
+        name for name in inspect.signature(vars(environment)["__init__"]).parameters if name not in ("self", "worlds")
+    ]
     known = [*own, *options.__annotations__]
     for name in given:
         if name not in known:
