@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dreamer_racing.hil.links import packed
-from dreamer_racing.hil.links.telemetry import FrameTelemetry
+from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 
 HEADER = b"\xc8\x18\x16"
 FRAME_SIZE = len(HEADER) + packed.SIZE + 1
@@ -42,29 +42,40 @@ def decode_crsf(frame: bytes) -> tuple[float, ...] | None:
     return packed.unpack(frame[len(HEADER) : -1])
 
 
-class CrsfTelemetry(FrameTelemetry):
+class CrsfTelemetry(Telemetry):
     """Reads BATTERY_SENSOR."""
 
-    def frame_size(self, data: bytes) -> int | None:
-        """Return the size of the frame that begins the data; see `FrameTelemetry`."""
-        if data[0] not in ADDRESSES:
-            return None
-        if len(data) < 2:
-            return 0
-        return data[1] + 2 if _SHORTEST <= data[1] <= _LONGEST else None
+    def __init__(self) -> None:
+        super().__init__()
+        self._frames = FrameReader(size_of, is_whole)
 
-    def is_whole(self, frame: bytes) -> bool:
-        """Whether the CRC of a frame is right."""
-        return crc8(frame[2:-1]) == frame[-1]
+    def read(self, data: bytes) -> list[float]:
+        """Take in bytes; return the voltages in them, V, in steps of 0.1 V."""
+        damaged, voltages = self._frames.rejected, []
+        for frame in self._frames.read(data):
+            payload = frame[3:-1]
+            if frame[2] != BATTERY_SENSOR:
+                continue
+            if len(payload) < _BATTERY_PAYLOAD:
+                self.rejected += 1
+            else:
+                voltages.append(int.from_bytes(payload[:2], "big") / 10)
+        self.rejected += self._frames.rejected - damaged
+        return voltages
 
-    def is_battery(self, frame: bytes) -> bool:
-        """Whether a frame is a BATTERY_SENSOR."""
-        return frame[2] == BATTERY_SENSOR
 
-    def voltage(self, frame: bytes) -> float | None:
-        """Return the voltage, V, in steps of 0.1 V."""
-        payload = frame[3:-1]
-        return None if len(payload) < _BATTERY_PAYLOAD else int.from_bytes(payload[:2], "big") / 10
+def size_of(data: bytes) -> int | None:
+    """Return the size of the frame that begins the data, as `FrameReader` asks."""
+    if data[0] not in ADDRESSES:
+        return None
+    if len(data) < 2:
+        return 0
+    return data[1] + 2 if _SHORTEST <= data[1] <= _LONGEST else None
+
+
+def is_whole(frame: bytes) -> bool:
+    """Return whether the CRC of a frame is right."""
+    return crc8(frame[2:-1]) == frame[-1]
 
 
 def crc8(data: bytes) -> int:

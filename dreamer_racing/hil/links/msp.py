@@ -40,7 +40,7 @@ from dreamer_racing.hil.betaflight.status import (
     read_status,
 )
 from dreamer_racing.hil.imu import make_sample
-from dreamer_racing.hil.links.telemetry import FrameTelemetry
+from dreamer_racing.hil.links.telemetry import FrameReader, Telemetry
 
 SET_RAW_RC, BATTERY_STATE, RAW_IMU = 200, 130, 102
 BATTERY_REQUEST = b"$M<" + bytes([0, BATTERY_STATE, BATTERY_STATE])
@@ -87,7 +87,7 @@ def decode_msp(frame: bytes) -> tuple[float, ...] | None:
     return tuple(float(value) for value in struct.unpack(f"<{size // 2}H", frame[5:-1]))
 
 
-class MspTelemetry(FrameTelemetry):
+class MspTelemetry(Telemetry):
     """Reads answers to `OVERRIDE_REQUEST` and `IMU_REQUEST`.
 
     Args:
@@ -101,33 +101,31 @@ class MspTelemetry(FrameTelemetry):
 
     def __init__(self, g_counts: float = G_COUNTS, override: bool = False) -> None:
         super().__init__()
+        self._frames = FrameReader(size_of, is_whole)
         self.status: FlightControllerStatus | None = None
         self.boxes: bytes | None = None
         self._override = override
         self._scale = math.radians(1.0 / GYRO_COUNTS), GRAVITY / g_counts
 
-    def frame_size(self, data: bytes) -> int | None:
-        """Return the size of the frame that begins the data; see `FrameTelemetry`."""
-        if data[:3] not in (b"$", b"$M", b"$M>", b"$M!"):
-            return None
-        return data[3] + 6 if len(data) > 3 else 0
-
-    def is_whole(self, frame: bytes) -> bool:
-        """Whether the checksum of a frame is right."""
-        return _checksum(frame) == frame[-1]
-
-    def is_battery(self, frame: bytes) -> bool:
-        """Whether a frame is a BATTERY_STATE, or says that the flight controller has none."""
-        return frame[4] == BATTERY_STATE
-
-    def note(self, frame: bytes) -> None:
-        """Keep what a STATUS, or a BOXIDS, says."""
-        if frame[2] != ord(">"):
-            return
-        if frame[4] == STATUS:
-            self.status = read_status(frame[5:-1]) or self.status
-        elif frame[4] == BOXIDS:
-            self.boxes = frame[5:-1]
+    def read(self, data: bytes) -> list[float]:
+        """Take in bytes; return the voltages in them, V, in steps of 0.01 V."""
+        damaged, voltages = self._frames.rejected, []
+        for frame in self._frames.read(data):
+            kind, payload, answered = frame[4], frame[5:-1], frame[2] == ord(">")
+            if kind == BATTERY_STATE:
+                voltage = _voltage(payload) if answered else None
+                voltages += [] if voltage is None else [voltage]
+                self.rejected += voltage is None
+            elif kind == RAW_IMU:
+                sample = self._sample(payload) if answered else None
+                self.felt += [] if sample is None else [sample]
+                self.rejected += sample is None
+            elif kind == STATUS and answered:
+                self.status = read_status(payload) or self.status
+            elif kind == BOXIDS and answered:
+                self.boxes = payload
+        self.rejected += self._frames.rejected - damaged
+        return voltages
 
     def refusal(self, armed: bool) -> str:
         """Return why the flight controller does not fly what it is told, or would not; empty as far as is known."""
@@ -152,24 +150,31 @@ class MspTelemetry(FrameTelemetry):
             return "the pilot flies it: MSP OVERRIDE is off"
         return "it levels itself: switch ANGLE and HORIZON off" if on & {ANGLE, HORIZON} else ""
 
-    def voltage(self, frame: bytes) -> float | None:
-        """Return the voltage, V, in steps of 0.01 V."""
-        payload = frame[5:-1]
-        if frame[2] != ord(">") or len(payload) < _BATTERY_PAYLOAD or payload[0] == 0:
-            return None
-        return int.from_bytes(payload[9:11], "little") / 100
-
-    def is_imu(self, frame: bytes) -> bool:
-        """Whether a frame is a RAW_IMU, or says that the flight controller has none."""
-        return frame[4] == RAW_IMU
-
-    def sample(self, frame: bytes) -> np.ndarray | None:
-        """Return body rates, rad/s, and specific force, m/s², FLU."""
-        payload = frame[5:-1]
-        if frame[2] != ord(">") or len(payload) < _IMU.size:
+    def _sample(self, payload: bytes) -> np.ndarray | None:
+        """Return body rates, rad/s, and specific force, m/s², FLU, of a RAW_IMU; None: it is too short."""
+        if len(payload) < _IMU.size:
             return None
         counts, (rate, force) = _IMU.unpack_from(payload), self._scale
         return make_sample(tuple(rate * each for each in counts[3:]), tuple(force * each for each in counts[:3]))
+
+
+def _voltage(payload: bytes) -> float | None:
+    """Return the voltage of a BATTERY_STATE, V; None: it is too short, or there is no battery."""
+    if len(payload) < _BATTERY_PAYLOAD or payload[0] == 0:
+        return None
+    return int.from_bytes(payload[9:11], "little") / 100
+
+
+def size_of(data: bytes) -> int | None:
+    """Return the size of the frame that begins the data, as `FrameReader` asks."""
+    if data[:3] not in (b"$", b"$M", b"$M>", b"$M!"):
+        return None
+    return data[3] + 6 if len(data) > 3 else 0
+
+
+def is_whole(frame: bytes) -> bool:
+    """Return whether the checksum of a frame is right."""
+    return _checksum(frame) == frame[-1]
 
 
 def _checksum(frame: bytes) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -32,52 +33,31 @@ class Telemetry(ABC):
         return ""
 
 
-class FrameTelemetry(Telemetry):
-    """Cuts a stream of bytes into frames; a subclass says what a frame is, and what it says.
+class FrameReader:
+    """Cuts a stream of bytes into frames. What is damaged is skipped up to the next frame that is whole.
 
-    What is damaged is skipped up to the next frame that is whole.
+    Args:
+        size_of: Returns the size of the frame that begins the bytes that it is given, up to 8; 0 if that takes more
+            bytes to tell; None: none begins.
+        is_whole: Returns whether the checksum of a frame is right.
+
+    Attributes:
+        rejected: Frames so far that were damaged, and stretches of bytes that were no frame.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, size_of: Callable[[bytes], int | None], is_whole: Callable[[bytes], bool]) -> None:
+        self.size_of, self.is_whole = size_of, is_whole
+        self.rejected = 0
         self._buffer = bytearray()
         self._lost = False  # whether the last byte was skipped: those in a row count once
 
-    @abstractmethod
-    def frame_size(self, data: bytes) -> int | None:
-        """Return the size of the frame that begins the data; 0 if that takes more bytes to tell; None: none begins."""
-
-    @abstractmethod
-    def is_whole(self, frame: bytes) -> bool:
-        """Whether the checksum of a frame is right."""
-
-    @abstractmethod
-    def is_battery(self, frame: bytes) -> bool:
-        """Whether a whole frame speaks of the battery."""
-
-    @abstractmethod
-    def voltage(self, frame: bytes) -> float | None:
-        """Return what a frame that speaks of the battery says, V; None if it is too short, or there is no battery."""
-
-    def is_imu(self, frame: bytes) -> bool:
-        """Whether a whole frame speaks of the IMU."""
-        return False
-
-    def sample(self, frame: bytes) -> np.ndarray | None:
-        """Return what a frame that speaks of the IMU says, (6,); None if it is too short, or there is none."""
-        raise NotImplementedError(f"{type(self).__name__} reads no IMU.")
-
-    def note(self, frame: bytes) -> None:
-        """Take in a whole frame that speaks of something else."""
-
-    def read(self, data: bytes) -> list[float]:
-        """Take in bytes; return the voltages in them, V, oldest first."""
+    def read(self, data: bytes) -> Iterator[bytes]:
+        """Take in bytes; yield the whole frames in them, oldest first."""
         self._buffer += data
-        voltages = []
         while self._buffer:
-            size = self.frame_size(bytes(self._buffer[:8]))
+            size = self.size_of(bytes(self._buffer[:8]))
             if size is not None and not 0 < size <= len(self._buffer):
-                break  # the rest is on its way
+                return  # the rest is on its way
             frame = bytes(self._buffer[: size or 0])
             if size is None or not self.is_whole(frame):
                 self.rejected += size is not None or not self._lost
@@ -86,14 +66,4 @@ class FrameTelemetry(Telemetry):
                 continue
             del self._buffer[:size]
             self._lost = False
-            if self.is_battery(frame):
-                voltage = self.voltage(frame)
-                self.rejected += voltage is None
-                voltages += [] if voltage is None else [voltage]
-            elif self.is_imu(frame):
-                sample = self.sample(frame)
-                self.rejected += sample is None
-                self.felt += [] if sample is None else [sample]
-            else:
-                self.note(frame)
-        return voltages
+            yield frame

@@ -113,7 +113,7 @@ def test_noise_and_damage(name):
     generator, telemetry = np.random.default_rng(0), make()
     for _ in range(2000):
         telemetry.read(generator.bytes(int(generator.integers(0, 64))))
-        assert len(telemetry._buffer) < 262
+        assert len(telemetry._frames._buffer) < 262
     assert telemetry.rejected > 0
     telemetry, heard = make(), []
     for _ in range(1000):
