@@ -9,7 +9,7 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
     python recipes/hil.py replay=runs/hil_kidney_20260101-120000          # the same again, from its file
     python recipes/hil.py report=runs/hil_kidney_20260101-120000
 
-Read docs/hil.md before anything with propellers. Nothing here needs torch, but for actor=pilot and report=.
+Read docs/hil_safety.md before anything with propellers. Only actor=pilot and report= need torch.
 """
 
 import json

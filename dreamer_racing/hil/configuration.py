@@ -115,7 +115,7 @@ class HilConfig:
     voltage_tolerance: float = setting(0.25, Range(0, 0.5))  # share of voltage= by which readings may differ from it
     voltage_smoothing: float = setting(0.5, Range(0, 60))  # s, time constant of the low-pass that readings go through
 
-    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil.md
+    limits: Any = field(default_factory=LimitsConfig)  # of safety: limits.speed_max=10; all of them: docs/hil_safety.md
     renderer: str = "auto"  # auto | egl | osmesa
     record: bool = True  # write the flight to a file
     view: int | None = setting(None, Range(1, 65535))  # port of a page on this machine that shows what the actor sees

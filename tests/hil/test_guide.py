@@ -1,4 +1,4 @@
-"""The guide says every limit with its default, every reason, and every source and link that there is."""
+"""The pages on flight have every limit with its default, every reason, and every source and link that there is."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from dreamer_racing.hil.safety_limits import BELOW_FLOOR, SafetyLimits
 from dreamer_racing.hil.stamping import Stamping
 from dreamer_racing.hil.view import PORT
 
-PAGE = Path(__file__).parents[2] / "docs" / "hil.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+SAFETY = (DOCS / "hil_safety.md").read_text(encoding="utf-8")
+TEXT = "".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("hil*.md")))
 ROWS = {
     name: cells.split(" | ")
-    for name, cells in re.findall(r"^\| `(\w+)` \| (.*) \|$", TEXT.partition("## Safety")[2], re.M)
+    for name, cells in re.findall(r"^\| `(\w+)` \| (.*) \|$", SAFETY.partition("## Limits")[2], re.M)
 }
 
 
@@ -36,7 +37,7 @@ def test_every_limit_is_there_with_its_default(limit):
 
 
 def test_no_limit_is_there_that_is_none():
-    table = TEXT.partition("| limit | default |")[2].partition("\n\n")[0]
+    table = SAFETY.partition("| limit | default |")[2].partition("\n\n")[0]
     assert set(re.findall(r"^\| `(\w+)`", table, re.M)) == {limit.name for limit in fields(SafetyLimits)}
 
 

@@ -222,7 +222,7 @@ def _receiver(link: str) -> list[Wanted]:
     if link not in LINKS:
         raise ValueError(f"link={link}: must be one of {', '.join(LINKS)}.")
     if link == "betaflight_sitl":
-        return [_MSP_RATE, *_SIMULATED]  # channels come over UDP, whichever receiver is set: see docs/hil.md
+        return [_MSP_RATE, *_SIMULATED]  # channels come over UDP, whichever receiver is set: see docs/hil_firmware.md
     if link == "msp_override":
         return [*_OVERRIDE, _MSP_RATE]
     serial = link != "msp"
