@@ -6,16 +6,19 @@
 A folder of results is described by its `provenance.json`, an entry or a list of entries:
 
     {"title": "...", "text": "...", "command": "..." or [...], "commit": "...", "machine": "...", "wall_clock": "...",
-     "files": {"curve.png": "caption"} or ["curve.png"], "fills": ["dreamer_v3/circle"]}
+     "files": {"curve.png": "caption"} or ["curve.png"], "fills": {"sac/circle": "99 %"} or ["sac/circle"]}
 
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `fills` names
-cells of results/planned.json, the tables of what is to be run; a cell that nothing fills says so.
+cells of results/planned.json, the tables of what is to be run, and may say what a cell shows instead of the title; a
+cell that nothing fills says so. With `"brief": true` an entry is an item of the list at the end, with no pictures.
 """
 
 import argparse
 import json
 import os
+import re
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,16 +27,18 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
+WIDTH = 118
+BRIEF = "Shown on other pages"
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 Made by `python docs/results.py` from the `provenance.json` files in [results/](../results): change those, not this
-page. Only what was run is here. [What we know](what_we_know.md) says what follows from it, and
-[figures.md](figures.md) how to draw such figures from runs of your own.
+page. [What we know](what_we_know.md) says what follows, and [figures](figures.md) how to draw your own. More results,
+of earlier defaults, are in the tree of commit 3c460b3.
 
-A command runs at the commit beside it. Until 2c16a57 the recipe that is `recipes/latent_ppo.py` today was called
-`recipes/dreamer_v3.py`, so commands of older results name that one. Where nothing is said, flights are deterministic:
-by the policy's mean, without sampling.
+A command runs at the commit below it. Until 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`, so
+commands of older results name that one. Where nothing is said, flights are deterministic: by the policy's mean. Files
+of metrics hold the rows with evaluations and every fourth to twentieth of the others.
 """
 
 
@@ -49,7 +54,8 @@ class Entry:
     commit: str | None = None
     machine: str | None = None
     wall_clock: str | None = None
-    fills: list[str] = field(default_factory=list)
+    brief: bool = False  # an item of the last list
+    fills: dict[str, str] = field(default_factory=dict)  # what cells of the planned tables show, by their names
 
     @property
     def anchor(self) -> str:
@@ -75,7 +81,8 @@ def main() -> None:
 
 def make_page(results: Path) -> str:
     """Make the text of docs/results.md from a folder of results."""
-    entries = [entry for path in sorted(results.rglob("provenance.json")) for entry in read_entries(path)]
+    paths = sorted(results.rglob("provenance.json"), key=lambda path: (path.parent == results, path))
+    entries = [entry for path in paths for entry in read_entries(path)]
     planned = json.loads((results / "planned.json").read_text(encoding="utf-8"))
     known = [cell for table in planned for cell in cells_of(table)]
     for entry in entries:
@@ -83,7 +90,9 @@ def make_page(results: Path) -> str:
             raise ValueError(f"{entry.folder / 'provenance.json'}: fills {sorted(unknown)}: not in planned.json.")
     tables = [table_text(table, entries) for table in planned]
     entries.sort(key=lambda entry: min(map(known.index, entry.fills), default=len(known)))  # as the tables link to them
-    return "\n".join([HEAD, *tables, *(entry_text(entry, results) for entry in entries)])
+    long = [entry_text(entry, results) for entry in entries if not entry.brief]
+    brief = [brief_text(entry, results) for entry in entries if entry.brief]
+    return "\n".join([HEAD, *tables, *long, *([f"## {BRIEF}\n", *brief] if brief else []), ""]).rstrip("\n") + "\n"
 
 
 def read_entries(path: Path) -> Iterator[Entry]:
@@ -104,7 +113,7 @@ def read_entries(path: Path) -> Iterator[Entry]:
         for name in files:
             if not (path.parent / name).is_file():
                 raise ValueError(f"{path}: files names {name}, which is not there.")
-        command = raw.get("command") or []
+        command, fills = raw.get("command") or [], raw.get("fills") or {}
         yield Entry(
             folder=path.parent,
             title=raw["title"],
@@ -114,7 +123,8 @@ def read_entries(path: Path) -> Iterator[Entry]:
             commit=raw.get("commit") or recorded(path.parent, files, "commit"),
             machine=raw.get("machine") or recorded(path.parent, files, "machine"),
             wall_clock=raw.get("wall_clock"),
-            fills=raw.get("fills") or [],
+            brief=bool(raw.get("brief")),
+            fills=fills if isinstance(fills, dict) else dict.fromkeys(fills, raw["title"]),
         )
 
 
@@ -136,36 +146,73 @@ def cells_of(table: dict[str, Any]) -> list[str]:
 
 def table_text(table: dict[str, Any], entries: list[Entry]) -> str:
     """Draw a planned table; its cells link to what fills them."""
-    lines = [f"## {table['title']}\n", f"{table['text']}\n", f"| | {' | '.join(table['columns'].values())} |"]
+    lines = [f"## {table['title']}\n", f"{wrapped(table['text'])}\n", f"| | {' | '.join(table['columns'].values())} |"]
     lines.append("|---" * (len(table["columns"]) + 1) + "|")
     for row, title in table["rows"].items():
-        filling = ([e for e in entries if f"{row}/{column}" in e.fills] for column in table["columns"])
-        cells = ["<br>".join(f"[{e.title}](#{e.anchor})" for e in found) or NOT_RUN for found in filling]
+        names = [f"{row}/{column}" for column in table["columns"]]
+        links = ([f"[{e.fills[name]}](#{e.anchor})" for e in entries if name in e.fills] for name in names)
+        cells = ["<br>".join(found) or NOT_RUN for found in links]
         lines.append(f"| {title} | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
 
 def entry_text(entry: Entry, results: Path) -> str:
-    """Draw an entry: heading, text, where it comes from, pictures, other files."""
+    """Draw an entry: heading, text, commands, where it comes from, pictures, other files."""
     place = Path(os.path.relpath(entry.folder, results.parent))
     lines = [f"## {entry.title}\n"]
     if entry.text:
-        lines.append(f"{entry.text}\n")
-    if len(entry.command) > 1:
-        lines.append("\n".join(["```bash", *entry.command, "```"]) + "\n")
-    command = f"`{entry.command[0]}`" if len(entry.command) == 1 else "above" if entry.command else NOT_RECORDED
-    facts = {"command": command, "commit": entry.commit, "machine": entry.machine, "wall clock": entry.wall_clock}
-    lines += ["| | |", "|---|---|", *(f"| {name} | {value or NOT_RECORDED} |" for name, value in facts.items()), ""]
-    for name, caption in entry.files.items():
-        if name.endswith(PICTURES):
-            lines += [f"![{caption or name}](../{(place / name).as_posix()})\n", *([f"{caption}\n"] if caption else [])]
+        lines.append(f"{wrapped(entry.text)}\n")
+    if entry.command:
+        lines.append("\n".join(["```bash", *map(wrapped_command, entry.command), "```"]) + "\n")
+    lines.append(wrapped(provenance(entry)) + "\n")
+    if numbers := links(entry, results):
+        lines.append(f"{numbers}\n")
+    pictures = [name for name in entry.files if name.endswith(PICTURES)]
+    shown = [f"![{entry.files[name] or name}](../{(place / name).as_posix()})" for name in pictures]
+    return "\n".join([*lines, *shown, *([""] if shown else [])])
+
+
+def brief_text(entry: Entry, results: Path) -> str:
+    """Draw an entry as an item of a list."""
+    commands = "; ".join(f"`{command.partition('  # ')[0]}`" for command in entry.command)
+    said = " ".join(filter(None, (f"**{entry.title}**.", entry.text, f"{commands}." if commands else "")))
+    text = wrapped(f"- {said} {provenance(entry)}")
+    return "\n".join([text.replace("\n", "\n  "), *([f"  {numbers}"] if (numbers := links(entry, results)) else [])])
+
+
+def provenance(entry: Entry) -> str:
+    """Say where an entry comes from."""
+    facts: dict[str, str | None] = {} if entry.command else {"Command": None}
+    facts |= {"Commit": entry.commit, "Machine": entry.machine, "Time": entry.wall_clock}
+    return " ".join(f"{name}: {value or NOT_RECORDED}." for name, value in facts.items())
+
+
+def links(entry: Entry, results: Path) -> str:
+    """Link to the files that are no pictures, in one line; nothing if there are none."""
+    place = Path(os.path.relpath(entry.folder, results.parent))
     others = [name for name in entry.files if not name.endswith(PICTURES)]
-    if others:
-        linked = (
-            f"[{n}](../{(place / n).as_posix()}){f' ({entry.files[n]})' if entry.files[n] else ''}" for n in others
-        )
-        lines.append(f"Numbers: {', '.join(linked)}.\n")
-    return "\n".join(lines)
+    linked = (f"[{n}](../{(place / n).as_posix()}){f' ({entry.files[n]})' if entry.files[n] else ''}" for n in others)
+    return f"Numbers: {', '.join(linked)}." if others else ""
+
+
+def wrapped(text: str) -> str:
+    """Break paragraphs into lines; tables stay as they are."""
+    wrapper = textwrap.TextWrapper(WIDTH, break_long_words=False, break_on_hyphens=False)
+    paragraphs = text.split("\n\n")
+    return "\n\n".join(part if part.startswith("|") else wrapper.fill(part) for part in paragraphs)
+
+
+def wrapped_command(command: str) -> str:
+    """Break a command into lines, never within quotes, and put the remark behind it above it."""
+    command, _, remark = command.partition("  # ")
+    lines = [f"# {line}" for line in wrapped(remark).splitlines()]
+    line = ""
+    for word in re.findall(r"""(?:[^\s"']|"[^"]*"|'[^']*')+""", command):
+        if line and len(line) + len(word) > WIDTH - 2:
+            lines.append(f"{line} \\")
+            line = "   "
+        line = f"{line} {word}" if line else word
+    return "\n".join([*lines, line])
 
 
 if __name__ == "__main__":

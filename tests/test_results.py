@@ -71,26 +71,44 @@ def test_cells_without_a_result_say_so(results, folder):
 
 def test_facts_come_from_the_entry_or_its_records_and_are_never_invented(results, folder):
     page = results.make_page(folder)
-    for row in (
-        "| command | not recorded |",
-        "| commit | c1; c2 |",
-        "| machine | M |",
-        "| wall clock | not recorded |",
-    ):
-        assert row in page
+    assert "Command: not recorded. Commit: c1; c2. Machine: M. Time: not recorded." in page
     change(folder, command="python x.py", machine="N", wall_clock="3 minutes", commit="c3")
     page = results.make_page(folder)
-    for row in ("| command | `python x.py` |", "| commit | c3 |", "| machine | N |", "| wall clock | 3 minutes |"):
-        assert row in page
-    change(folder, command=["python x.py", "python y.py"])
+    assert "```bash\npython x.py\n```\n\nCommit: c3. Machine: N. Time: 3 minutes." in page
+    change(folder, command=["python x.py", "python y.py  # likewise z.py"])
+    assert "```bash\npython x.py\n# likewise z.py\npython y.py\n```" in results.make_page(folder)
+
+
+def test_cells_may_say_what_they_show(results, folder):
+    change(folder, fills={"ppo/b": "99 %"})
+    assert "| PPO | not run | [99 %](#one-a-result) |" in results.make_page(folder)
+
+
+def test_brief_entries_are_a_list_at_the_end(results, folder):
+    change(folder, brief=True, text="What it is.", command="python x.py")
     page = results.make_page(folder)
-    assert "```bash\npython x.py\npython y.py\n```" in page and "| command | above |" in page
+    assert "- **One: a result**. What it is. `python x.py`. Commit: c1; c2." in page and "## One" not in page
+
+
+def test_commands_are_not_broken_within_quotes(results):
+    words = ["python x.py", "'a={b: 1, c: 2}'", '"d e"'] * 6
+    lines = results.wrapped_command(" ".join(words)).splitlines()
+    assert len(lines) > 1 and all(line.endswith(" \\") for line in lines[:-1])
+    assert " ".join(line.removesuffix(" \\").strip() for line in lines) == " ".join(words)
+
+
+def test_long_lines_are_broken_and_tables_are_not(results, folder):
+    row = "|" + " a |" * 100
+    change(folder, text=f"{'word ' * 100}\n\n{row}", command=f"python x.py {'option=value ' * 30}")
+    lines = results.make_page(folder).splitlines()
+    assert row in lines and max(len(line) for line in lines if line != row and "Numbers:" not in line) <= 120
+    assert any(line.startswith("    option=value") for line in lines)
 
 
 def test_pictures_are_shown_and_numbers_linked(results, folder):
     page = results.make_page(folder)
     place = f"../{folder.name}/one/deep"
-    assert f"![A curve]({place}/curve.png)" in page and f"Numbers: [numbers.json]({place}/numbers.json)." in page
+    assert f"![A curve]({place}/curve.png)" in page and f"[numbers.json]({place}/numbers.json)." in page
 
 
 @pytest.mark.parametrize(
