@@ -419,13 +419,17 @@ def write_page(results: Path, page: Path) -> None:
 
 
 def table(records: list[dict[str, Any]]) -> str:
-    """A row for each job, of its latest attempt on a GPU."""
+    """A row for each job, of its latest attempt on a GPU; one for a stage of which nothing was run."""
     latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
     places = sorted({f"{r.get('gpu')} at {r['commit']}" for r in latest.values()})
     lines = [f"Measured on {', '.join(places)}.", ""] if places else []
     lines += ["| stage | what | |", "|---|---|---|"]
     for stage, commands in STAGES.items():
-        for name, _, _ in commands("cuda", False, Path()):
+        names = [name for name, _, _ in commands("cuda", False, Path())]
+        if not any((stage, name) in latest for name in names):
+            lines.append(f"| {stage} | {len(names)} {'job' if len(names) == 1 else 'jobs'} | not run |")
+            continue
+        for name in names:
             record = latest.get((stage, name))
             lines.append(f"| {stage} | `{name}` | {'not run' if record is None else in_words(record)} |")
     return "\n".join(lines)

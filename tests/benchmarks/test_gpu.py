@@ -99,6 +99,7 @@ def test_the_table_says_what_was_not_run(tmp_path: Path) -> None:
     assert "| speed | `size12m eager 64x16` | failed: out of memory |" in text
     for name in ("paper_large", "paper_small"):
         assert f"| speed | `{name} graph 64x16` | not run |" in text, "a GPU's numbers come from a GPU"
+    assert "| train | 1 job | not run |" in text and "| train | `kidney`" not in text
 
 
 def test_the_tests_that_are_named_are_those_that_need_a_gpu() -> None:
