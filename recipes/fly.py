@@ -2,6 +2,7 @@
 
     python recipes/fly.py track=kidney preset=easy pilot=scripted run_dir=runs/fly
     python recipes/fly.py agent=kidney
+    python recipes/fly.py agent=kidney view=chase
     python recipes/fly.py agent=kidney viewer=true
     python recipes/fly.py track=figure8 pilot=keyboard
 
@@ -9,7 +10,7 @@ A scripted pilot sees the true state, not images: it shows what a track asks for
 agent has learned to fly by what its camera sees: give one that ships by its name (docs/agents.md), or a path.
 `pilot=keyboard` and `pilot=gamepad` are you, by what the camera sees in a window (arrows: roll and pitch; A, D: yaw;
 W, S: throttle). `viewer=true` shows agents and scripted pilots live in MuJoCo's viewer, the camera's image in a corner,
-and writes nothing. Windows need a display.
+and writes nothing. Windows need a display. `view=chase` needs none: it films the drone from behind.
 """
 
 import time
@@ -35,6 +36,7 @@ from torch import set_num_threads, tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
+from dreamer_racing.envs.simulator.chase import ChaseView
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import Track, load_track
@@ -43,6 +45,7 @@ from dreamer_racing.evaluation.by_hand import KINDS, FlightAbandonedError, HandP
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.evaluate import Episode, Evaluation, Trajectory, evaluate
 from dreamer_racing.evaluation.trajectory import write_flight
+from dreamer_racing.figures.chase import chase_beside_onboard
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
@@ -52,6 +55,7 @@ from dreamer_racing.training.directory import EVALUATION
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
 PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
+VIEWS = ("map", "chase")
 GIF_STEPS = 300  # control steps shown if there is no second lap
 BREAK = 1.0  # s between two flights in the viewer
 
@@ -71,6 +75,7 @@ class FlyConfig:
     camera_tilt: float | None = None  # degrees upwards; null: 25
     control_rate: float | None = None  # Hz; null: 50
     renderer: str = "auto"  # as env.renderer in training, docs/options.md
+    view: str = "map"  # map | chase; chase: also chase.mp4 and chase.gif, the drone from behind beside its own view
     viewer: bool = False  # watch agent or pilot live in a window instead of writing files
     seed: int = 0
 
@@ -119,6 +124,10 @@ def check(config: FlyConfig) -> None:
         if config.viewer:
             raise ValueError(f"viewer=true and pilot={config.pilot}, which has a window of its own: give one of them.")
         check_by_hand(config.pilot)
+    if config.view not in VIEWS:
+        raise ValueError(f"view={config.view}: there are {', '.join(VIEWS)}.")
+    if config.viewer and config.view == "chase":
+        raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
     for name in ("image_size", "control_rate"):
         value = getattr(config, name)
         if value is not None and value < 1:
@@ -158,11 +167,14 @@ def fly(config: FlyConfig) -> None:
     """Fly one episode of all laps and write what there is to see."""
     with folder_to_fill(Path(config.run_dir)) as directory:
         flight = make_flight(config)
+        outside = open_view(flight.env) if config.view == "chase" else None
         result = flight.fly()
         flight.env.close()
         laps = ", ".join(f"{duration:.2f} s" for duration in result.lap_times)
         say(f"{result.summary()}\n{'laps':<18} {laps or 'none'}")
         write(directory, flight.env.track, result)
+        if outside is not None:
+            film_from_outside(directory, outside, flight.env.track, result.trajectories[0])
 
 
 @contextmanager
@@ -258,7 +270,7 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
     (directory / EVALUATION).write_text(result.to_json())
     stored = write_flight(directory / "flight", trajectory, track)
     plot_top_down(track, trajectory, directory / "top_down.png")
-    for earlier in ("onboard.mp4", "onboard.gif"):
+    for earlier in ("onboard.mp4", "onboard.gif", "chase.mp4", "chase.gif"):
         (directory / earlier).unlink(missing_ok=True)  # that it is not taken for this flight's
     files = f"{directory}: {EVALUATION}, {', '.join(stored)}, top_down.png"
     if trajectory.pixels is None:
@@ -272,6 +284,24 @@ def write(directory: Path, track: Track, result: Evaluation) -> None:
     gif = caption(frames, words[first : last + 1 : GIF_STRIDE])
     size = write_gif(directory / "onboard.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
     print(f"{'files':<18} {files}, {'onboard.mp4, ' if filmed else ''}onboard.gif ({size / 1e6:.2f} MB)")
+
+
+def open_view(env: DroneRacingEnv) -> ChaseView:
+    """Make what films the drone, before the flight: where there is no OpenGL, that would be in vain."""
+    with plain_errors():
+        return ChaseView(env.track, env.worlds.parameters, size=GIF_SIZE)
+
+
+def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory: Trajectory) -> None:
+    """Write a video of the whole flight and a GIF of its second lap, seen from outside and by the drone."""
+    frames, words = chase_beside_onboard(view, trajectory), race_words(track, trajectory)
+    view.close()
+    filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
+    first, last = second_lap(trajectory)
+    shown = slice(first, last + 1, GIF_STRIDE)
+    gif = caption(frames[shown], words[shown])
+    size = write_gif(directory / "chase.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
+    print(f"{'from outside':<18} {directory}: {'chase.mp4, ' if filmed else ''}chase.gif ({size / 1e6:.2f} MB)")
 
 
 def second_lap(trajectory: Trajectory) -> tuple[int, int]:

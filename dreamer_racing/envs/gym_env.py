@@ -10,7 +10,8 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
 
-`render` draws the on-board view, larger (`render_mode="rgb_array"`). All in SI units.
+`render` draws 256 × 256 pixels (`render_mode="rgb_array"`), by the argument `render_view`: `"chase"`, the drone from
+outside, which needs OpenGL, or `"onboard"`, what it sees itself, larger. All in SI units.
 
 `info` has `gates_passed`, `gate_offset` m, `lap_time` s, `crash` (the number of a `CrashCause`, 0 while flying),
 `finished`, `reward_base` and `body_rate_norm` rad/s (`reward = reward_base − b₂ · body_rate_norm`), and with
@@ -33,12 +34,15 @@ from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race import RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
+from dreamer_racing.envs.simulator.chase import ChaseView
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
 from dreamer_racing.envs.simulator.scene import build_scene
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, check_options
 from dreamer_racing.settings import FINITE, check_flags, check_setting
 
+RENDER_VIEWS = ("chase", "onboard")
 OBSERVATIONS = ("pixels", "pixels_imu", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
 
@@ -88,6 +92,7 @@ class GymWorlds:
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
         preset: physics preset or parameters.
+        render_view: of frames: `chase` or `onboard`.
         worlds: further arguments of `RaceWorlds`, see `WorldOptions`.
 
     Raises:
@@ -104,6 +109,7 @@ class GymWorlds:
         body_rate_weight: float | None,
         render_mode: str | None,
         preset: str | QuadrotorParameters,
+        render_view: str,
         worlds: WorldOptions,
     ) -> None:
         check_flags(privileged=privileged)
@@ -111,6 +117,8 @@ class GymWorlds:
             raise ValueError(f"observation={observation!r}: choose one of {', '.join(OBSERVATIONS)}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: choose 'rgb_array', or None for no frames.")
+        if render_view not in RENDER_VIEWS:
+            raise ValueError(f"render_view={render_view!r}: choose one of {', '.join(RENDER_VIEWS)}.")
         if body_rate_weight is not None:
             check_setting("body_rate_weight", body_rate_weight, FINITE)
         device = worlds.get("device", "cpu")
@@ -131,7 +139,9 @@ class GymWorlds:
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
         )
+        self._render_view = render_view
         self._onboard: Renderer | None = None
+        self._chase: ChaseView | None = None
         self._closed = False
 
     @property
@@ -229,15 +239,36 @@ class GymWorlds:
         return info
 
     def frames(self) -> np.ndarray:
-        """The on-board views, uint8 (N, 256, 256, 3), as each drone sees, but for noise; by a renderer of their own.
-
-        It is made on first use.
+        """Draw every drone from outside, or what it sees, uint8 (N, 256, 256, 3), by a renderer made on first use.
 
         Raises:
             ClosedEnvironmentError: the environment is closed.
+            RendererUnavailableError: drones are to be drawn from outside, and there is no OpenGL.
         """
         if self._closed:
             raise gymnasium.error.ClosedEnvironmentError("render() after close(): there is nothing left to draw with.")
+        return self._seen_from_outside() if self._render_view == "chase" else self._seen_on_board()
+
+    def _seen_from_outside(self) -> np.ndarray:
+        """Return the drones as cameras behind them see them, in nominal colours."""
+        worlds = self.worlds
+        if self._chase is None:
+            try:
+                self._chase = ChaseView(worlds.track, worlds.parameters, worlds.num_envs, FRAME_SIZE)
+            except RendererUnavailableError as error:
+                raise RendererUnavailableError(
+                    f"{error} render_view='onboard' draws what the drone sees, and needs no OpenGL."
+                ) from error
+        state, race = worlds.simulator.state, worlds.race
+        return self._chase.draw(
+            state.position.double().numpy(),
+            state.attitude.double().numpy(),
+            race.target_gate.numpy(),
+            race.step_count.numpy() * worlds.parameters.control_dt,
+        )
+
+    def _seen_on_board(self) -> np.ndarray:
+        """Return what each drone sees, but for noise."""
         worlds, looks = self.worlds, self.worlds.simulator.looks
         if self._onboard is None:
             camera = replace(worlds.camera, width=FRAME_SIZE, height=FRAME_SIZE)
@@ -252,9 +283,10 @@ class GymWorlds:
         """Free rendering contexts and threads."""
         self._closed = True
         self.worlds.close()
-        if self._onboard is not None:
-            self._onboard.close()
-            self._onboard = None
+        for renderer in (self._onboard, self._chase):
+            if renderer is not None:
+                renderer.close()
+        self._onboard = self._chase = None
 
 
 class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -266,10 +298,11 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
-        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        render_mode: `rgb_array` for frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
+        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
@@ -294,10 +327,13 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: bool = False,
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
+        render_view: str = "chase",
         **worlds: Unpack[WorldOptions],
     ) -> None:
         check_options(DroneRaceGymEnv, worlds, WorldOptions)
-        self.race = GymWorlds(track, 1, observation, privileged, body_rate_weight, render_mode, preset, worlds)
+        self.race = GymWorlds(
+            track, 1, observation, privileged, body_rate_weight, render_mode, preset, render_view, worlds
+        )
         self.metadata = {**self.metadata, "render_fps": self.race.frames_per_second}
         self.render_mode = render_mode
         self.action_space = self.race.action_space()
@@ -338,7 +374,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
         )
 
     def render(self) -> np.ndarray | None:
-        """The on-board view, uint8 (256, 256, 3); None without a render mode."""
+        """The drone from outside, or what it sees, uint8 (256, 256, 3); None without a render mode."""
         return self.race.frames()[0] if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -32,10 +32,11 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         num_envs: N.
         track: name of a built-in track, path to a YAML file, or a `Track`.
         observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
-        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        render_mode: `rgb_array` for frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
+        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
         max_episode_steps: control steps until an episode is truncated; Gymnasium's name of `episode_steps`.
         autoreset_mode: `NextStep`, `SameStep` or `Disabled`.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
@@ -66,6 +67,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         privileged: bool = False,
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
+        render_view: str = "chase",
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **worlds: Unpack[WorldOptions],
@@ -76,7 +78,9 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             steps = worlds.get("episode_steps")
             check_numbers(whole=without_none(max_episode_steps=max_episode_steps, episode_steps=steps), real={})
             worlds["episode_steps"] = max_episode_steps if steps is None else min(max_episode_steps, steps)
-        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
+        self.race = GymWorlds(
+            track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, render_view, worlds
+        )
         own = {"render_fps": self.race.frames_per_second, "autoreset_mode": self.autoreset_mode}
         self.metadata = {**self.metadata, **own}
         self.num_envs = num_envs
@@ -144,7 +148,7 @@ class DroneRaceVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return observation, np.where(begun, 0.0, reward), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
+        """The drones from outside, or what they see, N images uint8 (256, 256, 3); None without a render mode."""
         return tuple(self.race.frames()) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -34,10 +34,11 @@ class DroneRaceVecEnv(VecEnv):
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
         observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
-        render_mode: `rgb_array` for on-board frames of 256×256 pixels, or None.
+        render_mode: `rgb_array` for frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
+        render_view: of frames: `chase`, the drone from outside, or `onboard`, what it sees.
         worlds: further arguments of `RaceWorlds`; see `WorldOptions`.
 
     Raises:
@@ -59,10 +60,13 @@ class DroneRaceVecEnv(VecEnv):
         privileged: bool = False,
         body_rate_weight: float | None = None,
         preset: str | QuadrotorParameters = "easy",
+        render_view: str = "chase",
         **worlds: Unpack[WorldOptions],
     ) -> None:
         check_options(DroneRaceVecEnv, worlds, WorldOptions)
-        self.race = GymWorlds(track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, worlds)
+        self.race = GymWorlds(
+            track, num_envs, observation, privileged, body_rate_weight, render_mode, preset, render_view, worlds
+        )
         self.render_mode = render_mode
         self._actions = np.zeros((num_envs, *self.race.action_space().shape), np.float32)
         super().__init__(num_envs, self.race.observation_space(), self.race.action_space())
@@ -109,7 +113,7 @@ class DroneRaceVecEnv(VecEnv):
         return with_rows(observation, mask, self.race.observe(mask))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """The on-board views, N images uint8 (256, 256, 3); None without a render mode."""
+        """The drones from outside, or what they see, N images uint8 (256, 256, 3); None without a render mode."""
         return list(self.race.frames()) if self.render_mode == "rgb_array" else [None] * self.num_envs
 
     def close(self) -> None:

@@ -16,13 +16,17 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 import dreamer_racing
+from dreamer_racing.envs import gym_env
 from dreamer_racing.envs.dm_control_env import load
-from dreamer_racing.envs.drone.parameters import QuadrotorParameters
-from dreamer_racing.envs.gym_env import OBSERVATIONS, DroneRaceGymEnv
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_preset
+from dreamer_racing.envs.gym_env import OBSERVATIONS, RENDER_VIEWS, DroneRaceGymEnv
 from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.simulator.chase import ChaseView
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
+from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
 
 IDS = [f"dreamer_racing/{name}-v0" for name in dreamer_racing.GYM_ENVIRONMENTS]
@@ -111,7 +115,7 @@ def test_module_form_of_the_name_needs_no_import(make: Callable, monkeypatch: py
 
 
 def test_pixels_by_default_and_frames_of_the_same_view() -> None:
-    env = gymnasium.make(IDS[1], render_mode="rgb_array")
+    env = gymnasium.make(IDS[1], render_mode="rgb_array", render_view="onboard")
     observation, info = env.reset(seed=0)
     assert (observation.shape, observation.dtype) == ((64, 64, 3), np.uint8)
     assert set(info) == INFO
@@ -120,6 +124,38 @@ def test_pixels_by_default_and_frames_of_the_same_view() -> None:
     small = frame.reshape(64, 4, 64, 4, 3).mean((1, 3))
     assert np.abs(small - observation).mean() < 4.0
     env.close()
+    env.close()
+
+
+def test_frames_show_the_drone_from_outside_by_default() -> None:
+    """What `ChaseView` draws of the same state; the drone's colours are in it, and move with it."""
+    env = gymnasium.make("dreamer_racing/Kidney-v0", observation="state", render_mode="rgb_array")
+    state, _ = env.reset(seed=0)
+    view = ChaseView(load_track("kidney"), load_preset("easy"))
+    for step in range(3):
+        frame = env.render()
+        place = (state["position"][None], state["attitude"][None], np.array([int(state["target_gate"])]))
+        (expected,) = view.draw(
+            *(np.asarray(part, float if part.ndim > 1 else int) for part in place), np.array([0.02 * step])
+        )
+        assert (frame.shape, frame.dtype) == ((256, 256, 3), np.uint8)
+        assert np.abs(frame.astype(int) - expected).mean() < 0.5, "but for float32"
+        state = env.step(HOVER)[0]
+    view.close()
+    env.close()
+
+
+def test_without_opengl_frames_say_how_to_have_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object) -> None:
+        raise RendererUnavailableError("There is none.")
+
+    monkeypatch.setattr(gym_env, "ChaseView", missing)
+    env = gymnasium.make(IDS[0], observation="state", render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(
+        RendererUnavailableError, match=r"There is none\. render_view='onboard' draws what the drone sees"
+    ):
+        env.render()
     env.close()
 
 
@@ -236,6 +272,8 @@ def test_wrong_arguments_are_explained() -> None:
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="observation='image': choose one of pixels, pixels_imu, vector, state, both"):
         DroneRaceGymEnv(observation="image")
+    with pytest.raises(ValueError, match="render_view='front': choose one of chase, onboard"):
+        DroneRaceGymEnv(render_view="front")
     with pytest.raises(ValueError, match="render_mode='human'"):
         DroneRaceVectorEnv(2, render_mode="human")
 
@@ -254,8 +292,9 @@ def test_devices_without_worlds_are_refused(device: str | None, words: str) -> N
 
 
 @pytest.mark.parametrize("kind", [DroneRaceGymEnv, DroneRaceVectorEnv])
-def test_a_closed_environment_draws_no_more(kind: type[gymnasium.Env]) -> None:
-    env = kind(track="circle", observation="state", render_mode="rgb_array", renderer="warp")
+@pytest.mark.parametrize("view", RENDER_VIEWS)
+def test_a_closed_environment_draws_no_more(kind: type[gymnasium.Env], view: str) -> None:
+    env = kind(track="circle", observation="state", render_mode="rgb_array", renderer="warp", render_view=view)
     env.reset()
     env.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match=r"render\(\) after close\(\)"):

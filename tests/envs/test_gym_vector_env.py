@@ -49,7 +49,7 @@ def test_vector_spaces_infos_and_frames() -> None:
 
 def test_frames_look_as_what_is_seen() -> None:
     """With light, colours, lens and tilt of each drone: nearer to its own image than to another's."""
-    envs = make_vec(observation="pixels", render_mode="rgb_array", looks="randomised")
+    envs = make_vec(observation="pixels", render_mode="rgb_array", render_view="onboard", looks="randomised")
     seen, _ = envs.reset(seed=0)
     frames = np.stack([frame.reshape(64, 4, 64, 4, 3).mean((1, 3)) for frame in envs.render()])
     apart = np.abs(frames[:, None] - seen[None].astype(float)).mean((2, 3, 4))  # (3, 3), frame by image

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+from PIL import Image
 from tensordict import TensorDictBase
 
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.viewer import WindowClosedError
 from dreamer_racing.envs.worlds import RaceWorlds
 from tests.running_recipes import recipe, recipe_module
@@ -101,4 +105,36 @@ def test_the_refusal_as_a_user_meets_it(tmp_path) -> None:
     done = recipe("fly", "agent=kidney", "viewer=true", cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: The viewer cannot open a window here: ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_view_that_there_is_not_is_refused_before_the_flight() -> None:
+    fly = recipe_module("fly")
+    with pytest.raises(ValueError, match=r"^view=side: there are map, chase\.$"):
+        fly.check(fly.FlyConfig(view="side"))
+    with pytest.raises(ValueError, match=r"^viewer=true and view=chase"):
+        fly.check(fly.FlyConfig(viewer=True, view="chase"))
+
+
+@pytest.mark.parametrize("flyer", [{"agent": "circle"}, {"pilot": "hover", "track": "circle", "control_rate": 10}])
+def test_a_flight_is_filmed_from_outside(flyer: dict[str, Any], tmp_path: Path) -> None:
+    fly = recipe_module("fly")
+    fly.fly(fly.FlyConfig(**flyer, view="chase", run_dir=str(tmp_path)))
+    with Image.open(tmp_path / "chase.gif") as film:
+        assert film.n_frames > 10 and film.width == 256 + 8 + 256 and film.height > 256
+    assert (tmp_path / "onboard.gif").is_file()
+
+
+def test_without_opengl_no_flight_is_filmed_and_none_is_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fly = recipe_module("fly")
+
+    def missing(*_: object, **__: object) -> None:
+        raise RendererUnavailableError("A drone is drawn from outside by OpenGL alone, and here is none.")
+
+    monkeypatch.setattr(fly, "ChaseView", missing)
+    with pytest.raises(SystemExit):
+        fly.fly(fly.FlyConfig(pilot="hover", view="chase", run_dir=str(tmp_path / "new")))
+    assert "by OpenGL alone, and here is none." in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -47,19 +47,23 @@ class OpenGLScene:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = 0
-        option.geomgroup[HALL_GROUP] = 1
-        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
+        self.show(model, data, HALL_GROUP)
+        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
+        self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
+        self._upright = self._buffer[::-1]  # OpenGL's first row is the lowest
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData, *groups: int) -> None:
+        """Put the geoms of these groups into the scene, where the data have them."""
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 0
+        option.geomgroup[list(groups)] = 1
+        option.sitegroup[:] = 0  # the drone's site would stay behind as a ball in mid-air
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = model.camera(CAMERA_NAME).id
         mujoco.mjv_updateScene(model, data, option, mujoco.MjvPerturb(), view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        self._eyes = tuple(self._scene.camera)  # MuJoCo draws from the mean of its two stereo eyes
-        self._buffer = np.empty((camera.height, camera.width, 3), np.uint8)
-        self._upright = self._buffer[::-1]  # OpenGL's first row is the lowest
 
     def draw(self, position: np.ndarray, up: np.ndarray, forward: np.ndarray, out: np.ndarray) -> None:
         """Draw what a camera sees.

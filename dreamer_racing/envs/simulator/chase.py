@@ -1,0 +1,137 @@
+"""Drones seen from outside: a camera follows each of them, drawn by OpenGL without a display.
+
+Shapes: N drones. SI units, world z up.
+"""
+
+from __future__ import annotations
+
+import weakref
+
+import mujoco
+import numpy as np
+
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.simulator.opengl import (
+    GL_LIBRARIES,
+    OpenGLScene,
+    RendererUnavailableError,
+    open_scene,
+    require_library,
+)
+from dreamer_racing.envs.simulator.rendering import RenderThread
+from dreamer_racing.envs.simulator.scene import DRONE_GROUP, HALL_GROUP, Camera, build_scene
+from dreamer_racing.envs.tracks import Track
+
+# choices of this project, for the looks of it
+DISTANCE, HEIGHT = 1.0, 0.35  # m behind and above the drone
+AHEAD = 0.5  # m before the drone, where the camera looks
+BEYOND = 1.5  # m behind the target gate, towards which it looks
+FIELD_OF_VIEW = 70.0  # degrees
+TURNING_TIME = 0.25  # s in which the camera follows a turn
+WALL_MARGIN, FLOOR_MARGIN = 0.1, 0.25  # m
+SAMPLES = 4  # a pixel, for smooth edges
+
+
+class ChaseView:
+    """Draws N drones from outside, each by a camera behind and above it that turns towards the gate to pass next.
+
+    Args:
+        track: the track. Its hall is drawn in nominal colours.
+        parameters: of the drones.
+        num_envs: N.
+        size: width and height of the images, pixels.
+
+    Raises:
+        RendererUnavailableError: neither EGL nor OSMesa works here; the message says why and what helps.
+
+    Example:
+        >>> from dreamer_racing.envs.tracks import load_track
+        >>> view = ChaseView(load_track("circle"), QuadrotorParameters())
+        >>> above_the_start = np.array([[4.0, -2.5, 1.35]])
+        >>> view.draw(above_the_start, np.array([[1.0, 0, 0, 0]]), np.array([0]), np.array([0.0])).shape
+        (1, 256, 256, 3)
+        >>> view.close()
+    """
+
+    def __init__(self, track: Track, parameters: QuadrotorParameters, num_envs: int = 1, size: int = 256) -> None:
+        self._size = size
+        gates = np.array([gate.position for gate in track.gates])
+        self._aims = (gates + BEYOND * track.gate_normals().double().numpy())[:, :2]  # (G, 2)
+        self._low = np.add(track.bounds_low, (WALL_MARGIN, WALL_MARGIN, FLOOR_MARGIN))
+        self._high = np.array(track.bounds_high) - WALL_MARGIN
+        self._heading = np.zeros((num_envs, 2))  # horizontal unit vectors in which the cameras look
+        self._time = np.full(num_envs, np.inf)
+        camera = Camera(width=size, height=size, field_of_view=FIELD_OF_VIEW)
+        spec = build_scene(track, parameters, camera)
+        spec.visual.quality.offsamples = SAMPLES
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._thread = RenderThread("chase")  # the OpenGL context is its own
+        try:
+            self._scene = self._thread.submit(_open, self._model, camera).result()
+        except BaseException:
+            self._thread.end(None)
+            raise
+        self._end = weakref.finalize(self, self._thread.end, self._scene.close)
+        self._end.atexit = False  # contexts are freed at exit as it is
+
+    def draw(self, position: np.ndarray, attitude: np.ndarray, target_gate: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Draw the drones.
+
+        Args:
+            position: (N, 3) m. A drone with a number that is not finite is not drawn: its image is black.
+            attitude: (N, 4) wxyz.
+            target_gate: gates to pass next, (N,) int.
+            time: of each episode, (N,) s, by which the cameras turn. Where it is 0 or runs backwards one begins.
+
+        Returns:
+            uint8 RGB (N, size, size, 3), first row at the top.
+        """
+        self._follow(position, target_gate, time)
+        images = np.zeros((len(position), self._size, self._size, 3), np.uint8)
+        there = np.isfinite(position).all(1) & np.isfinite(attitude).all(1)
+        for index in there.nonzero()[0]:
+            self._thread.submit(
+                self._film, position[index], attitude[index], self._heading[index], images[index]
+            ).result()
+        return images
+
+    def _follow(self, position: np.ndarray, target_gate: np.ndarray, time: np.ndarray) -> None:
+        """Turn the cameras towards the gates, at once where an episode begins."""
+        way = self._aims[target_gate] - position[:, :2]
+        wanted = way / np.linalg.norm(way, axis=1, keepdims=True).clip(1e-9)
+        passed = np.where((time == 0) | (time < self._time), np.inf, time - self._time)
+        share = 1 - np.exp(-passed / TURNING_TIME)
+        turned = (1 - share)[:, None] * self._heading + share[:, None] * np.nan_to_num(wanted)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        self._heading = np.where(length > 1e-3, turned / length.clip(1e-9), self._heading)
+        self._time = time.copy()
+
+    def _film(self, position: np.ndarray, attitude: np.ndarray, heading: np.ndarray, out: np.ndarray) -> None:
+        self._data.qpos[:] = *position, *attitude
+        mujoco.mj_forward(self._model, self._data)
+        self._scene.show(self._model, self._data, HALL_GROUP, DRONE_GROUP)
+        eye = np.clip(np.append(position[:2] - DISTANCE * heading, position[2] + HEIGHT), self._low, self._high)
+        forward = np.append(position[:2] + AHEAD * heading, position[2]) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        self._scene.draw(eye, np.cross(right / np.linalg.norm(right), forward), forward, out)
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._end()
+        self._thread.join()
+
+
+def _open(model: mujoco.MjModel, camera: Camera) -> OpenGLScene:
+    """Make the scene by the first OpenGL library that works."""
+    reasons = []
+    for backend in GL_LIBRARIES:
+        try:
+            require_library(backend)
+            return open_scene(backend, model, camera)
+        except RendererUnavailableError as error:
+            reasons.append(str(error))
+    raise RendererUnavailableError(
+        f"A drone is drawn from outside by OpenGL alone, and here is none. {' '.join(reasons)}"
+    )
