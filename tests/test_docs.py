@@ -64,6 +64,18 @@ def strings(tree: object) -> list[str]:
     return [text for part in inner for text in strings(part)]
 
 
+def sentences(text: str) -> list[str]:
+    """Of paragraphs and list items; code is a word, and code blocks, tables and headings are left out."""
+    text = re.sub(r"```.*?```|^(?:#|\s*\||<!--).*?$", "\n", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"^\s*(?:-|\d+\.) ", "\n\n", text, flags=re.MULTILINE)
+    text = re.sub(r"!?\[([^\[\]]*)\]\([^)]*\)", r"\1", re.sub(r"`[^`]*`", "CODE", text))
+    return [
+        found
+        for part in re.split(r"\n\s*\n", text)
+        for found in re.split(r"(?<=[.!?])[\"*)]*\s+(?=[A-Z0-9\"*(])", part)
+    ]
+
+
 def anchors(page: Path) -> set[str]:
     """Of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
@@ -83,6 +95,24 @@ def test_links_lead_somewhere(page):
         found = (page.parent / file).resolve() if file else page
         assert found.exists(), target
         assert not anchor or found.suffix != ".md" or anchor in anchors(found), target
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "options.md"], ids=lambda page: page.name)
+def test_sentences_are_short(page: Path) -> None:
+    found = sentences(page.read_text(encoding="utf-8"))
+    assert [sentence for sentence in found if len(re.findall(r"\S*\w\S*", sentence)) > 40] == []
+
+
+def test_sentences_are_told_apart() -> None:
+    text = "# A head\n\nOne `a b. C`, [see this](x.md).\nTwo words? *Three*\n\n- an item\n- two\n\n| a |\n```\nx\n```"
+    found = [" ".join(sentence.split()) for sentence in sentences(text)]
+    assert [sentence for sentence in found if sentence] == [
+        "One CODE, see this.",
+        "Two words?",
+        "*Three*",
+        "an item",
+        "two",
+    ]
 
 
 def test_the_page_of_options_is_up_to_date(options):
