@@ -164,9 +164,7 @@ def entry_text(entry: Entry, results: Path) -> str:
         lines.append(f"{wrapped(entry.text)}\n")
     if entry.command:
         lines.append("\n".join(["```bash", *map(wrapped_command, entry.command), "```"]) + "\n")
-    lines.append(wrapped(provenance(entry)) + "\n")
-    if numbers := links(entry, results):
-        lines.append(f"{numbers}\n")
+    lines.append("\n".join(filter(None, (wrapped(provenance(entry)), links(entry, results)))) + "\n")
     pictures = [name for name in entry.files if name.endswith(PICTURES)]
     shown = [f"![{entry.files[name] or name}](../{(place / name).as_posix()})" for name in pictures]
     return "\n".join([*lines, *shown, *([""] if shown else [])])
