@@ -39,6 +39,7 @@ COLUMNS = {
 ROWS = ("training", "evaluation")
 NOTHING = "–"
 EVALUATING = "  evaluating   {bar:24} {n_fmt} of {total_fmt} episodes"
+BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}, {rate_fmt}{postfix}]"
 TEXT: dict[str, Any] = {"total": 0, "bar_format": "{desc}"}
 CLEAR_BELOW, UP = "\r\x1b[J", "\x1b[A"  # of ECMA-48, as terminals know them
 
@@ -57,7 +58,9 @@ class LiveTable:
         self._draws = False
         self._answers: list[str] = []  # that came while something was drawn
         # One update a time at least: otherwise a thread of tqdm's draws, too.
-        self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True, position=0, miniters=1)
+        self._bar = tqdm(total=total, initial=env_steps, unit="step", dynamic_ncols=True, position=0, miniters=1,
+                         bar_format=BAR)  # fmt: skip
+        self._left, self._failing = "", ""
         self._lines = [tqdm(position=number, **TEXT) for number in (1, 2, 3)]
         self._evaluating: tqdm[Any] | None = None
         self._write("", ["env_steps", *COLUMNS], 0)
@@ -66,10 +69,12 @@ class LiveTable:
         self._logging = logging_redirect_tqdm(tqdm_class=cast(Any, self))  # it calls `write`
         self._logging.__enter__()
 
-    def advance(self, env_steps: int) -> None:
-        """Take note of how far the run is; the last rollout may go past the end."""
+    def advance(self, env_steps: int, left: str) -> None:
+        """Take note of how far the run is, where the last rollout may go past the end, and what is left in words."""
         with self._drawing():
             self._bar.total = max(self._bar.total, env_steps)
+            self._left = left
+            self._note(refresh=False)
             self._bar.update(env_steps - self._bar.n)
 
     def show(self, metrics: Mapping[str, float], failing: str = "") -> None:
@@ -79,7 +84,8 @@ class LiveTable:
                 if new := numbers_of(row, metrics):
                     self._write(row, [f"{self._bar.n:,}", *(new.get(word, NOTHING) for word in COLUMNS)], number)
             self._end_evaluation()
-            self._bar.set_postfix_str(f"NOT SAVED: {failing}" if failing else "")
+            self._failing = f"NOT SAVED: {failing}" if failing else ""
+            self._note()
 
     def evaluating(self, episodes: int, total: int) -> None:
         """Show how far an evaluation is."""
@@ -122,6 +128,10 @@ class LiveTable:
             self._draws = False
             while self._answers:
                 self.answer(self._answers.pop())
+
+    def _note(self, refresh: bool = True) -> None:
+        """Write beside the bar how long the run still takes, and what cannot be written."""
+        self._bar.set_postfix_str(", ".join(filter(None, (self._left, self._failing))), refresh)
 
     def _end_evaluation(self) -> None:
         if self._evaluating is not None:

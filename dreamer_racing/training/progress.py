@@ -6,11 +6,11 @@ import contextlib
 import sys
 import time
 from collections.abc import Mapping
-from datetime import timedelta
 from typing import TextIO
 
 from dreamer_racing.training.live_table import LiveTable, numbers_of
 from dreamer_racing.training.signals import say_at_once
+from dreamer_racing.training.time_left import TimeLeft
 
 
 class Progress:
@@ -19,27 +19,32 @@ class Progress:
     Args:
         total: env_steps at the end.
         env_steps: those at the beginning, of a run that is continued.
+        updates: those at the beginning.
         seconds: between two lines of a log.
         shown: whether anything is; where several processes train together, one alone speaks.
 
     Example:
         >>> progress = Progress(total=1000)
-        >>> progress.advance(500)
+        >>> progress.advance(500, updates=10)
         >>> progress.close()
     """
 
-    def __init__(self, total: int, env_steps: int = 0, seconds: float = 30.0, shown: bool = True) -> None:
+    def __init__(
+        self, total: int, env_steps: int = 0, updates: int = 0, seconds: float = 30.0, shown: bool = True
+    ) -> None:
         self._total, self._seconds, self._shown = total, seconds, shown
         self._env_steps = env_steps
+        self._left = TimeLeft(total, env_steps, updates)
         self._evaluated = ""  # the latest evaluation, in every line until the next
         self._since, self._from = time.monotonic(), env_steps  # of the latest line
         self._table = LiveTable(total, env_steps) if shown and sys.stderr.isatty() else None
 
-    def advance(self, env_steps: int) -> None:
-        """Take note of how far the run is."""
+    def advance(self, env_steps: int, updates: int) -> None:
+        """Take note of how far the run is, and how many updates it has made."""
         self._env_steps = env_steps
+        self._left.advance(env_steps, updates)
         if self._table is not None:
-            self._table.advance(env_steps)
+            self._table.advance(env_steps, str(self._left))
 
     def show(self, metrics: Mapping[str, float], unsaved: Mapping[str, int] | None = None) -> None:
         """Show the latest numbers, and what cannot be written since which env_steps."""
@@ -56,6 +61,7 @@ class Progress:
 
     def evaluating(self, episodes: int, total: int) -> None:
         """Show how far an evaluation is, until there are numbers to show; a log has no use for it."""
+        self._left.disturb()
         if self._table is not None:
             self._table.evaluating(episodes, total)
 
@@ -88,9 +94,7 @@ class Progress:
     def _write_line(self, numbers: str) -> None:
         now = time.monotonic()
         speed = (self._env_steps - self._from) / (now - self._since)
-        remaining = max(0, self._total - self._env_steps)  # the last rollout may go past the end
-        left = timedelta(seconds=round(remaining / speed)) if speed else "unknown time"
-        done = f"{self._env_steps:,} of {self._total:,} env_steps, {speed:.0f}/s, {left} to go"
+        done = f"{self._env_steps:,} of {self._total:,} env_steps, {speed:.0f}/s, {self._left}"
         _write(f"{done}: {numbers}", sys.stderr)
         self._since, self._from = now, self._env_steps
 

@@ -247,7 +247,7 @@ class Session:
         """Account for a rollout that is about to be delivered, and see what is due after it."""
         if rollout is not None:
             self.counters["env_steps"] += rollout.numel() * parallel.count()
-            self._progress.advance(self.env_steps)
+            self._progress.advance(self.env_steps, self.counters["updates"])
         by_steps = self._periods.due("save", self.env_steps)
         by_minutes = parallel.agreed(self._minutes.due())  # both take note
         self._saves = saves or by_steps or by_minutes
@@ -388,7 +388,8 @@ class Session:
         self.began = True
         self._stop = self._stack.enter_context(graceful_exit())
         total, shown = self.config.total_env_steps, parallel.is_first()
-        self._progress = self._stack.enter_context(Progress(total, self.env_steps, shown=shown))
+        begun = self.env_steps, self.counters["updates"]
+        self._progress = self._stack.enter_context(Progress(total, *begun, shown=shown))
         self._stop.say = self._progress.answer
         self.say, self.evaluator.on_episode = self._progress.say, self._progress.evaluating
         self.evaluator.attempt = self.attempt

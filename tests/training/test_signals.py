@@ -61,7 +61,7 @@ with GracefulExit("saving") as stop, Progress(total=1000) as progress:
     while not stop.requested:
         time.sleep(0.01)
     for number in range(20):
-        progress.advance(number)
+        progress.advance(number, updates=0)
         progress.show({"episode/return": 1.0})
         progress.say("saved")
         print("saved", flush=True)
