@@ -8,6 +8,7 @@ import inspect
 import json
 import pkgutil
 import re
+import shlex
 from pathlib import Path
 from types import ModuleType
 
@@ -101,6 +102,31 @@ def test_links_lead_somewhere(page):
 def test_sentences_are_short(page: Path) -> None:
     found = sentences(page.read_text(encoding="utf-8"))
     assert [sentence for sentence in found if len(re.findall(r"\S*\w\S*", sentence)) > 40] == []
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """The recipes that a page starts, in blocks and within lines, and their settings."""
+    code = re.findall(r"```\w*\n(.*?)```|`([^`\n]+)`", text.replace("\\\n", " "), flags=re.DOTALL)
+    found = re.findall(r"(?<!tests/)recipes/([a-z_0-9]+)\.py(.*)", "\n".join(map("".join, code)))
+    words = ((name, shlex.split(given, comments=True)) for name, given in found)
+    return [(name, [word for word in given if re.match(r"[\w.+~-]+=|--", word)]) for name, given in words]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.name not in ("results.md", "CHANGELOG.md")],  # which are of older commits, too
+    ids=lambda page: page.name,
+)
+def test_commands_name_settings_that_there_are(page: Path) -> None:
+    known = module_of("recipes", "composing.options")
+    for name, given in commands(page.read_text(encoding="utf-8")):
+        assert (ROOT / "recipes" / f"{name}.py").is_file(), name
+        known.refuse_slips(name, given)
+
+
+def test_commands_are_found_with_their_settings() -> None:
+    text = "```bash\n./dev python recipes/fly.py agent=a \\\n  view=x  # b=1\n```\nOr `recipes/plot.py runs='r/*'` b=1."
+    assert commands(text) == [("fly", ["agent=a", "view=x"]), ("plot", ["runs=r/*"])]
 
 
 def test_sentences_are_told_apart() -> None:
