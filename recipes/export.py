@@ -14,6 +14,7 @@ import json
 import logging
 import shlex
 import sys
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -68,8 +69,10 @@ register()
 def main(config: DictConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
     start_logging()
-    # Its exporter says four times that torchvision is not installed, which nothing here needs.
+    # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of its
+    # own that it copies.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning, r"copyreg$")
     set_num_threads(1)
     try:
         with plain_errors():

@@ -111,8 +111,8 @@ class Actor(nn.Module):
         self.raw_std = None if state_std else nn.Parameter((first - STD_SHIFT).repeat(action_dim))
         self.few_kernels = False
         self.action_dim = action_dim
-        shift = torch.tensor([0.0, STD_SHIFT]).repeat_interleave(action_dim)
-        self.shift = nn.Buffer(shift if state_std else shift[:action_dim], persistent=False)  # of the network's output
+        shift = torch.tensor([0.0, STD_SHIFT] if state_std else [0.0]).repeat_interleave(action_dim)
+        self.shift = nn.Buffer(shift, persistent=False)  # of the network's output
         self.min_std = nn.Buffer(torch.tensor(float(min_std)))
         self.max_std = nn.Buffer(torch.tensor(float(max_std)))
 
