@@ -27,8 +27,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
-WIDTH = 118
-BRIEF = "Shown on other pages"
+WIDTH = 128
+BRIEF = "In brief"
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
@@ -37,8 +37,9 @@ page. [What we know](what_we_know.md) says what follows, and [figures](figures.m
 of earlier defaults, are in the tree of commit 3c460b3.
 
 A command runs at the commit below it. Until 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`, so
-commands of older results name that one. Where nothing is said, flights are deterministic: by the policy's mean. Files
-of metrics hold the rows with evaluations and every fourth to twentieth of the others.
+commands of older results name that one. Flights of 100 randomised starts are by `python recipes/evaluate.py
+checkpoint=runs/RUN episodes=100 num_envs=100 start_noise=1 seed=7`, deterministic unless sampling is said. Files of
+metrics hold the rows with evaluations and every fourth to twentieth of the others.
 """
 
 
@@ -172,7 +173,8 @@ def entry_text(entry: Entry, results: Path) -> str:
 
 def brief_text(entry: Entry, results: Path) -> str:
     """Draw an entry as an item of a list."""
-    commands = "; ".join(f"`{command.partition('  # ')[0]}`" for command in entry.command)
+    parts = (command.partition("  # ") for command in entry.command)
+    commands = "; ".join(f"`{command}`" + (f" ({remark})" if remark else "") for command, _, remark in parts)
     said = " ".join(filter(None, (f"**{entry.title}**.", entry.text, f"{commands}." if commands else "")))
     text = wrapped(f"- {said} {provenance(entry)}")
     return "\n".join([text.replace("\n", "\n  "), *([f"  {numbers}"] if (numbers := links(entry, results)) else [])])

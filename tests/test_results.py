@@ -85,9 +85,9 @@ def test_cells_may_say_what_they_show(results, folder):
 
 
 def test_brief_entries_are_a_list_at_the_end(results, folder):
-    change(folder, brief=True, text="What it is.", command="python x.py")
+    change(folder, brief=True, text="What it is.", command="python x.py  # and y.py")
     page = results.make_page(folder)
-    assert "- **One: a result**. What it is. `python x.py`. Commit: c1; c2." in page and "## One" not in page
+    assert "- **One: a result**. What it is. `python x.py` (and y.py). Commit: c1; c2." in page and "## One" not in page
 
 
 def test_commands_are_not_broken_within_quotes(results):
@@ -101,7 +101,7 @@ def test_long_lines_are_broken_and_tables_are_not(results, folder):
     row = "|" + " a |" * 100
     change(folder, text=f"{'word ' * 100}\n\n{row}", command=f"python x.py {'option=value ' * 30}")
     lines = results.make_page(folder).splitlines()
-    assert row in lines and max(len(line) for line in lines if line != row and "Numbers:" not in line) <= 120
+    assert row in lines and max(len(line) for line in lines if line != row and "Numbers:" not in line) <= 128
     assert any(line.startswith("    option=value") for line in lines)
 
 
