@@ -52,7 +52,7 @@ class PlotConfig:
     runs: Any = "runs"
     figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
     output: str = "figures"  # folder
-    quantities: list[str] = field(default_factory=lambda: ["return"])  # rows: names in dreamer_racing/figures/curves.py
+    quantities: Any = field(default_factory=lambda: ["return"])  # rows, one or a list: dreamer_racing/figures/curves.py
     aggregate: Aggregate = Aggregate.mean  # mean (and standard deviation) | iqm (and 95 % bootstrap interval)
     axis: str = "env_steps"  # of the curves: env_steps | hours (wall clock) | core_hours (CPU time)
     # of the curves' running mean, in units of their axis; null: 2 % of the longest run
@@ -65,6 +65,7 @@ class PlotConfig:
 
 logger = logging.getLogger(__name__)
 
+LISTS = ("quantities", "flights", "dreams")  # settings that take one or several
 VIDEO_SLOWER = 2  # than the flight, so that one can look
 FLIGHTS = ("last", "best")  # of the evaluations of a run
 
@@ -79,12 +80,12 @@ class Drawn(NamedTuple):
 
 
 def draw(config: PlotConfig) -> None:
-    """Make one figure, or all for which there is something to draw.
+    """Make one figure, or all for which there is something to draw; of flights or dreams by name alone, theirs.
 
     Raises:
         ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
-    config = replace(config, flights=as_list(config.flights), dreams=as_list(config.dreams))
+    config = replace(config, **{name: as_list(getattr(config, name)) for name in LISTS})
     check_plot(config)
     output = ensure_writable(config.output, "output")
     places = as_list(config.runs)
@@ -93,13 +94,15 @@ def draw(config: PlotConfig) -> None:
         draw_curves(read_curves(places[0]), output)
         logger.info("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
-    explicit = {"trajectories": config.flights, "imagined": config.dreams}.get(config.figure)
-    asked = FIGURES.values() if config.figure == "all" else [FIGURES[config.figure]]
-    columns = {column for figure in asked for column in figure.columns(config)}
-    runs, problems = ([], []) if explicit else read_runs(find_runs(places), columns)
+    named = [name for name, files in (("trajectories", config.flights), ("imagined", config.dreams)) if files]
+    asked = list(FIGURES) if config.figure == "all" else [config.figure]
+    if config.figure == "all" and named and config.runs == PlotConfig().runs:
+        asked = named
+    columns = {column for name in asked for column in FIGURES[name].columns(config)}
+    runs, problems = ([], []) if set(asked) <= set(named) else read_runs(find_runs(places), columns)
     warn(problems)
     if config.figure == "all":
-        draw_all(config, output, runs, problems)
+        draw_all(config, output, runs, problems, asked)
     elif not draw_one(config.figure, config, output, runs, problems):
         raise ValueError(f"figure={config.figure}: none of these runs has stored anything for it.")
 
@@ -146,7 +149,7 @@ def check_plot(config: PlotConfig) -> None:
     wanted_columns(config.quantities, config.axis)
 
 
-def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> None:
+def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str], names: Iterable[str]) -> None:
     """Make every figure for which there is something to draw; one that fails does not cost the others.
 
     Raises:
@@ -155,7 +158,7 @@ def draw_all(config: PlotConfig, output: Path, runs: list[RunData], problems: li
     """
     drawn = False
     failures: dict[str, Exception] = {}
-    for name in FIGURES:
+    for name in names:
         try:
             drawn |= draw_one(name, config, output, runs, problems)
         except Exception as error:

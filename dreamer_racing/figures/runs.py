@@ -24,6 +24,10 @@ from dreamer_racing.training.metrics import MetricsTable, read_metrics
 DEFAULT_ALGORITHM = "dreamer_v3"  # of configurations from before there was a choice
 PPO_ACTORS = ("flown_ppo", "latent_ppo", "asymmetric_ppo")
 """Values of loss.actor of what is the algorithm latent_ppo, in runs from before it had its name."""
+LOGGED_BY = (
+    ("imagined_reward", "dreamer_v3"), ("loss_dynamics", "latent_ppo"), ("alpha", "sac"), ("clip_fraction", "ppo"),
+)  # fmt: skip
+"""Columns of `metrics.csv` that one algorithm alone has, or none before it in this order."""
 REFERENCE = "default"  # the variant that others are compared with; so is one without a name
 SAME_CURVE = (
     "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
@@ -130,14 +134,17 @@ def is_metrics(path: Path) -> bool:
 
 
 def _key_of_table(path: Path) -> CurveKey:
-    """Read off the name `metrics_<track>_<variant>_seed<k>.csv` what it says; who learned, it does not say."""
+    """Read off the name `metrics_<track>_<variant>_seed<k>.csv` what it says, and off its columns who learned."""
     words = re.sub(r"^metrics_?|(?:^|_)seed\d+", "", path.stem)
     track = next(
         (name for name in sorted(BUILTIN_TRACKS, key=len, reverse=True) if re.search(rf"(?:^|_){name}(?:_|$)", words)),
         "unknown",
     )
     rest = re.sub(rf"(?:^|_){track}(?=_|$)", "", words).strip("_")
-    return CurveKey(track, "", " ".join(filter(None, (path.absolute().parent.name, rest))))
+    with path.open(encoding="utf-8", errors="replace") as file:
+        columns = file.readline().strip().split(",")
+    algorithm = next((name for column, name in LOGGED_BY if column in columns), "")
+    return CurveKey(track, algorithm, " ".join(filter(None, (path.absolute().parent.name, rest))))
 
 
 def find_runs(places: Sequence[str | Path]) -> list[Path]:

@@ -460,6 +460,19 @@ def test_tables_that_results_keep_are_drawn_by_their_names(tmp_path):
     assert [at(curve, 2000)[0] for curve in learning_curves(runs).curves] == [10.0, 10.0]
 
 
+def test_the_columns_of_a_table_say_who_learned():
+    """Of those that results keep: what their pages say trained them."""
+    results = Path(__file__).parents[2] / "results"
+    for name, algorithm in (
+        ("dreaming/metrics_circle_seed0.csv", "dreamer_v3"),
+        ("held/metrics_kidney_seed1.csv", "latent_ppo"),
+        ("baselines_from_pixels/metrics_sac.csv", "sac"),
+        ("split_s/metrics_ppo_state.csv", "ppo"),
+    ):
+        ((run,), _) = read_runs(find_runs([results / name]), ["episode/return"])
+        assert run.key.algorithm == algorithm
+
+
 def test_a_short_run_is_drawn_without_steps():
     steps = np.arange(1.0, 21.0) * 500
     grid = np.linspace(500, 10_000, 240)

@@ -78,12 +78,16 @@ def test_a_single_flight_and_what_an_evaluation_after_training_left_are_drawn(ru
     evaluations = runs / "runs" / "dreamer_v3_circle_paper_seed0" / "evaluations"
     done = plot(f"flights={evaluations}/000001000_trajectory.csv", "figure=trajectories", "output=one", cwd=runs)
     assert done.returncode == 0 and (runs / "one" / "trajectories.png").is_file(), done.stderr
+    (runs / "elsewhere").mkdir()
+    done = plot(f"flights={evaluations}/000001000_trajectory.csv", cwd=runs / "elsewhere")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (runs / "elsewhere" / "figures").iterdir()} == {"trajectories.png"}
     after = evaluations.parent / "evaluation"
     after.mkdir()
     evaluations.rename(after / "evaluations")
     for file in (after / "evaluations").glob("000001000*"):
         file.rename(file.with_name(file.name.replace("000001000", "deterministic")))
-    done = plot(f"runs={after.parent}", "output=after", cwd=runs)
+    done = plot(f"runs={after.parent}", "output=after", "quantities=gates", cwd=runs)
     made = {path.name for path in (runs / "after").iterdir()}
     assert {"trajectories.png", "imagined_dreamer_v3_circle_paper_seed0.png"} <= made, done.stderr
 
