@@ -65,7 +65,6 @@ class PlotConfig:
 
 logger = logging.getLogger(__name__)
 
-LISTS = ("quantities", "flights", "dreams")  # settings that take one or several
 VIDEO_SLOWER = 2  # than the flight, so that one can look
 FLIGHTS = ("last", "best")  # of the evaluations of a run
 
@@ -85,7 +84,8 @@ def draw(config: PlotConfig) -> None:
     Raises:
         ValueError: bad setting, the figure asked for cannot be drawn, or none of all.
     """
-    config = replace(config, **{name: as_list(getattr(config, name)) for name in LISTS})
+    lists = {name: as_list(getattr(config, name)) for name in ("quantities", "flights", "dreams")}
+    config = replace(config, **lists)  # type: ignore[arg-type]
     check_plot(config)
     output = ensure_writable(config.output, "output")
     places = as_list(config.runs)
