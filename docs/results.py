@@ -181,9 +181,11 @@ def brief_text(entry: Entry, results: Path) -> str:
 
 
 def provenance(entry: Entry) -> str:
-    """Say where an entry comes from."""
+    """Say where an entry comes from; an item of the list leaves out the time that was not recorded."""
     facts: dict[str, str | None] = {} if entry.command else {"Command": None}
     facts |= {"Commit": entry.commit, "Machine": entry.machine, "Time": entry.wall_clock}
+    if entry.brief and not entry.wall_clock:
+        del facts["Time"]
     return " ".join(f"{name}: {value or NOT_RECORDED}." for name, value in facts.items())
 
 
