@@ -69,8 +69,8 @@ register()
 def main(config: DictConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
     start_logging()
-    # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of its
-    # own that it copies.
+    # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of
+    # its own that it copies.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning, r"copyreg$")
     set_num_threads(1)
