@@ -338,13 +338,15 @@ def check_workers(config: WorldModelRunConfig) -> None:
 
 ACTORS_OF_BEFORE = {"latent_ppo": "latent", "asymmetric_ppo": "state"}
 """What the critic sees of actors that were losses of DreamerV3 before they were an algorithm."""
+OF_COLLECTED = ("clipped",)
+"""Objectives of collected steps; the others are of imagined ones."""
 
 
 def check_actor(config: WorldModelRunConfig) -> None:
-    """Refuse an objective that there is not.
+    """Refuse an objective that there is not, or of steps that the algorithm does not take.
 
     Raises:
-        ValueError: the message names those that there are, and the recipe of what is an algorithm of its own now.
+        ValueError: the message names those that there are, or the recipe of the algorithm that takes it.
     """
     actor = config.loss.actor  # type: ignore[attr-defined]
     if actor in ACTORS_OF_BEFORE:
@@ -353,6 +355,10 @@ def check_actor(config: WorldModelRunConfig) -> None:
             f"loss.critic={ACTORS_OF_BEFORE[actor]}."
         )
     find_objective(actor)
+    takes = "latent_ppo" if actor in OF_COLLECTED else "dreamer_v3"
+    if ":" not in actor and config.algorithm != takes:
+        steps = "collected" if actor in OF_COLLECTED else "imagined"
+        raise ValueError(f"loss.actor={actor} learns from {steps} steps: recipes/{takes}.py takes it.")
 
 
 def check_schedule(config: WorldModelRunConfig) -> None:

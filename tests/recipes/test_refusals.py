@@ -46,6 +46,11 @@ REFUSED = [
     (["env.looks=pretty", "env.from_pixels=true"], ["pretty", "nominal", "randomised"]),
     (["env.looks=randomised", "env.from_pixels=false"], ["env.looks=randomised", "nominal"]),
     (["loss.actor=magic"], ["magic", "reinforce"]),
+    (["loss.actor=clipped"], ["loss.actor=clipped learns from collected steps: recipes/latent_ppo.py takes it"]),
+    (
+        ["loss.critic=latent", "loss.actor=reinforce"],
+        ["loss.actor=reinforce learns from imagined steps: recipes/dreamer_v3.py takes it"],
+    ),
     (["loss.actor=flown_ppo"], ["'flown_ppo' is gone", "the algorithm latent_ppo"]),
     (["model.replay_ratio=0"], ["model.replay_ratio=0", "above 0"]),
     (["model.replay_ratio=inf"], ["model.replay_ratio=inf", "above 0, and finite"]),
