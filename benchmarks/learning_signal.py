@@ -3,11 +3,11 @@
     python benchmarks/learning_signal.py runs/circle --json learning_signal.json
 
 * `returns`: the stochastic policy flies N worlds of its training environment for K steps, at a body-rate weight b₂ of
-  0. From every eighth step it also imagines H steps, H the learner's horizon, beginning at the latents with which it
-  flew. `reward` is the sum until a crash, in the world and imagined; `crash` the share that crashed; `value_end` the
-  critic's value of where that led, 0 after a crash; `return` the λ-return, with `return_correlation` between the two
-  over all starts. `value` is the critic's mean on the first half of the flights, `monte_carlo` the mean discounted sum
-  of what was paid until the episode's or the flight's end: γ to the power of K / 2 or less of it is cut off.
+  0. From every eighth step it also imagines H steps, beginning at the latents with which it flew. `reward` is the sum
+  until a crash, in the world and imagined; `crash` the share that crashed; `value_end` the critic's value of where that
+  led, 0 after a crash; `return` the λ-return, with `return_correlation` between the two over all starts. `value` is the
+  critic's mean on the first half of the flights, `monte_carlo` the mean discounted sum of what was paid until the
+  episode's or the flight's end: γ to the power of K / 2 or less of it is cut off.
 * `gradient`: at the present actor, by each of the two objectives of imagined steps, from `starts` latents of the run's
   own replay as many as an update imagines from, and from eight times as many: `cosine` between gradients from
   independent draws, `signal` power over noise power, and `seconds` of the process for one; `agreement` is the cosine
@@ -17,13 +17,14 @@
   on, or flown, from the policy at what the model makes of it now; mean and quantiles, `of` windows of the newest
   records (`replay.recent_share`) and of those drawn from all, which the model has mostly not seen for long.
 
-The trained weights are measured, not the averaged ones. Where the checkpoint holds no replay, as `best/`, say
-`--only returns`.
+H is the learner's horizon, or that of ``--horizon``. The trained weights are measured, not the averaged ones. Where the
+checkpoint holds no replay, as `best/`, say ``--only returns``.
 """
 
 import argparse
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -54,14 +55,18 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
+    parser.add_argument("--horizon", type=int, help="H; without: the learner's")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:
         trained = restore(path)
+        if arguments.horizon:
+            trained.learner.config = replace(trained.learner.config, imagination_horizon=arguments.horizon)
         torch.manual_seed(0)
         for record in measure(trained, arguments.only, arguments.num_envs, arguments.steps):
-            records.append({"benchmark": "learning_signal", **trained.where, **record})
+            where = trained.where | {"horizon": trained.learner.horizon}
+            records.append({"benchmark": "learning_signal", **where, **record})
             print_table([{"name": name, "value": value} for name, value in records[-1].items()], ("name", "value"))
             write_json(records, arguments.json)
 
