@@ -54,6 +54,7 @@ from dreamer_racing.training.directory import EVALUATION
 
 GIF_SIZE = 256  # pixels, least side of either picture
 GIF_STRIDE = 2  # control steps a frame: 25 frames a second
+CHASE_STRIDE, CHASE_COLORS = 3, 32  # of the GIF from outside, in which everything moves
 PILOT, TRACK, PRESET = "scripted", "kidney", "easy"  # without an agent
 VIEWS = ("map", "chase")
 GIF_STEPS = 300  # control steps shown if there is no second lap
@@ -298,9 +299,9 @@ def film_from_outside(directory: Path, view: ChaseView, track: Track, trajectory
     view.close()
     filmed = write_video(directory / "chase.mp4", caption(frames, words), fps=1 / trajectory.control_dt, scale=1)
     first, last = second_lap(trajectory)
-    shown = slice(first, last + 1, GIF_STRIDE)
+    shown = slice(first, last + 1, CHASE_STRIDE)
     gif = caption(frames[shown], words[shown])
-    size = write_gif(directory / "chase.gif", gif, fps=1 / (GIF_STRIDE * trajectory.control_dt))
+    size = write_gif(directory / "chase.gif", gif, fps=1 / (CHASE_STRIDE * trajectory.control_dt), colors=CHASE_COLORS)
     print(f"{'from outside':<18} {directory}: {'chase.mp4, ' if filmed else ''}chase.gif ({size / 1e6:.2f} MB)")
 
 
