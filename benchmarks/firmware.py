@@ -101,7 +101,7 @@ def fly(name: str, track: str, flights: int, firmware: SteppedFirmware | None) -
             if vehicle.armed:
                 top.append(float(np.linalg.norm(vehicle.pose().linear_velocity)))
 
-        step.sleep_until = note  # type: ignore[method-assign]
+        step.sleep_until = note  # type: ignore[method-assign]  # to see each step
         ended = step.fly(chain, flyer.rate, PATIENCE)
         chain.close()
         finished = ended == "disarmed: the flight is over" and len(vehicle.lap_times) == LAPS

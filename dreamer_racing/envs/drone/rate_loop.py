@@ -33,7 +33,7 @@ class Row(enum.IntEnum):
     DTERM_LPF2 = 6  # what D sees
     P = 7  # lowpassed about yaw
     RELAX = 8  # deg/s, lowpassed setpoint
-    I = 9  # noqa: E741
+    I = 9  # noqa: E741 - the letter of PID
     BOOST_1 = 10  # share by which D is raised, lowpassed
     BOOST_2 = 11
     THROTTLE = 12  # held, as of the step before, steps until the next frame
@@ -44,7 +44,7 @@ class Own(enum.IntEnum):
     """What may differ between drones: rows of three numbers."""
 
     P = 0  # relative, by axis
-    I = 1  # noqa: E741
+    I = 1  # relative, by axis  # noqa: E741 - the letter of PID
     D = 2
     FILTERS = 3  # relative: cut-offs of gyro, of D, unused
     MOTORS = 4  # decay of a physics step, of half a step, share of thrust that the battery loses at full load

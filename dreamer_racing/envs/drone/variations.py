@@ -76,7 +76,7 @@ def vary(base: T, changes: Mapping[str, Any]) -> T:
     Raises:
         ValueError: There is no such field, or a value is not allowed.
     """
-    names = sorted({field.name for field in dataclasses.fields(base)} - {KEPT})  # type: ignore[arg-type]
+    names = sorted({field.name for field in dataclasses.fields(base)} - {KEPT})  # type: ignore[arg-type]  # a dataclass, of any kind
     values: dict[str, Any] = {}
     for name, value in changes.items():
         if name not in names:
@@ -88,4 +88,4 @@ def vary(base: T, changes: Mapping[str, Any]) -> T:
             values[name] = vary(before, value)
         else:
             values[name] = tuple(value) if isinstance(value, list) else value
-    return dataclasses.replace(base, **values)  # type: ignore[type-var]
+    return dataclasses.replace(base, **values)  # type: ignore[type-var]  # likewise
