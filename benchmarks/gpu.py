@@ -6,9 +6,9 @@
     python benchmarks/gpu.py --page results/gpu.jsonl                        # no measuring: writes docs/benchmarks.md
 
 Every job of a stage is a process of its own with a limit in seconds; what it measures is appended to the file as lines
-of JSON at once. A job that fails or takes too long leaves a line that says so, and the next one begins. Started again
-with the same file, jobs that were done are left out, and the training goes on where it was. Compiled kernels are kept
-in the folder `--caches`.
+of JSON at once. A job that fails or takes too long leaves a line that says so, and the next one begins; all that it
+printed is in `failed.log` in the folder `--caches`, where compiled kernels are kept, too. Started again with the same
+file, jobs that were done are left out, and the training goes on where it was.
 
 `probe`: versions, speed of a matrix product (8192³ in bfloat16) and of a copy. `env`: steps of the worlds eager, and as
 a CUDA graph, which must fly as the eager ones do. `learner`: a captured update learns; held-out metrics, a checkpoint
@@ -130,16 +130,26 @@ def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
         process = subprocess.run(
             [sys.executable, *job.command], cwd=ROOT, env=environment, timeout=limit, capture_output=True, text=True
         )
-    except subprocess.TimeoutExpired:
+    except subprocess.TimeoutExpired as late:
+        keep_output(caches, job, late.stdout, late.stderr)
         why = f"more than {limit:.0f} s{'; it goes on the next time' if job.stage == 'train' else ''}"
         return {"state": "too long", "why": why}
     lines = process.stdout.strip().splitlines()
     if process.returncode:
+        keep_output(caches, job, process.stdout, process.stderr)
         said = (process.stderr or process.stdout).strip().splitlines()
         return {"state": "failed", "why": said[-1] if said else f"status {process.returncode}"}
     if "--measure" in job.command:
         return {"state": "done", **json.loads(lines[-1])}
     return {"state": "done", "said": lines[-1] if lines else ""}
+
+
+def keep_output(caches: Path, job: Job, *outputs: str | bytes | None) -> None:
+    """Add what a job printed to the log of those that failed; one that took too long left bytes, or nothing."""
+    caches.mkdir(parents=True, exist_ok=True)
+    texts = [each.decode(errors="replace") if isinstance(each, bytes) else each or "" for each in outputs]
+    with (caches / "failed.log").open("a", encoding="utf-8") as log:
+        log.write("\n".join([f"--- {job.stage} {job.name}: {' '.join(job.command)}", *texts, ""]))
 
 
 def read(results: Path) -> list[dict[str, Any]]:

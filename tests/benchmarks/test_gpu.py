@@ -48,6 +48,7 @@ def test_what_fails_or_takes_too_long_says_so(tmp_path: Path) -> None:
     assert gpu.attempt(failing, 60.0, tmp_path) == {"state": "failed", "why": "no kernel image is available"}
     endless = gpu.Job("speed", "two", 60.0, ["-c", "import time; time.sleep(60)"])
     assert gpu.attempt(endless, 0.2, tmp_path) == {"state": "too long", "why": "more than 0 s"}
+    assert "no kernel image is available" in (tmp_path / "failed.log").read_text()
 
 
 def test_a_failed_job_stops_no_other_and_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
