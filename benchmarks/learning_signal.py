@@ -24,7 +24,6 @@ checkpoint holds no replay, as `best/`, say ``--only returns``.
 import argparse
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -62,7 +61,7 @@ def main() -> None:
     for path in arguments.checkpoints:
         trained = restore(path)
         if arguments.horizon:
-            trained.learner.config = replace(trained.learner.config, imagination_horizon=arguments.horizon)
+            trained.learner.adjust(imagination_horizon=arguments.horizon)
         torch.manual_seed(0)
         for record in measure(trained, arguments.only, arguments.num_envs, arguments.steps):
             where = trained.where | {"horizon": trained.learner.horizon}

@@ -152,6 +152,19 @@ class DreamerV3(WorldModelLearner):
                 "value_error": (expected - returns).abs().mean(),
             }
 
+    def adjust(self, *, imagination_horizon: float | None = None, **numbers: Any) -> None:
+        """Change what a run may have on a schedule, from the next update on; as `WorldModelLearner.adjust`.
+
+        Args:
+            imagination_horizon: H, rounded; a CUDA graph is captured again where it changes.
+            numbers: Others.
+        """
+        super().adjust(**numbers)
+        if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
+            self.horizon = round(imagination_horizon)
+            if self._graph is not None:
+                self._graph = self._make_graph()
+
     def _continuation(self, features: Tensor) -> Tensor:
         """Return the probability ``(..., 1)`` that the episode goes on after features ``(..., F)``."""
         if not self.loss_config.continuation:

@@ -54,6 +54,7 @@ class WorldModelLearner(ABC):
         averaged: A copy of the agent whose weights are averages, if they are kept.
         discount: γ, a scalar; ``adjust`` moves it.
         entropy_scale: Weight of the actor's entropy, a scalar; likewise.
+        horizon: H, imagined actions from each start.
         updates: Made so far.
 
     Raises:
@@ -81,6 +82,7 @@ class WorldModelLearner(ABC):
             save_kernels(nn.ModuleList([agent, *self.own_networks.values()]))
         self.averaged = None if self.config.average_rate is None else copy.deepcopy(agent).requires_grad_(False)
         self.latents: TensorDictBase | None = None
+        self.horizon = self.config.imagination_horizon
         self.updates = 0
         self._trained = self._parameters()
         self.optimizer = self._make_optimizer()
@@ -169,11 +171,6 @@ class WorldModelLearner(ABC):
     def size(self) -> ModelSize:
         """Of the networks."""
         return self.agent.size
-
-    @property
-    def horizon(self) -> int:
-        """H, imagined actions from each start."""
-        return self.config.imagination_horizon
 
     @property
     def latent_format(self) -> LatentFormat:

@@ -18,6 +18,7 @@ from composing.schema import (
     LOSS_RAMPS,
     RECIPES,
     CollectorKind,
+    DreamerV3RunConfig,
     ExperimentConfig,
     LatentPPORunConfig,
     PPORunConfig,
@@ -375,6 +376,8 @@ def check_schedule(config: WorldModelRunConfig) -> None:
     }
     if isinstance(config, LatentPPORunConfig):
         targets["kl_target"] = allowed_values(config.loss.ppo, "kl_target")
+    if isinstance(config, DreamerV3RunConfig):
+        targets["imagination_horizon"] = allowed_values(config.model, "imagination_horizon")
     for name, allowed in targets.items():
         ramp = getattr(config.schedule, name)
         ramp.check(f"schedule.{name}")

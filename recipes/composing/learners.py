@@ -55,6 +55,8 @@ def make_schedule(config: WorldModelRunConfig, env: Environment | None = None) -
             ramps[name] = (getattr(loss, name), ramp)
     if isinstance(config, LatentPPORunConfig) and (kl_target := config.loss.ppo.kl_target) is not None:
         ramps["kl_target"] = (kl_target, config.schedule.kl_target)
+    if isinstance(config, DreamerV3RunConfig) and config.schedule.imagination_horizon.to is not None:
+        ramps["imagination_horizon"] = (config.model.imagination_horizon, config.schedule.imagination_horizon)
     if schedule.start_on_line.to is not None:
         ramps["start_on_line"] = (config.env.start_on_line, schedule.start_on_line)
     num_gates = env.track.num_gates if isinstance(env, DroneRacingEnv) else 0

@@ -165,6 +165,13 @@ class ScheduleConfig:
 
 
 @dataclass
+class DreamerV3ScheduleConfig(ScheduleConfig):
+    """And of what is imagined."""
+
+    imagination_horizon: Ramp = field(default_factory=Ramp)  # model.imagination_horizon, rounded
+
+
+@dataclass
 class LatentPPOScheduleConfig(ScheduleConfig):
     """And of an actor that learns from what was collected."""
 
@@ -274,6 +281,7 @@ class DreamerV3RunConfig(WorldModelRunConfig):
 
     algorithm: str = "dreamer_v3"
     loss: DreamerV3Losses = field(default_factory=DreamerV3Losses)
+    schedule: DreamerV3ScheduleConfig = field(default_factory=DreamerV3ScheduleConfig)
 
 
 @dataclass
