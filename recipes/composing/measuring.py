@@ -18,11 +18,7 @@ WINDOWS, RECORDS = 32, 2_000
 
 
 def measure(
-    session: Session,
-    config: WorldModelRunConfig,
-    learner: WorldModelLearner,
-    replay: StreamReplay,
-    scheduled: Mapping[str, float],
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
 ) -> dict[str, Tensor | float]:
     """Return hyperparameters as they are now, and what the model makes of the newest records not trained on."""
     groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)

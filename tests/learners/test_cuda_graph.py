@@ -92,6 +92,8 @@ def test_after_the_capture_a_learner_is_measured_saved_and_flown(tmp_path: Path)
     course.close()
     assert learner.update(batch("cuda"))["loss"].isfinite(), "the graph still replays"
     assert other.update(batch("cuda"))["loss"].isfinite()
+    other.adjust(imagination_horizon=2)
+    assert other.update(batch("cuda"))["loss"].isfinite(), "what is scheduled is captured anew"
 
 
 @pytest.mark.gpu

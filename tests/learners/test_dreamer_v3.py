@@ -392,6 +392,21 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
         learner.adjust(world_model_rate=0.1)
 
 
+def test_the_horizon_is_moved_from_the_next_update_on():
+    learner, lengths = learner_of(seed=0, **CONFIG), []
+    objective = learner.objective
+
+    def noted(trajectory, **numbers):
+        lengths.append(len(trajectory.action))
+        return objective(trajectory, **numbers)
+
+    learner.objective, begin = noted, learner.horizon
+    for moved in ({}, {"imagination_horizon": 2.4}, {"imagination_horizon": 1.6}, {}):
+        learner.adjust(**moved)
+        learner.update(make_batch())
+    assert lengths == [begin, 2, 2, 2] and begin > 2
+
+
 def make_starts(count=6, terminated=()):
     flags = torch.zeros(count, 1, dtype=torch.bool)
     flags[list(terminated)] = True
