@@ -14,7 +14,7 @@ file, jobs that were done are left out, and the training goes on where it was.
 a CUDA graph, which must fly as the eager ones do. `learner`: a captured update learns; held-out metrics, a checkpoint
 and an evaluation after the capture; the replay. `tests`: those marked `gpu`, and a short run that is resumed. `speed`:
 updates of each size, eager, captured and with the compiled cell, in long windows and in short ones; the kernels that
-take most of a captured one. `train`: Kidney by `tuned=gpu`, until the budget is spent.
+take most of a captured one. `train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
 """
 
 import argparse
@@ -231,9 +231,9 @@ def train_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     begin = ["tuned=gpu", "track=kidney", f"device={device}", f"run_dir={run_dir}", "checkpoint.minutes=3"]
     if tiny:
         begin += ["model=debug", "model.batch_size=4", "env.num_envs=4", "env.start_on_line=0", "budget=smoke"]
-        begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0", "loss.ppo.steps=128"]
+        begin += ["schedule.start_on_line.to=null", "total_env_steps=600", "evaluation.every=0"]
     begun = any((run_dir / "checkpoints").glob("checkpoint-*"))
-    yield "kidney", 3600.0, ["recipes/latent_ppo.py", *([f"resume={run_dir}"] if begun else begin)]
+    yield "kidney", 3600.0, ["recipes/dreamer_v3.py", *([f"resume={run_dir}"] if begun else begin)]
 
 
 STAGES: dict[str, Callable[[str, bool, Path], Commands]] = {
