@@ -6,12 +6,16 @@
 A folder of results is described by its `provenance.json`, an entry or a list of entries:
 
     {"title": "...", "text": "...", "command": "..." or [...], "commit": "...", "machine": "...", "wall_clock": "...",
-     "files": {"curve.png": "caption"} or ["curve.png"], "fills": {"sac/circle": "99 %"} or ["sac/circle"]}
+     "today": "..." or [...], "files": {"curve.png": "caption"} or ["curve.png"],
+     "headline": [{"result": "...", "value": "...", "seeds": "...", "minutes": "...", "command": "..."}],
+     "fills": {"sac/circle": "99 %"} or ["sac/circle"], "brief": true, "result": "..."}
 
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
-files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `fills` names
-cells of results/planned.json, the tables of what is to be run, and may say what a cell shows instead of the title; a
-cell that nothing fills says so. With `"brief": true` an entry is an item of the list at the end, with no pictures.
+files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
+was run at `commit`; `today` starts the same now, and is what the page prints where it is given. Rows of `headline` make
+the first table. `fills` names cells of results/planned.json, the table of what is to be run, and may say what a cell
+shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
+which shows its `result`, with no commands and no pictures.
 """
 
 import argparse
@@ -29,18 +33,28 @@ PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
 WIDTH = 128
 BRIEF = "In brief"
+COLUMNS = ("value", "seeds", "minutes", "command")
+"""Of the first table, behind the result."""
+FEW = 3
+"""So many files are linked one by one; more are their folder."""
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
-Made by `python docs/results.py` from the `provenance.json` files in [results/](../results): change those, not this
-page. [What we know](what_we_know.md) says what follows, and [figures](figures.md) how to draw your own. More results,
-of earlier defaults, are in the tree of commit 3c460b3.
+Every number that the pages cite, with its command. [What we know](what_we_know.md) draws the conclusions;
+[concepts](concepts.md#words) explains the words.
 
-A command runs at the commit below it. Until 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`, so
-commands of older results name that one. Flights of 100 randomised starts are by `python recipes/evaluate.py
-checkpoint=runs/RUN episodes=100 num_envs=100 start_noise=1 seed=7`, deterministic unless sampling is said. Files of
-metrics hold the rows with evaluations and every fourth to twentieth of the others.
+- **Success**: a flight finishes three laps. Unless a table says otherwise, a run flies 100 times from randomised starts
+  that training never evaluated on. It flies by the weights at its end, without random actions (not *sampled*), by
+  `./dev python recipes/evaluate.py checkpoint=runs/RUN episodes=100 num_envs=100 start_noise=1 seed=7`.
+- **CPU minutes** are those of one core, for the whole run.
+- **Commands** on this page start the experiment with today's code, whose defaults may differ. Those that made the
+  numbers are in the `provenance.json` of each section, for the commit that it names. Before commit 2c16a57 they call
+  `recipes/latent_ppo.py` by its old name, `recipes/dreamer_v3.py`.
+- **Files**: `metrics_*.csv` have all rows with evaluations and every fourth to twentieth of the others. `-dirty` behind
+  a commit means that files had been changed.
 """
+FOOT = """This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results):
+change those, not the page. Results of earlier defaults are in the tree of commit 3c460b3."""
 
 
 @dataclass
@@ -55,7 +69,10 @@ class Entry:
     commit: str | None = None
     machine: str | None = None
     wall_clock: str | None = None
-    brief: bool = False  # an item of the last list
+    today: list[str] = field(default_factory=list)  # the commands that start the same now
+    headline: list[dict[str, str]] = field(default_factory=list)  # rows of the first table
+    brief: bool = False  # a row of the last table
+    result: str = ""  # what that row shows
     fills: dict[str, str] = field(default_factory=dict)  # what cells of the planned tables show, by their names
 
     @property
@@ -90,10 +107,12 @@ def make_page(results: Path) -> str:
         if unknown := set(entry.fills) - set(known):
             raise ValueError(f"{entry.folder / 'provenance.json'}: fills {sorted(unknown)}: not in planned.json.")
     tables = [table_text(table, entries) for table in planned]
-    entries.sort(key=lambda entry: min(map(known.index, entry.fills), default=len(known)))  # as the tables link to them
+    # As the tables link to them; then those of the first table
+    entries.sort(key=lambda entry: (min(map(known.index, entry.fills), default=len(known)), not entry.headline))
     long = [entry_text(entry, results) for entry in entries if not entry.brief]
-    brief = [brief_text(entry, results) for entry in entries if entry.brief]
-    return "\n".join([HEAD, *tables, *long, *([f"## {BRIEF}\n", *brief] if brief else []), ""]).rstrip("\n") + "\n"
+    brief = [entry for entry in entries if entry.brief]
+    parts = [HEAD, *headline_text(entries), *tables, *long, *brief_text(brief, results), FOOT]
+    return "\n".join(parts).rstrip("\n") + "\n"
 
 
 def read_entries(path: Path) -> Iterator[Entry]:
@@ -114,19 +133,27 @@ def read_entries(path: Path) -> Iterator[Entry]:
         for name in files:
             if not (path.parent / name).is_file():
                 raise ValueError(f"{path}: files names {name}, which is not there.")
-        command, fills = raw.get("command") or [], raw.get("fills") or {}
+        fills = raw.get("fills") or {}
         yield Entry(
             folder=path.parent,
             title=raw["title"],
             files=files,
             text=raw.get("text") or "",
-            command=[command] if isinstance(command, str) else command,
+            command=listed(raw.get("command")),
             commit=raw.get("commit") or recorded(path.parent, files, "commit"),
             machine=raw.get("machine") or recorded(path.parent, files, "machine"),
             wall_clock=raw.get("wall_clock"),
+            today=listed(raw.get("today")),
+            headline=raw.get("headline") or [],
             brief=bool(raw.get("brief")),
+            result=raw.get("result") or "",
             fills=fills if isinstance(fills, dict) else dict.fromkeys(fills, raw["title"]),
         )
+
+
+def listed(commands: str | list[str] | None) -> list[str]:
+    """Return one command or several as a list."""
+    return [commands] if isinstance(commands, str) else commands or []
 
 
 def recorded(folder: Path, files: dict[str, str], name: str) -> str | None:
@@ -157,42 +184,61 @@ def table_text(table: dict[str, Any], entries: list[Entry]) -> str:
     return "\n".join([*lines, ""])
 
 
+def headline_text(entries: list[Entry]) -> list[str]:
+    """Draw the first table: a result a row, linked to its section; nothing if no entry has one."""
+    rows = [
+        f"| [{row['result']}](#{entry.anchor}) | {' | '.join(row[name] for name in COLUMNS)} |"
+        for entry in entries
+        for row in entry.headline
+    ]
+    head = "## At a glance\n\nPut `./dev python recipes/` before a command. Each result links to its section.\n"
+    table = "| result | success | seeds | CPU minutes | today |\n|---|---|---|---|---|"
+    return [head, table, *rows, ""] if rows else []
+
+
 def entry_text(entry: Entry, results: Path) -> str:
     """Draw an entry: heading, text, commands, where it comes from, pictures, other files."""
     place = Path(os.path.relpath(entry.folder, results.parent))
     lines = [f"## {entry.title}\n"]
     if entry.text:
         lines.append(f"{wrapped(entry.text)}\n")
-    if entry.command:
-        lines.append("\n".join(["```bash", *map(wrapped_command, entry.command), "```"]) + "\n")
-    lines.append("\n".join(filter(None, (wrapped(provenance(entry)), links(entry, results)))) + "\n")
+    if commands := entry.today or entry.command:
+        when = [] if entry.today else ["At the commit below:\n"]
+        lines.append("\n".join([*when, "```bash", *map(wrapped_command, commands), "```"]) + "\n")
+    origin = f"Made by [these commands](../{place.as_posix()}/provenance.json). " if entry.today else ""
+    lines.append("\n".join(filter(None, (wrapped(origin + provenance(entry)), links(entry, results)))) + "\n")
     pictures = [name for name in entry.files if name.endswith(PICTURES)]
     shown = [f"![{entry.files[name] or name}](../{(place / name).as_posix()})" for name in pictures]
     return "\n".join([*lines, *shown, *([""] if shown else [])])
 
 
-def brief_text(entry: Entry, results: Path) -> str:
-    """Draw an entry as an item of a list."""
-    parts = (command.partition("  # ") for command in entry.command)
-    commands = "; ".join(f"`{command}`" + (f" ({remark})" if remark else "") for command, _, remark in parts)
-    said = " ".join(filter(None, (f"**{entry.title}**.", entry.text, f"{commands}." if commands else "")))
-    text = wrapped(f"- {said} {provenance(entry)}")
-    return "\n".join([text.replace("\n", "\n  "), *([f"  {numbers}"] if (numbers := links(entry, results)) else [])])
+def brief_text(entries: list[Entry], results: Path) -> list[str]:
+    """Draw the last table: an entry a row; nothing if there are none."""
+    rows = []
+    for entry in entries:
+        place = Path(os.path.relpath(entry.folder, results.parent)).as_posix()
+        numbers = [name for name in entry.files if not name.endswith(PICTURES)]
+        one = len(numbers) == 1
+        linked = f"[{numbers[0]}](../{place}/{numbers[0]})" if one else f"[{len(numbers)} files](../{place})"
+        rows.append(f"| {entry.title} | {entry.result} | {linked} |")
+    head = "Commands, commits and machines are in the `provenance.json` beside the numbers, or in the numbers.\n"
+    table = "| measured | result | numbers |\n|---|---|---|"
+    return [f"## {BRIEF}\n", head, table, *rows, ""] if rows else []
 
 
 def provenance(entry: Entry) -> str:
-    """Say where an entry comes from; an item of the list leaves out the time that was not recorded."""
+    """Say where an entry comes from."""
     facts: dict[str, str | None] = {} if entry.command else {"Command": None}
     facts |= {"Commit": entry.commit, "Machine": entry.machine, "Time": entry.wall_clock}
-    if entry.brief and not entry.wall_clock:
-        del facts["Time"]
     return " ".join(f"{name}: {value or NOT_RECORDED}." for name, value in facts.items())
 
 
 def links(entry: Entry, results: Path) -> str:
-    """Link to the files that are no pictures, in one line; nothing if there are none."""
+    """Link to the files that are no pictures, or to their folder if they are many; nothing if there are none."""
     place = Path(os.path.relpath(entry.folder, results.parent))
     others = [name for name in entry.files if not name.endswith(PICTURES)]
+    if len(others) > FEW:
+        return f"Numbers: [{len(others)} files](../{place.as_posix()})."
     linked = (f"[{n}](../{(place / n).as_posix()}){f' ({entry.files[n]})' if entry.files[n] else ''}" for n in others)
     return f"Numbers: {', '.join(linked)}." if others else ""
 

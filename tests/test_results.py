@@ -84,10 +84,37 @@ def test_cells_may_say_what_they_show(results, folder):
     assert "| PPO | not run | [99 %](#one-a-result) |" in results.make_page(folder)
 
 
-def test_brief_entries_are_a_list_at_the_end(results, folder):
-    change(folder, brief=True, text="What it is.", command="python x.py  # and y.py")
+def test_brief_entries_are_rows_of_the_last_table(results, folder):
+    change(folder, brief=True, result="a figure", command="python x.py")
     page = results.make_page(folder)
-    assert "- **One: a result**. What it is. `python x.py` (and y.py). Commit: c1; c2." in page and "## One" not in page
+    assert f"| One: a result | a figure | [numbers.json](../{folder.name}/one/deep/numbers.json) |" in page
+    assert "## One" not in page and "python x.py" not in page
+
+
+def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, folder):
+    change(folder, command="python old.py", today="python new.py", commit="c3")
+    page = results.make_page(folder)
+    assert "```bash\npython new.py\n```" in page and "old.py" not in page
+    assert f"Made by [these commands](../{folder.name}/one/deep/provenance.json). Commit: c3." in page
+    change(folder, today=None)
+    assert "At the commit below:\n\n```bash\npython old.py\n```" in results.make_page(folder)
+
+
+def test_headlines_are_the_first_table_and_link_to_their_sections(results, folder):
+    assert "## At a glance" not in results.make_page(folder)
+    row = {"result": "PPO", "value": "99 %", "seeds": "2", "minutes": "3", "command": "`ppo.py`"}
+    change(folder, headline=[row])
+    page = results.make_page(folder)
+    assert "| [PPO](#one-a-result) | 99 % | 2 | 3 | `ppo.py` |" in page
+    assert page.index("## At a glance") < page.index("## Planned")
+
+
+def test_many_files_are_linked_by_their_folder(results, folder):
+    names = [f"{name}.csv" for name in "abcd"]
+    for name in names:
+        (folder / "one" / "deep" / name).touch()
+    change(folder, files=names)
+    assert f"Numbers: [4 files](../{folder.name}/one/deep)." in results.make_page(folder)
 
 
 def test_commands_are_not_broken_within_quotes(results):
