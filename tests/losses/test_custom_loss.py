@@ -43,6 +43,12 @@ def test_a_target_is_learned_beside_others(my_losses):
     torch.testing.assert_close(metrics["loss"], total)
 
 
+def test_the_smallest_target_is_learned(my_losses):
+    learner = learner_of(seed=0, world_model="reconstruction+my_losses:LastAction", **CONFIG)
+    metrics = learner.update(make_batch())
+    assert metrics["loss_last_action"] > 0 and "loss_image" in metrics
+
+
 def test_the_target_is_what_its_text_says(my_losses):
     """The prior after three blind steps, by hand; nothing is compared across a reset."""
     learner = learner_of(seed=0, world_model="my_losses:Overshooting", free_nats=0.0)
