@@ -13,8 +13,8 @@ file, jobs that were done are left out, and the training goes on where it was.
 `probe`: versions, speed of a matrix product (8192³ in bfloat16) and of a copy. `env`: steps of the worlds eager, and as
 a CUDA graph, which must fly as the eager ones do. `learner`: a captured update learns; held-out metrics, a checkpoint
 and an evaluation after the capture; the replay. `tests`: those marked `gpu`, and a short run that is resumed. `speed`:
-updates of each size, eager, captured and with the compiled cell, in long windows and in short ones; the kernels that
-take most of a captured one. `train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
+updates of each size, eager and captured, in long windows and in short ones; the kernels that take most of a captured
+one. `train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
 """
 
 import argparse
@@ -64,6 +64,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="file of results, a line each, which is continued")
     parser.add_argument("--stages", nargs="*", default=list(STAGES), choices=STAGES)
+    parser.add_argument("--jobs", nargs="*", help="names of jobs, if not all of a stage")
     parser.add_argument("--budget", type=float, default=1800.0, help="s for all of it")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--tiny", action="store_true", help="the smallest of everything: measures nothing")
@@ -116,7 +117,8 @@ def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
     for stage in STAGES:
         if stage in arguments.stages:
             for name, limit, command in STAGES[stage](arguments.device, arguments.tiny, runs):
-                yield Job(stage, name, limit, command)
+                if not arguments.jobs or name in arguments.jobs:
+                    yield Job(stage, name, limit, command)
 
 
 def attempt(job: Job, limit: float, caches: Path) -> dict[str, Any]:
@@ -214,7 +216,7 @@ def test_jobs(device: str, tiny: bool, runs: Path) -> Commands:
 
 def speed_jobs(device: str, tiny: bool, runs: Path) -> Commands:
     """Updates of all sizes, in all ways."""
-    ways = ("eager",) if device == "cpu" else ("eager", "graph", "compile+graph")
+    ways = ("eager",) if device == "cpu" else ("eager", "graph")
     plain = ("debug", "eager", "2x4") if tiny else ("size12m", "eager" if device == "cpu" else "graph", "64x16")
     yield f"{' '.join(plain)} without few kernels", 240.0, measured(device, tiny, "speed", *plain, "plain")
     for size in ("debug",) if tiny else SIZES:
@@ -429,19 +431,17 @@ def write_page(results: Path, page: Path) -> None:
 
 
 def table(records: list[dict[str, Any]]) -> str:
-    """A row for each job, of its latest attempt on a GPU; one for a stage of which nothing was run."""
+    """A row for each job, of its latest attempt on a GPU; one for those of a stage that were not run."""
     latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
     places = sorted({f"{r.get('gpu')} at {r['commit']}" for r in latest.values()})
     lines = [f"Measured on {', '.join(places)}.", ""] if places else []
     lines += ["| stage | what | |", "|---|---|---|"]
     for stage, commands in STAGES.items():
         names = [name for name, _, _ in commands("cuda", False, Path())]
-        if not any((stage, name) in latest for name in names):
-            lines.append(f"| {stage} | {len(names)} {'job' if len(names) == 1 else 'jobs'} | not run |")
-            continue
-        for name in names:
-            record = latest.get((stage, name))
-            lines.append(f"| {stage} | `{name}` | {'not run' if record is None else in_words(record)} |")
+        run = [name for name in names if (stage, name) in latest]
+        lines += [f"| {stage} | `{name}` | {in_words(latest[stage, name])} |" for name in run]
+        if left := len(names) - len(run):
+            lines.append(f"| {stage} | {left} {'other ' * bool(run)}{'job' if left == 1 else 'jobs'} | not run |")
     return "\n".join(lines)
 
 
@@ -450,7 +450,11 @@ def in_words(record: dict[str, Any]) -> str:
     if record["state"] != "done":
         return f"{record['state']}: {record.get('why', '')}"
     shown = {"ms": "ms", "steps_per_s": "steps/s", "matmul_tflops": "TFLOP/s", "copy_gb_per_s": "GB/s"}
-    numbers = [f"{record[key]:,.3g} {unit}" for key, unit in shown.items() if key in record]
+    numbers = [
+        f"{record[key]:,.0f} {unit}" if record[key] >= 100 else f"{record[key]:.3g} {unit}"
+        for key, unit in shown.items()
+        if key in record
+    ]
     return ", ".join(numbers) or f"done in {record['seconds']} s"
 
 

@@ -1,7 +1,7 @@
 """Seconds per update of the learner: sizes, losses, backends; FLOPs, calls, memory, share of the hardware's limit.
 
     python benchmarks/learner.py --sizes cpu_small --batch 8 32 --horizon 15 --json results/learner.json
-    python benchmarks/learner.py --sizes size12m paper_large --backends eager graph compile+graph --mixed-precision
+    python benchmarks/learner.py --sizes size12m paper_large --backends eager graph --mixed-precision
     python benchmarks/learner.py --losses reconstruction privileged decoder_free --actor-losses reinforce dynamics
     python benchmarks/learner.py --peers torchrl_small      # and TorchRL's own assembly, see stock_dreamer.py
     python benchmarks/learner.py --launches --sizes paper_large size12m --batch 64 16 --horizon 16
@@ -50,7 +50,7 @@ from dreamer_racing.modules import SIZES, Interface, ModelSize, get_size, layers
 
 PRIVILEGED_DIM = 21
 WARM_UP = 3  # updates that are not counted
-BACKENDS = ("eager", "compile", "graph", "compile+graph")
+BACKENDS = ("eager", "graph")
 PEERS = ("torchrl_small", "torchrl_large")
 COLUMNS = ("size", "loss", "actor", "backend", "batch", "horizon", "parameters", "s", "calls", "GFLOP", "share",
            "sample_share", "memory")  # fmt: skip
@@ -151,7 +151,6 @@ class Setting:
         torch.set_float32_matmul_precision("high")
         config = LearnerConfig(
             mixed_precision=self.mixed_precision,
-            compile="compile" in backend,
             cuda_graph="graph" in backend,
             few_kernels=self.few_kernels,
             imagination_horizon=self.horizon,

@@ -47,7 +47,7 @@ def check_layout(key: NestedKey, new: Tensor, stored: Tensor) -> None:
 def send(tensor: Tensor, device: torch.device) -> Tensor:
     """Return a tensor on a device; what goes to a CUDA device goes from pinned memory, and the CPU does not wait."""
     if device.type == "cuda" and tensor.device.type == "cpu":
-        return tensor.pin_memory().to(device, non_blocking=True)
+        return tensor.contiguous().pin_memory().to(device, non_blocking=True)
     return tensor.to(device)
 
 

@@ -32,7 +32,7 @@ REFERENCE = "default"  # the variant that others are compared with; so is one wi
 SAME_CURVE = (
     "seed", "run_dir", "resume", "total_env_steps", "device", "logger.", "checkpoint.", "replay.storage",
     "replay.device", "evaluation.every", "evaluation.first", "evaluation.stochastic", "evaluation.video_steps",
-    "model.compile", "model.cuda_graph",
+    "model.cuda_graph",
 )  # fmt: skip
 """Settings, or beginnings of them, in which the runs of one curve may differ: none of them changes what is learned."""
 IN_KEY = ("algorithm", "track", "task")  # settings that every key names anyway

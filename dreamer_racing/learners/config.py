@@ -18,8 +18,6 @@ class LearnerConfig:
         average_rate: Fraction by which the averaged weights, which fly evaluations and exports, move at each update;
             None keeps none.
         slow_critic_rate: Fraction by which the slow critic moves at each update.
-        compile: Compile the arithmetic of the recurrent cell with ``torch.compile``, instead of what ``few_kernels``
-            does there.
         cuda_graph: On a CUDA device, replay forward and backward as one CUDA graph. None, which the recipes replace by
             whether the run can, is False.
         few_kernels: Save kernels: weights are cast once an update instead of at every use (with ``mixed_precision``),
@@ -40,7 +38,6 @@ class LearnerConfig:
     imagination_starts: int | None = setting(None, COUNT)
     average_rate: float | None = setting(None, POSITIVE_SHARE)
     slow_critic_rate: float = setting(0.02, SHARE)
-    compile: bool = False
     cuda_graph: bool | None = None
     few_kernels: bool | None = None
     mixed_precision: bool | None = None

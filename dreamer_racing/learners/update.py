@@ -88,8 +88,6 @@ class WorldModelLearner(ABC):
         self.optimizer = self._make_optimizer()
         self._rates = [group["lr"] for group in self.optimizer.param_groups]
         self._guard = FiniteGuard(lag=2 if self.device.type == "cuda" else 0)
-        if self.config.compile:
-            agent.world_model.rssm.compile_steps()
         self._graph = self._make_graph() if self.config.cuda_graph else None
 
     @classmethod

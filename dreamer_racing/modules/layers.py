@@ -270,15 +270,14 @@ class BlockLinear(nn.Module):
 def unrolled(*modules: nn.Module, steps: int | None = None) -> Iterator[None]:
     """Let the linear layers of modules that a time loop calls at every step compute their weight gradients after it.
 
-    Gradients are the same but for rounding. Does nothing without gradients, and under ``torch.compile``, which cannot
-    trace it.
+    Gradients are the same but for rounding. Does nothing without gradients.
 
     Args:
         modules: That the loop calls, each layer of them once a step.
         steps: Length of the loop, to do so for gains and biases, too: fewer kernels; None: no.
     """
     inside = [layer for module in modules for layer in module.modules()]
-    if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+    if not torch.is_grad_enabled():
         inside = []
     layers = [layer for layer in inside if isinstance(layer, (Linear, BlockLinear))]
     norms = [layer for layer in inside if steps and isinstance(layer, (RMSNorm, LayerNorm))]

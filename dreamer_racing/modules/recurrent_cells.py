@@ -5,8 +5,6 @@ Shape legend: N any one-dimensional batch, A action, D belief, S state, U hidden
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -58,7 +56,6 @@ class DenseGRUCell(SplitInputCell):
         self.gates_norm = NORMS[norm](3 * belief)
         self.gates = linear(hidden + belief, 3 * belief, bias=not self.gates_norm.shifts)
         self.few_kernels = False
-        self.gated_update: Callable[..., Tensor] = gated_update
         self.shift = nn.Buffer(gate_shift(), persistent=False)
 
     def forward(self, belief: Tensor, state: Tensor, projected_action: Tensor, low: Tensor | None = None) -> Tensor:
@@ -79,7 +76,7 @@ class DenseGRUCell(SplitInputCell):
         if self.few_kernels:
             return GatedUpdate.apply(gates.unflatten(-1, (1, 3, -1)), self.shift, belief)
         reset, candidate, update = gates.float().chunk(3, -1)
-        return self.gated_update(reset, candidate, update, belief)
+        return gated_update(reset, candidate, update, belief)
 
 
 class BlockGRUCell(nn.Module):
@@ -112,7 +109,6 @@ class BlockGRUCell(nn.Module):
         self.hidden_norm = NORMS[norm](belief)
         self.gates = BlockLinear(belief, 3 * belief, blocks)
         self.few_kernels = False
-        self.gated_update: Callable[..., Tensor] = gated_update
         self.shift = nn.Buffer(gate_shift(), persistent=False)
 
     def project_action(self, action: Tensor) -> Tensor:
@@ -130,4 +126,4 @@ class BlockGRUCell(nn.Module):
             return GatedUpdate.apply(gates.unflatten(-1, (self.blocks, 3, -1)), self.shift, belief)
         parts = gates.float().unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
         reset, candidate, update = (gate.flatten(1) for gate in parts)
-        return self.gated_update(reset, candidate, update, belief)
+        return gated_update(reset, candidate, update, belief)

@@ -18,7 +18,7 @@ from torch.autograd.function import FunctionCtx
 
 from dreamer_racing.modules.deferred import autocast_type
 from dreamer_racing.modules.layers import NormedLinear, SplitNormedLinear, linear, unrolled
-from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell, gated_update
+from dreamer_racing.modules.recurrent_cells import BlockGRUCell, DenseGRUCell
 from dreamer_racing.modules.stored_latents import LatentFormat
 
 Begin = Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
@@ -146,8 +146,6 @@ class RSSM(nn.Module):
             raise ValueError(f"{type(self).__name__}: recurrence={recurrence!r}, known here: {', '.join(self.cells)}.")
         self.latents, self.classes, self.unimix, self.sampled = latents, classes, unimix, sampled
         self.few_kernels = False
-        self.compiled = False
-        self.mix: Callable[[Tensor, float], Tensor] = mix_uniform
         self.uniform = nn.Buffer(torch.tensor(1.0 / classes), persistent=False)
         state = latents * classes
         self.cell = self.cells[recurrence](belief, state, action, hidden, norm, blocks)
@@ -353,19 +351,8 @@ class RSSM(nn.Module):
         self, logits: Tensor, noise: Tensor | None, blank: Tensor | None = None, dtype: torch.dtype | None = None
     ) -> Tensor:
         """Return states ``(..., S)`` by logits ``(..., L, K)``; the other arguments are those of ``sample_one_hot``."""
-        if self.few_kernels and not self.compiled:
+        if self.few_kernels:
             probabilities = torch.lerp(torch.softmax(logits, -1), self.uniform, self.unimix)
         else:
-            probabilities = self.mix(logits, self.unimix)
+            probabilities = mix_uniform(logits, self.unimix)
         return (sample_one_hot(probabilities, noise, blank, dtype) if self.sampled else probabilities).flatten(-2)
-
-    def compile_steps(self) -> None:
-        """Compile the arithmetic of a step, with ``torch.compile``: the gates, and the probabilities of states.
-
-        Not the loop: unrolled it takes minutes to compile, and its matrix products gain nothing.
-        """
-        self.mix = torch.compile(mix_uniform, dynamic=False)
-        self.compiled = True
-        if hasattr(self.cell, "gated_update"):
-            self.cell.few_kernels = False
-            self.cell.gated_update = torch.compile(gated_update, dynamic=False)

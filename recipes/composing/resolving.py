@@ -119,10 +119,7 @@ def tune(config: DictConfig) -> str:
     chosen = "race" if config.env.suite == "race" else "suite"
     if device != "cpu":
         more = "; tuned=gpu has more worlds and updates, unmeasured, too" if chosen == "race" else ""
-        print(
-            f"settings: tuned={chosen}, known from CPUs; no whole run on {device} has been measured. model=size12m is "
-            f"the algorithm as published{more}"
-        )
+        print(f"settings: tuned={chosen}, known from CPUs. model=size12m is the algorithm as published{more}")
     return chosen
 
 

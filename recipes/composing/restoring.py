@@ -213,7 +213,7 @@ def restore_learner(
     config.env.device = "cpu"  # wherever it was trained
     chosen = choose_weights(weights, kept_weights(load_state(checkpoint, "learner")[0]), checkpoint)
     if isinstance(config, WorldModelRunConfig):
-        config.model.compile = config.model.cuda_graph = False
+        config.model.cuda_graph = False
         config.model.average_rate = (config.model.average_rate or 1.0) if chosen == AVERAGED else None
     env = _probe(config)
     interface = Interface.of(env)
