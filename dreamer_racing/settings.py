@@ -1,12 +1,16 @@
-"""What a person sets: the values that numbers may have, checked in one place, and how messages quote and suggest."""
+"""What a person sets: numbers and their ranges, checked in one place; names of own code; how messages quote."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
 import math
+import os
+import sys
 from collections.abc import Collection, Iterable, Mapping
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -180,3 +184,37 @@ def suggestion(word: object, known: Collection[str]) -> str:
     """Return ``" (did you mean x?)"`` for a likely slip of the pen, else nothing."""
     close = difflib.get_close_matches(str(word), known, n=1)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def import_own(name: str, asked: str) -> Any:
+    """Import what a user has written.
+
+    The folder that a command is started from is looked in last, after all that Python looks in anyway.
+
+    Args:
+        name: ``module:name``.
+        asked: How messages name it, for example ``reward=my_rewards:smooth``.
+
+    Raises:
+        ValueError: If it cannot be imported; the message says where it was looked for, and what to set.
+    """
+    module, _, attribute = name.partition(":")
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] != module.partition(".")[0]:
+            raise ValueError(f"{asked} cannot be imported: {error}.") from error
+        searched = os.environ.get("PYTHONPATH") or "not set"
+        raise ValueError(
+            f"{asked} was not found: there is no {module}.py in {folder}, nor on PYTHONPATH "
+            f"({searched}). Start from the folder that holds it, or set PYTHONPATH to that folder."
+        ) from error
+    except ImportError as error:
+        raise ValueError(f"{asked} cannot be imported: {error}.") from error
+    if not hasattr(found, attribute):
+        meant = suggestion(attribute, vars(found))
+        raise ValueError(f"{asked}: module {module!r} has no {attribute!r}{meant}.")
+    return getattr(found, attribute)

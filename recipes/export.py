@@ -95,6 +95,11 @@ def export(config: ExportConfig) -> None:
         raise ValueError(f"{checkpoint} was trained on {trained.task}; this recipe exports actors that race.")
     if trained.track_description is None:  # also of a run that was begun before they were noted
         trained.track_description = describe_file(trained.track)
+    if trained.env.vector is not None:
+        raise ValueError(
+            f"{checkpoint} was trained with env.vector={trained.env.vector}, which computes from the simulator's state "
+            "what no drone in flight is told: export an agent that sees images, or images and env.imu."
+        )
     check_agent(config, checkpoint)
     output = check_output(config.output or Path(config.agent or results_of(checkpoint) / "export") / ACTOR)
     if not config.agent and is_agent(output.parent):
@@ -124,7 +129,7 @@ def prepare(
         seed=config.seed,
         episode_steps=episode_steps(config.steps),
         num_threads=1,
-        **worlds_of(trained) | {"renderer": config.renderer, "device": "cpu"},
+        **worlds_of(trained) | {"renderer": config.renderer, "device": "cpu", "reward": None},
     )
     try:
         if is_agent(checkpoint):
@@ -276,7 +281,12 @@ def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> P
 def write_agent(folder: Path, trained: WorldModelRunConfig, about: dict[str, Any]) -> None:
     """Write configuration and agent.json, the latter last: with it the folder is an agent."""
     (folder / AGENT).unlink(missing_ok=True)
-    env, track = replace(trained.env, device="cpu"), Path(trained.track).name  # a file's place is of this machine
+    if trained.env.reward is not None:
+        print(f"reward: the agent ships without env.reward={trained.env.reward}; wherever it flies, Eq. 1 is paid")
+    env, track = (
+        replace(trained.env, device="cpu", reward=None),
+        Path(trained.track).name,
+    )  # a file's place is of this machine
     ships = replace(trained, track=track, run_dir=None, resume=None, device="auto", env=env)
     OmegaConf.save(OmegaConf.structured(ships), folder / CONFIG)
     (folder / AGENT).write_text(json.dumps(about, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -10,6 +10,7 @@ Physics, rules, rewards and start poses are those of the batched environments, f
 | `body_rates` | (3,) | rad/s, body frame |
 | `target_gate` | (1,) int64 | the gate to pass next |
 | `imu` | (6,) | body rates, rad/s, and specific force, m/s², body frame, only with `imu=` |
+| `vector` | (V,) | numbers of your own, only with `vector=` |
 | `pixels` | (height, width, 3) uint8 | nose camera, 64 × 64 by default, only with `from_pixels=True` |
 
 A crash ends the episode with discount 0; the time limit (and the last lap in evaluation) with discount 1. A broken
@@ -20,6 +21,7 @@ Shapes: P physics steps per control step. SI units.
 
 import collections
 import math
+from dataclasses import replace
 from typing import Any
 
 from dreamer_racing.envs.dm_control_gl import open_camera  # before dm_control
@@ -39,9 +41,19 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, a
 from dreamer_racing.envs.drone.quadrotor import Quadrotor, wrong_action_type
 from dreamer_racing.envs.drone.rotation import rotate_inverse
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
+from dreamer_racing.envs.own import (
+    OwnFunction,
+    RaceState,
+    RaceStates,
+    RewardFunction,
+    Transition,
+    VectorFunction,
+)
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
+from dreamer_racing.envs.race.race_vector import RaceVector
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
 from dreamer_racing.envs.simulator.scene import (
     CAMERA_NAME,
@@ -74,6 +86,8 @@ def load(
     control_rate: float | None = None,
     camera_rate: float | None = None,
     imu: str | ImuErrors | None = None,
+    reward: str | RewardFunction | None = None,
+    vector: str | VectorFunction | None = None,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
     """Make the race of one drone as a dm_control environment.
@@ -91,6 +105,8 @@ def load(
         camera_rate: frames a second, Hz, `control_rate` divided by a whole number: an image is shown until the next
             one; if None the camera's, a frame at every control step.
         imu: whether there is an observation `imu`: `exact`, `noisy` (see `IMUS`), or by how much it errs.
+        reward: function of a `Transition` in place of Eq. 1, or `module:function`, as of `RaceWorlds`.
+        vector: function of a `RaceState` whose numbers are an observation `vector`, likewise.
         environment_kwargs: further arguments of `control.Environment`, e.g. `flat_observation`.
 
     Raises:
@@ -123,6 +139,8 @@ def load(
         camera=camera if from_pixels else None,
         imu=errors,
         weights=weights,
+        reward=reward,
+        vector=vector,
     )
     # no time_limit here: control.Environment would give a crash in the last step the discount of a truncation
     return control.Environment(physics, task, control_timestep=parameters.control_dt, **(environment_kwargs or {}))
@@ -296,6 +314,8 @@ class DroneRace(base.Task):
         camera: the nose camera; None for no `pixels`.
         imu: by how much the IMU errs; None for no `imu`.
         weights: of the reward, paper Eq. 1.
+        reward: function of a `Transition` in place of Eq. 1, or `module:function`.
+        vector: function of a `RaceState` whose numbers are an observation `vector`; None for none.
 
     Attributes:
         body_rate_weight: b₂ of paper Eq. 1, applied to rewards from now on.
@@ -314,6 +334,8 @@ class DroneRace(base.Task):
         camera: Camera | None = None,
         imu: ImuErrors | None = None,
         weights: RewardWeights | None = None,
+        reward: str | RewardFunction | None = None,
+        vector: str | VectorFunction | None = None,
     ) -> None:
         super().__init__(random=random)
         self.track = track
@@ -325,6 +347,12 @@ class DroneRace(base.Task):
         self._generator = generator or torch.Generator()
         self._starts = StartSampler(track, self._generator, dtype=torch.float64)
         self._invalid_action = False
+        cpu = torch.device("cpu")
+        self._own_reward = None if reward is None else OwnFunction("reward", reward, 1, cpu)
+        self._own_vector = None if vector is None else OwnFunction("vector", vector, 1, cpu)
+        self._states = RaceStates(self.race, RaceVector(track))
+        self._action = torch.zeros(1, ACTION_SIZE)  # that was flown last
+        self._before: RaceState | None = None  # the present step
         self._imu_errors = imu
         self._imu: Imu | None = None
         self._camera = camera
@@ -343,6 +371,7 @@ class DroneRace(base.Task):
         physics.place(start.position[0].numpy(), start.attitude[0].numpy(), start.linear_velocity[0].numpy())
         self.race.begin(torch.ones(1, dtype=torch.bool), start.position, start.target_gate)
         self.outcome = None
+        self._action = torch.zeros(1, ACTION_SIZE)
         self._image_age = self._frame_interval
         if self._imu_errors is not None:
             self._imu = Imu(self._imu_errors, physics.feel, self._generator)
@@ -364,7 +393,11 @@ class DroneRace(base.Task):
                 "thrust and body rates x, y, z, each in [-1, 1]."
             )
         self._invalid_action = not np.isfinite(action).all()
-        physics.command(np.nan_to_num(action.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0))
+        flown = np.nan_to_num(action.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        if self._own_reward is not None:
+            self._before = self._race_state(physics)
+        self._action = torch.from_numpy(flown).float().clamp(-1.0, 1.0).unsqueeze(0)
+        physics.command(flown)
 
     def after_step(self, physics: Physics) -> None:
         """Judge the control step."""
@@ -373,6 +406,14 @@ class DroneRace(base.Task):
             self._imu.step()
         body_rates = torch.from_numpy(physics.body_rates()).unsqueeze(0)
         self.outcome = self.race.step(physics.path(), body_rates, torch.tensor([self._invalid_action]))
+        if self._own_reward is not None and self._before is not None:
+            transition = Transition(self._before, self._race_state(physics), self.outcome)
+            self.outcome = replace(self.outcome, reward_base=self._own_reward.rewards(transition))
+
+    def _race_state(self, physics: Physics) -> RaceState:
+        """Tell how the race stands, for functions of one's own."""
+        parts = (physics.position, physics.attitude, physics.linear_velocity, physics.body_rates)
+        return self._states(DroneState(*(torch.from_numpy(part()).unsqueeze(0) for part in parts)), self._action)
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
         """Return the observations of the module's table."""
@@ -385,6 +426,8 @@ class DroneRace(base.Task):
         )
         if self._imu is not None:
             observation["imu"] = self._imu.sample[0].numpy()
+        if self._own_vector is not None:
+            observation["vector"] = self._own_vector.vector(self._race_state(physics))[0].numpy()
         if self._camera is not None:
             observation["pixels"] = self._look(physics)
         return observation

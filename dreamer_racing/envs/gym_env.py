@@ -6,7 +6,8 @@ Action: `Box(-1, 1, (4,), float32)`: collective thrust, body rates x, y, z. Obse
 |---|---|
 | `"pixels"` | `Box(0, 255, (height, width, 3), uint8)`, the nose camera, 64 × 64 by default |
 | `"pixels_imu"` | `Dict` of `pixels` and `imu`, `Box(-inf, inf, (6,), float32)`: body rates and specific force |
-| `"vector"` | `Box(-inf, inf, (21,), float32)`, the race in the drone's own frame, see `RaceVector` |
+| `"vector"` | `Box(-inf, inf, (21,), float32)`, see `RaceVector`, or by `vector=` numbers of your own |
+| `"pixels_vector"` | `Dict` of `pixels` and `vector` |
 | `"state"` | `Dict` of `position`, `attitude` (wxyz), `linear_velocity` (world), `body_rates` (body), `target_gate` |
 | `"both"` | the same `Dict` with `pixels` |
 
@@ -33,7 +34,6 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.imu import IMU_SIZE
 from dreamer_racing.envs.race.race import RaceStep
-from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.envs.simulator.chase import ChaseView
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.rendering import Renderer, make_renderer
@@ -43,7 +43,7 @@ from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds, WorldOptions, ch
 from dreamer_racing.settings import FINITE, check_flags, check_setting
 
 RENDER_VIEWS = ("chase", "onboard")
-OBSERVATIONS = ("pixels", "pixels_imu", "vector", "state", "both")
+OBSERVATIONS = ("pixels", "pixels_imu", "pixels_vector", "vector", "state", "both")
 FRAME_SIZE = 256  # width and height of the images of `render`, pixels
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -87,7 +87,7 @@ class GymWorlds:
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
+        observation: `pixels`, `pixels_imu`, `pixels_vector`, `vector`, `state` or `both`.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.
         render_mode: `rgb_array` or None.
@@ -134,7 +134,9 @@ class GymWorlds:
             worlds["imu"] = worlds.get("imu") or "exact"
         elif worlds.get("imu") is not None:
             raise ValueError(f"imu={worlds.get('imu')!r} is for observation='pixels_imu', not {observation!r}.")
-        images = observation in ("pixels", "pixels_imu", "both")
+        if worlds.get("vector") is not None and not observation.endswith("vector"):
+            raise ValueError(f"vector= is for observation='vector' or 'pixels_vector', not {observation!r}.")
+        images = observation not in ("vector", "state")
         self.worlds = RaceWorlds(track, num_envs, preset, from_pixels=images, **worlds)
         self.body_rate_weight = (
             self.worlds.race.weights.body_rate if body_rate_weight is None else float(body_rate_weight)
@@ -161,8 +163,11 @@ class GymWorlds:
             return pixels
         if self.observation == "pixels_imu":
             return Dict({"pixels": pixels, "imu": Box(-np.inf, np.inf, (IMU_SIZE,), np.float32)})
+        vector = Box(-np.inf, np.inf, (self.worlds.vector_size,), np.float32)
         if self.observation == "vector":
-            return Box(-np.inf, np.inf, (RACE_VECTOR_SIZE,), np.float32)
+            return vector
+        if self.observation == "pixels_vector":
+            return Dict({"pixels": pixels, "vector": vector})
         spaces: dict[str, gymnasium.Space] = {
             name: Box(-np.inf, np.inf, (size,), np.float32)
             for name, size in (("position", 3), ("attitude", 4), ("linear_velocity", 3), ("body_rates", 3))
@@ -202,7 +207,7 @@ class GymWorlds:
         """The observations of all environments, or of the M masked ones (N,) bool in order."""
         rows = slice(None) if mask is None else mask
         if self.observation == "vector":
-            return self.worlds.vector().numpy()[rows]
+            return self.worlds.observed_vector().numpy()[rows]
         state = {name: value[rows] for name, value in self.state().items()}
         if self.observation == "state":
             return state
@@ -210,6 +215,8 @@ class GymWorlds:
         if self.observation == "pixels_imu":
             assert self.worlds.imu is not None, "made so"
             return {"pixels": pixels, "imu": self.worlds.imu.sample.numpy()[rows]}
+        if self.observation == "pixels_vector":
+            return {"pixels": pixels, "vector": self.worlds.observed_vector().numpy()[rows]}
         return pixels if self.observation == "pixels" else {"pixels": pixels, **state}
 
     def state(self) -> dict[str, np.ndarray]:
@@ -297,7 +304,7 @@ class DroneRaceGymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
-        observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
+        observation: `pixels`, `pixels_imu`, `pixels_vector`, `vector`, `state` or `both`.
         render_mode: `rgb_array` for frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.

@@ -33,7 +33,7 @@ class DroneRaceVecEnv(VecEnv):
     Args:
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N.
-        observation: `pixels`, `pixels_imu`, `vector`, `state` or `both`.
+        observation: `pixels`, `pixels_imu`, `pixels_vector`, `vector`, `state` or `both`.
         render_mode: `rgb_array` for frames of 256×256 pixels, or None.
         privileged: whether `info` has the state.
         body_rate_weight: b₂ of paper Eq. 1; that of `RewardWeights` if None.

@@ -27,7 +27,8 @@ class DroneRacingEnv(EnvBase):
         track: name of a built-in track, path to a YAML file, or a `Track`.
         num_envs: N; the batch size is [N].
         device: where the worlds and all tensors live, `cpu` or a CUDA device; see `RaceWorlds`.
-        from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`.
+        from_pixels: whether there are `pixels`; if not there is a `vector` instead, see `RaceVector`. A `vector=` of
+            one's own is there in either case.
         privileged: whether there are `("privileged", ...)` entries.
         preset: physics preset (`easy`, `faithful`, `betaflight`) or parameters.
         seed: of start poses and of the randomisation of physics and looks, one stream for all drones.
@@ -95,8 +96,8 @@ class DroneRacingEnv(EnvBase):
             observation["pixels"] = Bounded(
                 0, 255, (*n, camera.height, camera.width, 3), dtype=torch.uint8, device=self.device
             )
-        else:
-            observation["vector"] = number(RACE_VECTOR_SIZE)
+        if not self.from_pixels or self.worlds.own_vector is not None:
+            observation["vector"] = number(self.worlds.vector_size)
         if self.worlds.imu is not None:
             observation["imu"] = number(IMU_SIZE)
         if self.privileged:
@@ -177,10 +178,13 @@ class DroneRacingEnv(EnvBase):
     def _observe(self) -> dict[str, Any]:
         """What the worlds' states show now, without images."""
         data: dict[str, Any] = {} if self.worlds.imu is None else {"imu": self.worlds.imu.sample}
+        own = self.worlds.own_vector is not None
+        if own:
+            data["vector"] = self.worlds.observed_vector()
         if self.from_pixels and not self.privileged:
             return data
         vector = self.worlds.vector()
-        if not self.from_pixels:
+        if not (self.from_pixels or own):
             data["vector"] = vector
         if self.privileged:
             data["privileged"] = self._group({**self.worlds.privileged(), "vector": vector})

@@ -21,8 +21,9 @@ from dreamer_racing.envs.drone.parameters import (
 from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.held_frames import HeldFrames
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
+from dreamer_racing.envs.own import OwnFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
-from dreamer_racing.envs.race.race_vector import RaceVector
+from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE, RaceVector
 from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
@@ -67,6 +68,8 @@ class RaceOptions(TypedDict, total=False):
     control_rate: float | None
     camera_rate: float | None
     imu: str | ImuErrors | None
+    reward: str | RewardFunction | None
+    vector: str | VectorFunction | None
 
 
 class WorldOptions(RaceOptions, total=False):
@@ -137,6 +140,10 @@ class RaceWorlds:
             one, and none is drawn in between; if None the camera's, a frame at every control step.
         imu: gyro and accelerometer beside the images: `exact`, `noisy` (see `IMUS`), or by how much they err; None for
             none.
+        reward: function of a `Transition` that returns the rewards (N,), in place of Eq. 1 without the penalty of body
+            rates; or `module:function`; None for Eq. 1. See `docs/own_rewards.md`.
+        vector: function of a `RaceState` that returns numbers (N, V) which agents see, beside images or without; or
+            `module:function`; None for the race vector where there are no images.
 
     Raises:
         ValueError: bad argument; the message says which and what is allowed.
@@ -148,6 +155,8 @@ class RaceWorlds:
         >>> worlds.step(torch.zeros(2, 4)).terminated.shape
         torch.Size([2])
     """
+
+    _images: Tensor | None = None  # of all worlds as they are, where a step drew them
 
     def __init__(
         self,
@@ -175,6 +184,8 @@ class RaceWorlds:
         control_rate: float | None = None,
         camera_rate: float | None = None,
         imu: str | ImuErrors | None = None,
+        reward: str | RewardFunction | None = None,
+        vector: str | VectorFunction | None = None,
     ) -> None:
         _check_arguments(num_envs, without_none(episode_steps=episode_steps, num_threads=num_threads))
         check_flags(evaluation=evaluation, from_pixels=from_pixels)
@@ -201,13 +212,11 @@ class RaceWorlds:
         )
         self.device, self.dtype = self.simulator.device, self.simulator.dtype
         self.race = self._make_race(weights, episode_steps, miss_radius)
-        self._weigh_changes(action_change_weight)
-        self.race_vector = RaceVector(self.track, self.device, self.dtype)
+        self._make_numbers(errors, vector)
+        self._make_rewards(action_change_weight, reward)
         self._starts = self._make_starts(start_beyond_gate, start_at_gate, start_noise, start_on_line)
         self._held = HeldFrames(interval, self._draw) if from_pixels and interval > 1 else None
-        self.imu = None if errors is None else Imu(errors, self.simulator.feel, self._generator)
         self._graphs: dict[bool, GraphedFunction] = {}  # of a control step, by whether it draws
-        self._images: Tensor | None = None  # of all worlds as they are, where a step drew them
         self.begun = False
 
     def _make_race(self, weights: RewardWeights | None, episode_steps: int | None, miss_radius: float) -> Race:
@@ -226,11 +235,25 @@ class RaceWorlds:
             miss_radius=0.0 if self.evaluation else miss_radius,
         )
 
-    def _weigh_changes(self, weight: float) -> None:
-        """Set b₃, which is of training alone, and what the changes of the first actions are counted from."""
+    def _make_numbers(self, errors: ImuErrors | None, vector: str | VectorFunction | None) -> None:
+        """Make what tells agents numbers: the IMU, and the race vector or a function of one's own."""
+        if vector is not None and errors is not None:
+            raise ValueError("imu= and vector=: agents see one set of numbers, leave one of them out.")
+        self.imu = None if errors is None else Imu(errors, self.simulator.feel, self._generator)
+        self.race_vector = RaceVector(self.track, self.device, self.dtype)
+        self._states = RaceStates(self.race, self.race_vector)
+        self._last_action = torch.zeros(self.num_envs, ACTION_SIZE, device=self.device)
+        self.own_vector, self.vector_size = None, RACE_VECTOR_SIZE
+        if vector is not None:
+            self.own_vector = OwnFunction("vector", vector, self.num_envs, self.device)
+            self.vector_size = self.observed_vector().shape[1]
+
+    def _make_rewards(self, weight: float, reward: str | RewardFunction | None) -> None:
+        """Set b₃, which is of training alone, and the function of one's own that pays, if there is one."""
         check_setting("action_change_weight", weight, NOT_NEGATIVE)
         self.action_change_weight = 0.0 if self.evaluation else float(weight)
-        self._last_action = torch.zeros(self.num_envs, ACTION_SIZE, device=self.device)
+        self.own_reward = None if reward is None else OwnFunction("reward", reward, self.num_envs, self.device)
+        self._remembers = bool(self.action_change_weight or self.own_reward or self.own_vector)
 
     def _make_starts(self, beyond_gate: float, at_gate: float, noise: float, on_line: float) -> StartSampler:
         """Make the sampler of start poses, and plan the line for it if episodes begin there."""
@@ -300,6 +323,10 @@ class RaceWorlds:
         self.simulator.reset(mask, start.position, start.attitude, start.linear_velocity)
         self.race.begin(mask, start.position, start.target_gate)
         self._images, self.begun = None, True
+        if self._remembers:
+            self._last_action.masked_fill_(mask.unsqueeze(-1), 0.0)
+        for own in filter(None, (self.own_reward, self.own_vector)):
+            own.check()
         if self._held is not None:
             together = whole or (self.device.type == "cpu" and bool(mask.all()))  # elsewhere that would wait
             self._held.begin(None if together else mask)
@@ -352,13 +379,19 @@ class RaceWorlds:
         invalid = ~action.isfinite().all(dim=1)
         flown = action.nan_to_num(0.0, 0.0, 0.0)
         goes_on = self.race.step_count > 0  # before the step: the first of an episode changes nothing
+        before = None if self.own_reward is None else self.race_state()
         path = self.simulator.step(flown)
         outcome = self.race.step(path, self.simulator.state.body_rates, invalid)
-        if not self.action_change_weight:
+        if not self._remembers:
             return outcome
         flown = flown.float().clamp(-1.0, 1.0)
         change = (flown - self._last_action).square().sum(1).masked_fill(~goes_on | outcome.terminated, 0.0)
         self._last_action.copy_(flown)
+        if self.own_reward is not None and before is not None:
+            rewards = self.own_reward.rewards(Transition(before, self.race_state(), outcome))
+            outcome = replace(outcome, reward_base=rewards)
+        if not self.action_change_weight:
+            return outcome
         return replace(outcome, reward_base=outcome.reward_base - self.action_change_weight * change)
 
     def _capture(self, action: Tensor, draws: bool) -> GraphedFunction:
@@ -372,7 +405,15 @@ class RaceWorlds:
             return [*outcome, self.simulator.render()] if draws else outcome
 
         before = self.state_dict()
-        graph = GraphedFunction(fly_and_draw, action)
+        try:
+            graph = GraphedFunction(fly_and_draw, action)
+        except RuntimeError as error:
+            if self.own_reward is None:
+                raise
+            raise RuntimeError(
+                f"{self.own_reward.name} cannot be captured as a CUDA graph. It must compute with tensors alone: no "
+                f".item(), no if on a number, no index by a mask. CUDA says: {error}"
+            ) from error
         self.load_state_dict(before)
         return graph
 
@@ -427,13 +468,21 @@ class RaceWorlds:
         """The race in each drone's own frame, float32 (N, 21); see `RaceVector`."""
         return self.race_vector(self.simulator.state, self.race.target_gate)
 
+    def race_state(self) -> RaceState:
+        """How the race of each drone stands, as functions of one's own are given it: copies."""
+        return self._states(self.simulator.state, self._last_action)
+
+    def observed_vector(self) -> Tensor:
+        """What an agent sees under `vector`, float32 (N, V): by a function of one's own, or the race vector."""
+        return self.vector() if self.own_vector is None else self.own_vector.vector(self.race_state())
+
     def state_dict(self) -> dict[str, Any]:
         """Return all that coming steps and episodes depend on, for `torch.save`."""
         return {
             "simulator": self.simulator.state_dict(),
             "race": self.race.state_dict(),
             "generator": self._generator.get_state(),
-            **({"last_action": self._last_action.clone()} if self.action_change_weight else {}),
+            **({"last_action": self._last_action.clone()} if self._remembers else {}),
             **({} if self._held is None else {"frames": self._held.state_dict()}),
             **({} if self.imu is None else {"imu": self.imu.state_dict()}),
         }
@@ -453,7 +502,7 @@ class RaceWorlds:
             raise ValueError("The saved worlds had another camera_rate than these: resume with theirs.")
         if ("imu" in state_dict) != (self.imu is not None):
             raise ValueError("The saved worlds had another imu than these: resume with theirs.")
-        if self.action_change_weight and "last_action" in state_dict:
+        if self._remembers and "last_action" in state_dict:
             self._last_action.copy_(state_dict["last_action"])
         self.begun = True
         generator = state_dict["generator"].cpu()

@@ -145,7 +145,8 @@ def dream(
     assert trajectory.pixels is not None
     action = torch.nn.functional.pad(trajectory.action, (0, 0, 1, 0))  # (K + 1, A) the action that led here
     flight = {"pixels": trajectory.pixels, "previous_action": action, "target_gate": trajectory.target_gate}
-    flight |= {} if trajectory.imu is None else {"imu": trajectory.imu}
+    beside = {"imu": trajectory.imu, "vector": trajectory.vector}
+    flight |= {name: numbers for name, numbers in beside.items() if numbers is not None}
     windows = {name: torch.stack([value[part] for part in parts]) for name, value in flight.items()}
     shape = windows["pixels"].shape[:2]
     windows["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool)

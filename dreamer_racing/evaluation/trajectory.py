@@ -70,6 +70,8 @@ class Trajectory:
     """Of the camera that it was flown by, upwards from the body's x axis, degrees; None without one, or unknown."""
     imu: Tensor | None = None
     """(K + 1, 6) what the drone's IMU told beside the images; None without one, and in files."""
+    vector: Tensor | None = None
+    """(K + 1, V) numbers that the agent saw, likewise."""
 
     @property
     def speed(self) -> Tensor:
@@ -89,6 +91,7 @@ class Trajectory:
             value=None if self.value is None else self.value[first:last],
             camera_tilt=self.camera_tilt,
             imu=None if self.imu is None else self.imu[first : last + 1],
+            vector=None if self.vector is None else self.vector[first : last + 1],
         )
 
     @property
@@ -163,7 +166,7 @@ class TrajectoryRecorder:
         for name in ("position", "attitude", "linear_velocity"):
             self._rows[name].append(self._copy(tensordict["privileged", name]))
         self._rows["target_gate"].append(self._copy(tensordict["privileged", "target_gate"].squeeze(-1)))
-        for name in ("pixels", "imu") if self._pixels else ():
+        for name in ("pixels", "imu", "vector") if self._pixels else ():
             if (seen := tensordict.get(name, None)) is not None:
                 self._rows[name].append(self._copy(seen))
 

@@ -55,9 +55,6 @@ class ActorStep(nn.Module):
     Attributes:
         noise_shape: Shape of the input ``noise``, or None if there is none.
 
-    Raises:
-        ValueError: If the agent sees images and numbers both, other than those of an IMU.
-
     Example:
         >>> from dreamer_racing.modules import Interface, get_size
         >>> step = ActorStep(Agent(get_size("debug"), Interface(), decode=False))
@@ -72,9 +69,6 @@ class ActorStep(nn.Module):
     def __init__(self, agent: Agent) -> None:
         super().__init__()
         self.interface, self.size = agent.interface, agent.world_model.size
-        if self.interface.observation_keys not in ([PIXELS], [VECTOR], [PIXELS, IMU]):
-            seen = " and ".join(self.interface.observation_keys)
-            raise ValueError(f"This agent sees {seen}; beside images only what an IMU tells can be exported.")
         self.encoder = copy.deepcopy(agent.world_model.encoder)
         self.rssm = copy.deepcopy(agent.world_model.rssm)
         self.actor = copy.deepcopy(agent.actor)
@@ -99,7 +93,7 @@ class ActorStep(nn.Module):
             z: State after the last step, ``(1, S)``.
             previous_action: ``(1, A)``.
             is_init: Whether this is the first step of an episode, bool ``(1,)``.
-            more: What the IMU tells, float32 ``(1, 6)``, of an agent that has one; the noise, where there is any.
+            more: Numbers seen beside images, float32 ``(1, V)``, where there are any; the noise, likewise.
 
         Returns:
             Action ``(1, A)`` in [−1, 1], next belief ``(1, D)``, next state ``(1, S)``.
@@ -125,7 +119,8 @@ class ActorStep(nn.Module):
             if interface.pixels
             else {"vector": torch.zeros(1, interface.vector_dim)}
         )
-        imu = {IMU: torch.zeros(1, interface.vector_dim)} if interface.vector_key == IMU else {}
+        beside = interface.vector_key if interface.pixels and interface.vector_dim else None
+        numbers = {} if beside is None else {beside: torch.zeros(1, interface.vector_dim)}
         noise = {} if self.noise_shape is None else {"noise": torch.full((1, *self.noise_shape), 0.5)}
         return {
             **seen,
@@ -133,7 +128,7 @@ class ActorStep(nn.Module):
             "z": torch.zeros(1, size.state),
             "previous_action": torch.zeros(1, interface.action_dim),
             "is_init": torch.ones(1, dtype=torch.bool),
-            **imu,
+            **numbers,
             **noise,
         }
 
@@ -212,6 +207,9 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
             "latent=sample: this agent's states are the probabilities of their categoricals, of which nothing is drawn "
             "(model.sampled=false): export it with latent=mode."
         )
+    seen = agent.interface.observation_keys
+    if seen not in ([PIXELS], [VECTOR], [PIXELS, IMU]):
+        raise ValueError(f"This agent sees {' and '.join(seen)}; beside images only an IMU's numbers can be exported.")
     return LATENTS[latent](agent)
 
 

@@ -19,10 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
-from dreamer_racing.losses.own import import_own
 from dreamer_racing.modules.actor import ActionDistribution
 from dreamer_racing.modules.frozen import frozen
-from dreamer_racing.settings import suggestion
+from dreamer_racing.settings import import_own, suggestion
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ def find_objective(name: str) -> Objective:
         ValueError: If there is none; the message lists those that there are, or says where a module was looked for.
     """
     if ":" in name:
-        found = import_own(name, "objective")
+        found = import_own(name, f"Objective {name!r}")
         if not callable(found):
             raise ValueError(f"Objective {name!r} is no function of a Trajectory.")
         return found

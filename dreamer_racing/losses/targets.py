@@ -13,13 +13,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from dreamer_racing.losses.config import LossConfig
-from dreamer_racing.losses.own import import_own
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.decoder import VectorDecoder
 from dreamer_racing.modules.interface import PIXELS, PRIVILEGED
 from dreamer_racing.modules.layers import autocast, linear
 from dreamer_racing.modules.rssm import Posterior
-from dreamer_racing.settings import suggestion
+from dreamer_racing.settings import import_own, suggestion
 
 
 class Target(nn.Module):
@@ -221,7 +220,7 @@ def find_targets(names: str) -> tuple[type[Target], ...]:
     found: list[type[Target]] = []
     for name in names.split("+"):
         if ":" in name:
-            own = import_own(name, "target")
+            own = import_own(name, f"Target {name!r}")
             if not (isinstance(own, type) and issubclass(own, Target)):
                 raise ValueError(f"Target {name!r} is no subclass of dreamer_racing.losses.Target.")
             found.append(own)

@@ -67,6 +67,8 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "control_rate": env.control_rate,
         "from_pixels": env.from_pixels,
         "imu": None if env.imu == "none" else env.imu,
+        "reward": env.reward,
+        "vector": env.vector,
         "device": env.device,
     }
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from composing.arena import track_as_begun, worlds_of
@@ -36,6 +37,7 @@ from dreamer_racing.envs.imu import load_imu
 from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval
+from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.figures.loggers import check_loggers
 from dreamer_racing.learners.ppo_update import KL_TOLERANCE
@@ -58,6 +60,8 @@ RACE_ONLY = (
     "env.control_rate",
     "env.camera_rate",
     "env.imu",
+    "env.reward",
+    "env.vector",
     "env.start_beyond_gate",
     "env.start_at_gate",
     "env.start_on_line",
@@ -203,6 +207,7 @@ def check_race(config: RunConfig) -> None:
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
         ("env", lambda: frame_interval(Camera(rate=config.env.camera_rate), config.env.control_rate)),
         ("env", lambda: load_imu(worlds_of(config)["imu"], config.env.from_pixels)),
+        ("env", lambda: try_own(config)),
         ("env", lambda: GateSweeper(track, miss_radius=config.env.miss_radius)),
         ("evaluation", lambda: StartSampler(track, start_noise=config.evaluation.start_noise)),
     ):
@@ -216,6 +221,22 @@ def check_race(config: RunConfig) -> None:
             f"env.start_beyond_gate={config.env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
             "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
         )
+
+
+def try_own(config: RunConfig) -> None:
+    """Refuse a reward or numbers of a user's own that cannot be had, or are not as they should be: fly a step by them.
+
+    Raises:
+        ValueError: the message names the setting, and what is wrong.
+    """
+    env = config.env
+    if env.reward is None and env.vector is None:
+        return
+    worlds = RaceWorlds(track_as_begun(config), 2, from_pixels=False, reward=env.reward, vector=env.vector)
+    worlds.reset()
+    worlds.step(torch.zeros(2, ACTION_SIZE))
+    worlds.observed_vector()
+    worlds.close()
 
 
 def check_replay(config: ReplayRunConfig) -> None:

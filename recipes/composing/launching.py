@@ -45,7 +45,9 @@ from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of
 from dreamer_racing.training.schedule import Ramp, RampClock
 from dreamer_racing.training.session import Session
 
-TRAINED_ON = ("track", "task", "decoys", "env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu")
+TRAINED_ON = (
+    "track", "task", "decoys", "env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector",
+)  # fmt: skip
 """What a run that is resumed cannot change."""
 
 

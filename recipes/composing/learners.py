@@ -94,7 +94,7 @@ def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Env
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
-        for name in ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu"):
+        for name in ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector"):
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")

@@ -69,6 +69,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
             print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
     if config.env.suite == "race":
         note_track(config)
+    if config.env.reward is not None and config.curriculum.maximum:
+        print(f"reward: {config.env.reward}, less the curriculum's penalty of body rates (curriculum=none: without it)")
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device

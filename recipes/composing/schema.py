@@ -32,6 +32,10 @@ class EnvConfig:
     camera_rate: float | None = setting(None, POSITIVE)
     # gyro and accelerometer, seen beside the images: none | exact | noisy
     imu: str = "none"
+    # module:function of your own in place of Eq. 1 of the paper (docs/own_rewards.md); null: that
+    reward: str | None = None
+    # module:function of your own, whose numbers the agent sees, too (docs/own_rewards.md); null: none beside images
+    vector: str | None = None
     # control steps of a training episode; null: those of 20 s, with env=dmc those of the task
     episode_steps: int | None = setting(None, COUNT)
     # share of training episodes, but for those on a line, that begin behind a gate, to practise turns

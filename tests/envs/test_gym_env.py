@@ -270,7 +270,9 @@ def test_wrong_arguments_are_explained() -> None:
         envs.step(np.zeros((2, 4)))
     with pytest.raises(ValueError, match="seed=\\[1, 2, 3\\]: one number"):
         envs.reset(seed=[1, 2, 3])
-    with pytest.raises(ValueError, match="observation='image': choose one of pixels, pixels_imu, vector, state, both"):
+    with pytest.raises(
+        ValueError, match="observation='image': choose one of pixels, pixels_imu, pixels_vector, vector"
+    ):
         DroneRaceGymEnv(observation="image")
     with pytest.raises(ValueError, match="render_view='front': choose one of chase, onboard"):
         DroneRaceGymEnv(render_view="front")
@@ -326,9 +328,12 @@ def test_torchrl_takes_a_single_environment(observation: str) -> None:
     env = GymEnv(f"dreamer_racing:{IDS[0]}", observation=observation)
     check_env_specs(env)
     flown = env.rollout(3)
-    seen = {"pixels": {"pixels"}, "pixels_imu": {"pixels", "imu"}, "vector": {"observation"}}.get(
-        observation, {"position", "attitude", "target_gate"}
-    )
+    seen = {
+        "pixels": {"pixels"},
+        "pixels_imu": {"pixels", "imu"},
+        "pixels_vector": {"pixels", "vector"},
+        "vector": {"observation"},
+    }.get(observation, {"position", "attitude", "target_gate"})
     assert seen <= set(flown.keys()) and flown["next", "reward"].shape == (3, 1)
     env.close()
 

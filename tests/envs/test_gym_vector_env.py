@@ -232,7 +232,8 @@ def test_torchrl_takes_the_vector_environment(observation: str, mode: str) -> No
     flown = env.rollout(10, break_when_any_done=False)
     assert flown.batch_size == (3, 10)
     assert flown["next", "truncated"][..., 0].nonzero()[:, 1].tolist() == [3, 7] * 3  # and flies on from new starts
-    key = {"pixels": "observation", "vector": "observation", "pixels_imu": "imu"}.get(observation, "position")
+    keys = {"pixels": "observation", "vector": "observation", "pixels_imu": "imu", "pixels_vector": "vector"}
+    key = keys.get(observation, "position")
     assert (flown[key][:, 4] != flown["next", key][:, 3]).flatten(1).any(1).all()
     env.close()
 

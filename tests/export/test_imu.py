@@ -86,5 +86,5 @@ def test_an_actor_without_one_takes_none() -> None:
     assert contract["format_version"] == 1 and "imu" not in contract and "rate_hz" not in contract["camera"]
     with pytest.raises(ValueError, match="imu: this actor has none"):
         TorchActor(contract, step).step(np.zeros((32, 32, 3), np.uint8), imu=np.zeros(6, np.float32))
-    with pytest.raises(ValueError, match="sees pixels and vector; beside images only what an IMU tells"):
+    with pytest.raises(ValueError, match="sees pixels and vector; beside images only an IMU"):
         make_step(Agent(get_size("debug"), Interface(image_size=32, vector_dim=5), decode=False), "mode")

@@ -1,4 +1,4 @@
-"""An agent that learned by losses of one's own, which lie in another folder than one starts the next recipe from."""
+"""An agent of losses and a reward of one's own, which lie in another folder than one starts the next recipe from."""
 
 from __future__ import annotations
 
@@ -10,11 +10,18 @@ import pytest
 
 from tests.running_recipes import ROOT, TINY, recipe
 
-LOSSES = "\n\n".join(
-    re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "losses.md").read_text(encoding="utf-8"), re.M | re.S)
-)
-"""What the page writes."""
-OVERRIDES = ["loss.world_model=reconstruction+my_losses:Overshooting", "loss.actor=my_losses:smooth_reinforce"]
+
+def written(page: str) -> list[str]:
+    """The Python that a page writes."""
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
+
+
+LOSSES, REWARDS = "\n\n".join(written("losses.md")), "\n\n".join(written("own_rewards.md")[:-1])
+OVERRIDES = [
+    "loss.world_model=reconstruction+my_losses:Overshooting",
+    "loss.actor=my_losses:smooth_reinforce",
+    "env.reward=my_rewards:smooth",
+]
 
 
 @pytest.mark.slow
@@ -23,11 +30,13 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
     home.mkdir()
     elsewhere.mkdir()
     (home / "my_losses.py").write_text(LOSSES)
+    (home / "my_rewards.py").write_text(REWARDS)
     trained = recipe("dreamer_v3", *TINY, "tuned=none", *OVERRIDES, f"run_dir={run}", "evaluation.every=100", cwd=home)
     assert trained.returncode == 0, trained.stderr
     assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
+    assert "reward: my_rewards:smooth, less the curriculum's penalty of body rates" in trained.stdout
     lost = recipe("evaluate", f"checkpoint={run}", "episodes=1", cwd=elsewhere)
-    assert lost.returncode == 2 and f"there is no my_losses.py in {elsewhere}" in lost.stderr
+    assert lost.returncode == 2 and f"there is no my_rewards.py in {elsewhere}" in lost.stderr
     assert "set PYTHONPATH to that folder" in lost.stderr
     path = f"import sys; sys.path.append({str(home)!r})"  # what PYTHONPATH does
     for name, *overrides in (
