@@ -162,8 +162,9 @@ def recorded(folder: Path, files: dict[str, str], name: str) -> str | None:
     for file in files:
         if file.endswith(".json"):
             content = json.loads((folder / file).read_text(encoding="utf-8"))
-            records = content if isinstance(content, list) else [content.get("provenance") or content]
-            found |= {str(record[name]): None for record in records if isinstance(record, dict) and record.get(name)}
+            records = content if isinstance(content, list) else [content]
+            facts = [record.get("provenance") or record for record in records if isinstance(record, dict)]
+            found |= {str(fact[name]): None for fact in facts if fact.get(name)}
     return "; ".join(found) or None
 
 
