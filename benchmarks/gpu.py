@@ -3,7 +3,7 @@
     python benchmarks/gpu.py --json results/gpu/benchmark.jsonl --budget 1800          # all stages, in this order
     python benchmarks/gpu.py --json results/gpu/benchmark.jsonl --stages probe env     # some
     python benchmarks/gpu.py --device cpu --tiny --json tiny.jsonl           # whether all of it runs, without a GPU
-    python benchmarks/gpu.py --page results/gpu/benchmark.jsonl                        # no measuring: writes docs/benchmarks.md
+    python benchmarks/gpu.py --page results/gpu/benchmark.jsonl  # no measuring: writes docs/benchmarks.md
 
 Every job of a stage is a process of its own with a limit in seconds; what it measures is appended to the file as lines
 of JSON at once. A job that fails or takes too long leaves a line that says so, and the next one begins; all that it
