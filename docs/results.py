@@ -12,8 +12,8 @@ A folder of results is described by its `provenance.json`, an entry or a list of
 
 `title` and `files`, relative to the folder, are required. What is null or missing is read from the records of its JSON
 files where they have it (`machine`, `commit`), and otherwise the page says that it was not recorded. `command` is what
-was run at `commit`; `today` starts the same now, and is what the page prints where it is given. Rows of `headline` make
-the first table. `fills` names cells of results/planned.json, the table of what is to be run, and may say what a cell
+was run at `commit`, which the page links; `today` starts the same now, and is printed. Rows of `headline` make the
+first table. `fills` names cells of results/planned.json, the table of what is to be run, and may say what a cell
 shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
 which shows its `result`, with no commands and no pictures.
 """
@@ -46,7 +46,7 @@ Every number that the pages cite, with its command. [What we know](what_we_know.
 - **Success**: a flight finishes three laps. Unless a table says otherwise, a run flies 100 times from randomised starts
   that training never evaluated on. It flies by the weights at its end, without random actions (not *sampled*), by
   `./dev python recipes/evaluate.py checkpoint=runs/RUN episodes=100 num_envs=100 start_noise=1 seed=7`.
-- **CPU minutes** are those of one core, for the whole run.
+- **Minutes** are those of one CPU core unless said, for the whole run.
 - **Commands** on this page start the experiment with today's code, whose defaults may differ. Those that made the
   numbers are in the `provenance.json` of each section, for the commit that it names. Before commit 2c16a57 they call
   `recipes/latent_ppo.py` by its old name, `recipes/dreamer_v3.py`.
@@ -192,8 +192,8 @@ def headline_text(entries: list[Entry]) -> list[str]:
         for entry in entries
         for row in entry.headline
     ]
-    head = "## At a glance\n\nPut `./dev python recipes/` before a command. Each result links to its section.\n"
-    table = "| result | success | seeds | CPU minutes | today |\n|---|---|---|---|---|"
+    head = "## At a glance\n\nPut `OMP_NUM_THREADS=1 ./dev python recipes/` before a command of the last column.\n"
+    table = "| result | success | seeds | minutes | today |\n|---|---|---|---|---|"
     return [head, table, *rows, ""] if rows else []
 
 
@@ -203,11 +203,10 @@ def entry_text(entry: Entry, results: Path) -> str:
     lines = [f"## {entry.title}\n"]
     if entry.text:
         lines.append(f"{wrapped(entry.text)}\n")
-    if commands := entry.today or entry.command:
-        when = [] if entry.today else ["At the commit below:\n"]
-        lines.append("\n".join([*when, "```bash", *map(wrapped_command, commands), "```"]) + "\n")
-    origin = f"Made by [these commands](../{place.as_posix()}/provenance.json). " if entry.today else ""
-    lines.append("\n".join(filter(None, (wrapped(origin + provenance(entry)), links(entry, results)))) + "\n")
+    if entry.today:
+        lines.append("\n".join(["```bash", *map(wrapped_command, entry.today), "```"]) + "\n")
+    origin = f"Made by [these commands](../{place.as_posix()}/provenance.json)." if entry.command else ""
+    lines.append(wrapped(" ".join(filter(None, (origin, provenance(entry), links(entry, results))))) + "\n")
     pictures = [name for name in entry.files if name.endswith(PICTURES)]
     shown = [f"![{entry.files[name] or name}](../{(place / name).as_posix()})" for name in pictures]
     return "\n".join([*lines, *shown, *([""] if shown else [])])

@@ -72,10 +72,10 @@ def test_cells_without_a_result_say_so(results, folder):
 def test_facts_come_from_the_entry_or_its_records_and_are_never_invented(results, folder):
     page = results.make_page(folder)
     assert "Command: not recorded. Commit: c1; c2. Machine: M. Time: not recorded." in page
-    change(folder, command="python x.py", machine="N", wall_clock="3 minutes", commit="c3")
+    change(folder, today="python x.py", command="python w.py", machine="N", wall_clock="3 minutes", commit="c3")
     page = results.make_page(folder)
-    assert "```bash\npython x.py\n```\n\nCommit: c3. Machine: N. Time: 3 minutes." in page
-    change(folder, command=["python x.py", "python y.py  # likewise z.py"])
+    assert "```bash\npython x.py\n```\n\nMade by" in page and "Commit: c3. Machine: N. Time: 3 minutes." in page
+    change(folder, today=["python x.py", "python y.py  # likewise z.py"])
     assert "```bash\npython x.py\n# likewise z.py\npython y.py\n```" in results.make_page(folder)
 
 
@@ -95,9 +95,8 @@ def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, fo
     change(folder, command="python old.py", today="python new.py", commit="c3")
     page = results.make_page(folder)
     assert "```bash\npython new.py\n```" in page and "old.py" not in page
-    assert f"Made by [these commands](../{folder.name}/one/deep/provenance.json). Commit: c3." in page
-    change(folder, today=None)
-    assert "At the commit below:\n\n```bash\npython old.py\n```" in results.make_page(folder)
+    text = " ".join(page.split())
+    assert f"Made by [these commands](../{folder.name}/one/deep/provenance.json). Commit: c3." in text
 
 
 def test_headlines_are_the_first_table_and_link_to_their_sections(results, folder):
@@ -114,7 +113,7 @@ def test_many_files_are_linked_by_their_folder(results, folder):
     for name in names:
         (folder / "one" / "deep" / name).touch()
     change(folder, files=names)
-    assert f"Numbers: [4 files](../{folder.name}/one/deep)." in results.make_page(folder)
+    assert f"Numbers: [4 files](../{folder.name}/one/deep)." in " ".join(results.make_page(folder).split())
 
 
 def test_commands_are_not_broken_within_quotes(results):
@@ -126,9 +125,9 @@ def test_commands_are_not_broken_within_quotes(results):
 
 def test_long_lines_are_broken_and_tables_are_not(results, folder):
     row = "|" + " a |" * 100
-    change(folder, text=f"{'word ' * 100}\n\n{row}", command=f"python x.py {'option=value ' * 30}")
+    change(folder, text=f"{'word ' * 100}\n\n{row}", today=f"python x.py {'option=value ' * 30}")
     lines = results.make_page(folder).splitlines()
-    assert row in lines and max(len(line) for line in lines if line != row and "Numbers:" not in line) <= 128
+    assert row in lines and max(len(line) for line in lines if line != row and "](" not in line) <= 128
     assert any(line.startswith("    option=value") for line in lines)
 
 
