@@ -35,7 +35,7 @@ WIDTH = 128
 BRIEF = "In brief"
 COLUMNS = ("value", "seeds", "minutes", "command")
 """Of the first table, behind the result."""
-FEW = 3
+FEW = 1
 """So many files are linked one by one; more are their folder."""
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
@@ -48,10 +48,9 @@ Every number that the pages cite, with its command. [What we know](what_we_know.
   `./dev python recipes/evaluate.py checkpoint=runs/RUN episodes=100 num_envs=100 start_noise=1 seed=7`.
 - **Minutes** are those of one CPU core unless said, for the whole run.
 - **Commands** on this page start the experiment with today's code, whose defaults may differ. Those that made the
-  numbers are in the `provenance.json` of each section, for the commit that it names. Before commit 2c16a57 they call
+  numbers are linked in each section, with their commit. Before commit 2c16a57 they call
   `recipes/latent_ppo.py` by its old name, `recipes/dreamer_v3.py`.
-- **Files**: `metrics_*.csv` have all rows with evaluations and every fourth to twentieth of the others. `-dirty` behind
-  a commit means that files had been changed.
+- **Files**: `metrics_*.csv` have all rows with evaluations and every fourth to twentieth of the others.
 """
 FOOT = """This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results):
 change those, not the page. Results of earlier defaults are in the tree of commit 3c460b3."""
@@ -205,8 +204,7 @@ def entry_text(entry: Entry, results: Path) -> str:
         lines.append(f"{wrapped(entry.text)}\n")
     if entry.today:
         lines.append("\n".join(["```bash", *map(wrapped_command, entry.today), "```"]) + "\n")
-    origin = f"Made by [these commands](../{place.as_posix()}/provenance.json)." if entry.command else ""
-    lines.append(wrapped(" ".join(filter(None, (origin, provenance(entry), links(entry, results))))) + "\n")
+    lines.append(wrapped(" ".join(filter(None, (provenance(entry, place), links(entry, results))))) + "\n")
     pictures = [name for name in entry.files if name.endswith(PICTURES)]
     shown = [f"![{entry.files[name] or name}](../{(place / name).as_posix()})" for name in pictures]
     return "\n".join([*lines, *shown, *([""] if shown else [])])
@@ -226,11 +224,11 @@ def brief_text(entries: list[Entry], results: Path) -> list[str]:
     return [f"## {BRIEF}\n", head, table, *rows, ""] if rows else []
 
 
-def provenance(entry: Entry) -> str:
-    """Say where an entry comes from."""
-    facts: dict[str, str | None] = {} if entry.command else {"Command": None}
-    facts |= {"Commit": entry.commit, "Machine": entry.machine, "Time": entry.wall_clock}
-    return " ".join(f"{name}: {value or NOT_RECORDED}." for name, value in facts.items())
+def provenance(entry: Entry, place: Path) -> str:
+    """Say where an entry comes from; its commands and commits are where the link leads."""
+    recorded = f"[Commands and commits](../{place.as_posix()}/provenance.json)."
+    start = recorded if entry.command else f"Command: {NOT_RECORDED}. Commit: {entry.commit or NOT_RECORDED}."
+    return f"{start} Machine: {entry.machine or NOT_RECORDED}. Time: {entry.wall_clock or NOT_RECORDED}."
 
 
 def links(entry: Entry, results: Path) -> str:

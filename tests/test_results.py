@@ -74,7 +74,7 @@ def test_facts_come_from_the_entry_or_its_records_and_are_never_invented(results
     assert "Command: not recorded. Commit: c1; c2. Machine: M. Time: not recorded." in page
     change(folder, today="python x.py", command="python w.py", machine="N", wall_clock="3 minutes", commit="c3")
     page = results.make_page(folder)
-    assert "```bash\npython x.py\n```\n\nMade by" in page and "Commit: c3. Machine: N. Time: 3 minutes." in page
+    assert "```bash\npython x.py\n```\n\n[Commands and commits]" in page and "Machine: N. Time: 3 minutes." in page
     change(folder, today=["python x.py", "python y.py  # likewise z.py"])
     assert "```bash\npython x.py\n# likewise z.py\npython y.py\n```" in results.make_page(folder)
 
@@ -95,8 +95,7 @@ def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, fo
     change(folder, command="python old.py", today="python new.py", commit="c3")
     page = results.make_page(folder)
     assert "```bash\npython new.py\n```" in page and "old.py" not in page
-    text = " ".join(page.split())
-    assert f"Made by [these commands](../{folder.name}/one/deep/provenance.json). Commit: c3." in text
+    assert f"[Commands and commits](../{folder.name}/one/deep/provenance.json). Machine: M." in page
 
 
 def test_headlines_are_the_first_table_and_link_to_their_sections(results, folder):
