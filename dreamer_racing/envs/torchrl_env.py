@@ -1,6 +1,6 @@
 """`DroneRacingEnv`: the race as a natively batched TorchRL environment.
 
-Keys, shapes and units: `docs/architecture.md`. Shapes: N environments.
+Keys, shapes and units: `docs/api/environments.md`. Shapes: N environments.
 """
 
 from collections.abc import Mapping

@@ -452,7 +452,7 @@ class RaceWorlds:
         return torch.cat(parts)
 
     def privileged(self) -> dict[str, Tensor]:
-        """Copies of what the pixel agent must not see; see the key table in `docs/architecture.md`."""
+        """Copies of what the pixel agent must not see; see the key table in `docs/api/environments.md`."""
         state = self.simulator.state
         return {
             **{field.name: getattr(state, field.name).to(torch.float32, copy=True) for field in fields(state)},

@@ -1,7 +1,7 @@
 """From what a collector yields to replay records, one an observation.
 
 Shapes: N environments, T steps a rollout, M records of one rollout. The record layout is the table of
-``docs/architecture.md``.
+``docs/api/training.md``.
 """
 
 from __future__ import annotations

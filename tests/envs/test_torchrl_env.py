@@ -1,4 +1,4 @@
-"""`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/architecture.md` promises."""
+"""`DroneRacingEnv`: TorchRL's conformance, and what each key of `docs/api/environments.md` promises."""
 
 import copy
 import gc

@@ -80,7 +80,7 @@ def collect(env: CountingEnv, steps: int, batches: int, seed: int = 0) -> list[T
 
 
 class ReferenceStreams:
-    """The record layout of docs/architecture.md, spelled out step by step."""
+    """The record layout of docs/api/training.md, spelled out step by step."""
 
     def __init__(self, num_envs: int, length: int):
         self.streams: list[list[dict]] = [[] for _ in range(num_envs)]
