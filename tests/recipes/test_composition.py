@@ -238,7 +238,7 @@ def test_dreamer_as_published_is_one_word_away() -> None:
     ) | {"num_envs": None}
     assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
     schedule = OmegaConf.to_container(faithful.schedule)
-    assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.ScheduleConfig))
+    assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.DreamerV3ScheduleConfig))
     assert all(ramp["to"] is None for ramp in schedule.values())
 
 
@@ -273,7 +273,7 @@ def test_a_gpu_trains_by_the_settings_that_are_known_and_says_first_what_is_not(
     monkeypatch.setattr(resolving, "choose_device", lambda device: torch.device("cuda" if device == "auto" else device))
     assert resolving.tune(compose(algorithm, "track=kidney", "device=auto")) == "race"
     first, *others = capsys.readouterr().out.splitlines()
-    assert first.startswith("settings: tuned=race, known from CPUs; no whole run on cuda has been measured.")
+    assert first.startswith("settings: tuned=race, known from CPUs.")
     assert "tuned=gpu" in first and "model=size12m" in first and not others
     assert resolving.tune(compose(algorithm, "device=auto", "model=size12m")) == "none"
     assert "none are chosen for model=size12m" in capsys.readouterr().out
@@ -322,14 +322,14 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
 
 
 def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
-    """The race's ramp of `kl_target` is for actors that learn by PPO; a run without one goes on without it."""
+    """The race's ramps of `kl_target` and of the horizon belong to one algorithm each."""
     overrides = ["tuned=race", "device=cpu", "total_env_steps=100000"]
     found = []
     for name in ("latent_ppo", "dreamer_v3"):
         resolved = recipe_module(name).resolve(compose(name, *overrides))
         moved = recipe_module("composing.learners").make_schedule(OmegaConf.to_object(resolved)).at(0)
         found.append(set(moved) - {"rates", "world_model_rate", "start_on_line"})
-    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std"}]
+    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std", "imagination_horizon"}]
 
 
 def test_nothing_goes_by_gates_where_there_are_none():
