@@ -76,8 +76,9 @@ class Entry:
 
     @property
     def anchor(self) -> str:
-        """Of its heading, as GitHub makes them."""
-        kept = (letter for letter in self.title.lower() if letter.isalnum() or letter in " -_")
+        """Of its heading, or the last table's, as GitHub makes them."""
+        heading = BRIEF if self.brief else self.title
+        kept = (letter for letter in heading.lower() if letter.isalnum() or letter in " -_")
         return "".join(kept).replace(" ", "-")
 
 
