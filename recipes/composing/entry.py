@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import hydra
+from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
@@ -36,9 +37,13 @@ TEXTS = (
 def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     """Make a function of a configuration the recipe of a name, whose file in `config` hydra composes it from.
 
+    A recipe without a file has the schema of its name for a configuration, and hydra leaves nothing behind.
+
     An override that hydra does not take is said in one paragraph on stderr, with exit status 2. Ctrl-C, where the
     recipe has no use for it, ends it with the shell's status.
     """
+    if not (CONFIG_DIR / f"{name}.yaml").is_file():
+        ConfigStore.instance().store(name=name, node=schema_alone(name))
 
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(function)
@@ -61,6 +66,15 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
         return start
 
     return decorate
+
+
+def schema_alone(name: str) -> dict[str, Any]:
+    """Return the configuration of a recipe that has settings of its own and chooses nothing from groups."""
+    silent = [{f"override hydra/{kind}_logging": "none"} for kind in ("job", "hydra")]
+    return {
+        "defaults": [f"{name}_schema", "_self_", *silent],
+        "hydra": {"output_subdir": None, "run": {"dir": "."}},
+    }
 
 
 def readable(argument: str) -> str:

@@ -244,7 +244,8 @@ def _attributes(docstring: str) -> Iterator[tuple[str, str]]:
 
 def groups(recipe: str) -> dict[str, list[str]]:
     """Return the configuration groups that a recipe composes, and what there is to choose in each."""
-    defaults = yaml.safe_load((CONFIG_DIR / f"{recipe}.yaml").read_text(encoding="utf-8")).get("defaults", [])
+    path = CONFIG_DIR / f"{recipe}.yaml"
+    defaults = yaml.safe_load(path.read_text(encoding="utf-8")).get("defaults", []) if path.is_file() else []
     named = [name for entry in defaults if isinstance(entry, dict) for name in entry if "/" not in name]
     named += ["decoys"] if any(option.name == "decoys" for option in options(recipe)) else []
     choices = {name: sorted(path.stem for path in (CONFIG_DIR / name).glob("*.yaml")) for name in named}

@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.settings import check_settings, shortened
-from tests.running_recipes import CONFIG, EXPERIMENTS, recipe_module
+from tests.running_recipes import CONFIG, ROOT, recipe_module
 
-RECIPES = sorted(path.stem for path in CONFIG.glob("*.yaml") if path.stem not in EXPERIMENTS)
+RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 TRAINING = {
     "dreamer_v3": "check_world_model_run",
     "latent_ppo": "check_world_model_run",

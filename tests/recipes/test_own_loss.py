@@ -36,7 +36,7 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
     assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
     assert "reward: my_rewards:smooth, less the curriculum's penalty of body rates" in trained.stdout
     lost = recipe("evaluate", f"checkpoint={run}", "episodes=1", cwd=elsewhere)
-    assert lost.returncode == 2 and f"there is no my_rewards.py in {elsewhere}" in lost.stderr
+    assert lost.returncode == 2 and f"there is no my_losses.py in {elsewhere}" in lost.stderr
     assert "set PYTHONPATH to that folder" in lost.stderr
     path = f"import sys; sys.path.append({str(home)!r})"  # what PYTHONPATH does
     for name, *overrides in (
