@@ -23,10 +23,10 @@ RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     [
-        "hydra", "matplotlib.pyplot", "scipy.ndimage", "torch.utils.tensorboard", "torchrl.collectors", "torchrl.data",
-        "torchrl.envs", "torchrl.record", "torchrl.trainers.algorithms", "warp", "dreamer_racing.envs",
-        "dreamer_racing.figures.loggers", "dreamer_racing.figures.report", "dreamer_racing.learners.latent_ppo",
-        "dreamer_racing.training.session",
+        "tests.planned_lines", "hydra", "matplotlib.pyplot", "scipy.ndimage", "scipy.stats", "torch.utils.tensorboard",
+        "torchrl.collectors", "torchrl.data", "torchrl.envs", "torchrl.record", "torchrl.trainers.algorithms", "warp",
+        "dreamer_racing.envs", "dreamer_racing.figures.loggers", "dreamer_racing.figures.report",
+        "dreamer_racing.learners.latent_ppo", "dreamer_racing.training.session",
     ]
 )  # fmt: skip
 
@@ -112,6 +112,11 @@ def recipe(
 def started(name: str, *overrides: str, cwd: Path, before: str = "") -> Forked:
     """Start a recipe, as `recipe` does."""
     return Forked(_run, str(RECIPES / f"{name}.py"), overrides, before, cwd=cwd)
+
+
+def program(path: Path, *arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
+    """Run any file of Python, as `recipe` does."""
+    return Forked(_run, str(path), arguments, "", cwd=cwd).communicate(timeout)
 
 
 def _run(path: str, overrides: tuple[str, ...], before: str) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
 
 from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics
 
@@ -256,6 +255,8 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
 
     Reference: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.
     """
+    import scipy.stats  # a second, which training does without
+
     return scipy.stats.trim_mean(scores, 0.25, axis=0)
 
 

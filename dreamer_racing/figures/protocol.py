@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
@@ -53,6 +52,8 @@ def share_bar(happened: Sequence[bool]) -> Bar:
 
     Reference: Wilson, Probable inference, the law of succession, and statistical inference, 1927.
     """
+    import scipy.stats  # a second, which training does without
+
     low, high = scipy.stats.binomtest(sum(happened), len(happened)).proportion_ci(0.95, "wilson")
     return Bar(float(np.mean(happened)), float(low), float(high), len(happened))
 

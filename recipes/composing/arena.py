@@ -56,6 +56,11 @@ def camera_of(config: RunConfig) -> Camera:
     return Camera(width=side, height=side, tilt=config.env.camera_tilt, rate=config.env.camera_rate)
 
 
+def imu_of(config: RunConfig) -> str | None:
+    """The inertial measurements that the agent sees, as `DroneRacingEnv` takes them."""
+    return None if config.env.imu == "none" else config.env.imu
+
+
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
     env = config.env
@@ -66,7 +71,7 @@ def worlds_of(config: RunConfig) -> dict[str, Any]:
         "camera": camera_of(config),
         "control_rate": env.control_rate,
         "from_pixels": env.from_pixels,
-        "imu": None if env.imu == "none" else env.imu,
+        "imu": imu_of(config),
         "reward": env.reward,
         "vector": env.vector,
         "device": env.device,

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import track_as_begun, worlds_of
+from composing.arena import imu_of, track_as_begun
 from composing.command_line import override_key
 from composing.schema import (
     LOSS_RAMPS,
@@ -175,7 +175,6 @@ def check(config: RunConfig) -> None:
             f"WORLD_SIZE={parallel.asked_for()}: algorithm={config.algorithm} trains in one process, and of those that "
             "torchrun starts only recipes/dreamer_v3.py and latent_ppo.py makes use: start it without torchrun."
         )
-    values = OmegaConf.structured(config)
     on_cuda = config.env.device.partition(":")[0] == "cuda"
     if not on_cuda and config.env.device != "cpu":
         raise ValueError(f"env.device={config.env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
@@ -190,7 +189,7 @@ def check(config: RunConfig) -> None:
     if is_race(config):
         check_race(config)
         return
-    defaults = OmegaConf.structured(RunConfig)
+    values, defaults = OmegaConf.structured(config), OmegaConf.structured(RunConfig)
     for name in RACE_ONLY:
         if (value := OmegaConf.select(values, name)) != (default := OmegaConf.select(defaults, name)):
             raise ValueError(f"{name}={value} is for races, and env.suite={config.env.suite}: leave it at {default}.")
@@ -206,7 +205,7 @@ def check_race(config: RunConfig) -> None:
     for group, check_it in (
         ("env", lambda: at_control_rate(load_preset(config.env.preset), config.env.control_rate)),
         ("env", lambda: frame_interval(Camera(rate=config.env.camera_rate), config.env.control_rate)),
-        ("env", lambda: load_imu(worlds_of(config)["imu"], config.env.from_pixels)),
+        ("env", lambda: load_imu(imu_of(config), config.env.from_pixels)),
         ("env", lambda: try_own(config)),
         ("env", lambda: GateSweeper(track, miss_radius=config.env.miss_radius)),
         ("evaluation", lambda: StartSampler(track, start_noise=config.evaluation.start_noise)),

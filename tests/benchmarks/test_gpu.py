@@ -22,25 +22,35 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def stages_of(records: list[dict]) -> set[str]:
-    return {record["stage"] for record in records}
+@pytest.mark.slow
+def test_a_stage_runs_on_a_cpu_and_once(tmp_path: Path) -> None:
+    """The shortest; all of them run by `python benchmarks/gpu.py --device cpu --tiny --json FILE`."""
+    said = run(tmp_path, "--stages", "probe").stdout
+    records = gpu.read(tmp_path / "results.jsonl")
+    assert [(record["name"], record["state"]) for record in records] == [("machine", "done")], said
+    assert records[0]["tiny"] and records[0]["copy_gb_per_s"] > 0.0
+    assert run(tmp_path, "--stages", "probe").stdout == "", "all was done"
+    assert gpu.read(tmp_path / "results.jsonl") == records
+    assert gpu.identity(records[0]) != gpu.identity(records[0] | {"device": "cuda", "tiny": False})
 
 
 @pytest.mark.slow
-def test_stages_run_on_a_cpu_and_once(tmp_path: Path) -> None:
-    """Of those that are quick; all of them run by `python benchmarks/gpu.py --device cpu --tiny --json FILE`."""
-    stages = ["probe", "learner", "speed"]
-    said = run(tmp_path, "--stages", *stages).stdout
-    records = gpu.read(tmp_path / "results.jsonl")
-    assert [record["state"] for record in records] == ["done"] * len(records), said
-    assert stages_of(records) == set(stages) and all(record["tiny"] for record in records)
-    by_name = {record["name"]: record for record in records}
-    assert by_name["captured"]["loss_after"] < by_name["captured"]["loss_before"]
-    kernels = by_name["kernels of debug eager 2x4"]
+def test_jobs_of_updates_measure_what_they_promise(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Their commands, in this process."""
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    found = {}
+    for stage in ("learner", "speed"):
+        for name, _, command in gpu.STAGES[stage]("cpu", True, tmp_path):
+            monkeypatch.setattr(sys, "argv", command)
+            gpu.main()
+            found[name] = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["captured"]["loss_after"] < found["captured"]["loss_before"]
+    kernels = found["kernels of debug eager 2x4"]
     assert kernels["launched"] > 100 and sum(kernels["kernels_ms"].values()) <= kernels["ms"]
-    assert run(tmp_path, "--stages", *stages).stdout == "", "all was done"
-    assert gpu.read(tmp_path / "results.jsonl") == records
-    assert gpu.identity(records[0]) != gpu.identity(records[0] | {"device": "cuda", "tiny": False})
+    for name in ("debug eager 2x4", "debug eager 2x4 without few kernels"):
+        assert found[name]["ms"] > 0.0
 
 
 def test_what_fails_or_takes_too_long_says_so(tmp_path: Path) -> None:
@@ -67,9 +77,14 @@ def test_a_failed_job_stops_no_other_and_is_tried_again(monkeypatch: pytest.Monk
     assert states[1] == [*states[0], ("a", "done")]
 
 
-def test_no_job_begins_when_the_budget_is_spent(tmp_path: Path) -> None:
-    assert "budget of 1 s is spent before probe machine" in run(tmp_path, "--budget", "1").stdout
-    assert not (tmp_path / "results.jsonl").exists()
+def test_no_job_begins_when_the_budget_is_spent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    results = tmp_path / "results.jsonl"
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--json", str(results), "--device", "cpu", "--budget", "1"])
+    gpu.main()
+    assert "budget of 1 s is spent before probe machine" in capsys.readouterr().out
+    assert not results.exists()
 
 
 def test_the_table_says_what_was_not_run(tmp_path: Path) -> None:

@@ -132,13 +132,57 @@ def test_unknown_names_are_refused(override: str, words: str, tmp_path: Path) ->
         next_command(tmp_path, override)
 
 
+FORKED = """
+import os, runpy, signal, subprocess, sys
+import hydra.core.global_hydra
+class Forked:
+    def __init__(self, command, stdout, stderr, start_new_session):
+        sys.stdout.flush()
+        self.pid = os.fork()
+        if self.pid:
+            return
+        status = 1
+        try:
+            os.setsid()
+            os.dup2(stdout.fileno(), 1)
+            os.dup2(stderr.fileno(), 2)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_DFL)
+            hydra.core.global_hydra.GlobalHydra.instance().clear()
+            sys.argv = command[1:]
+            runpy.run_path(command[1], run_name="__main__")
+            status = 0
+        except SystemExit as ended:
+            status = ended.code or 0
+        except BaseException as error:
+            sys.excepthook(type(error), error, error.__traceback__)
+        finally:
+            sys.stdout.flush()
+            os._exit(status)
+    def __enter__(self):
+        return self
+    def __exit__(self, *error):
+        pass
+    def send_signal(self, number):
+        os.kill(self.pid, number)
+    def wait(self):
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+popen = subprocess.Popen
+subprocess.Popen = lambda command, **given: (Forked if "start_new_session" in given else popen)(command, **given)
+"""
+"""Whole runs, but of processes that have imported what the experiment's has, where starting Python is not the point."""
+SHORT = [
+    "budget=smoke", "track=circle", "device=cpu", "env.episode_steps=40", "total_env_steps=640", "logger.every=320",
+    "evaluation.every=640", "evaluation.episodes=1", "evaluation.video_steps=10", "checkpoint.every=0",
+]  # fmt: skip
+
+
 @pytest.mark.slow
 def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     algorithms = tuple(recipe_module("composing.schema").RECIPES)
-    command = ["--multirun", "budget=smoke", "name=smoke", f"algorithm={','.join(algorithms)}", "track=circle",
-               "seed=0", "device=cpu", "env.image_size=48", "evaluation.video_steps=10", "total_env_steps=640",
-    ]  # fmt: skip
-    first, second = (recipe("experiment", *command, cwd=tmp_path, timeout=600) for _ in range(2))
+    command = ["--multirun", *SHORT, "name=smoke", f"algorithm={','.join(algorithms)}", "seed=0", "env.image_size=48"]
+    first = recipe("experiment", *command, cwd=tmp_path, timeout=600, before=FORKED)
+    second = recipe("experiment", *command, "~hydra.callbacks.figures", cwd=tmp_path, timeout=600, before=FORKED)
     assert first.returncode == 0 and second.returncode == 0, first.stderr + second.stderr
     for algorithm in algorithms:
         run_dir = tmp_path / "runs" / "smoke" / f"{algorithm}_circle_default_seed0"
@@ -162,7 +206,7 @@ def test_all_algorithms_run_once_and_only_once(tmp_path: Path) -> None:
     assert "imagined_dreamer_v3_circle_default_seed0.png" in figures
 
 
-STATES = ["--multirun", "budget=smoke", "name=few", "algorithm=ppo", "variant=state", "track=circle", "device=cpu"]
+STATES = ["--multirun", *SHORT, "name=few", "algorithm=ppo", "variant=state"]
 
 
 @pytest.mark.slow
@@ -172,7 +216,7 @@ def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Pat
         (runs / f"ppo_circle_state_seed{seed}").mkdir(parents=True)
     (runs / "ppo_circle_state_seed0" / "checkpoints").write_text("in the way")
     lock = RunLock(runs / "ppo_circle_state_seed1")
-    done = recipe("experiment", *STATES, "seed=0,1,2", cwd=tmp_path, timeout=300)
+    done = recipe("experiment", *STATES, "seed=0,1,2", cwd=tmp_path, before=FORKED)
     lock.release()
     output = done.stdout + done.stderr
     assert done.returncode == 1, output
@@ -186,10 +230,10 @@ def test_a_run_that_fails_does_not_stop_the_others_nor_the_figures(tmp_path: Pat
 @pytest.mark.slow
 def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(tmp_path: Path) -> None:
     runs = tmp_path / "runs" / "few"
-    length = ["seed=0,1", "evaluation.every=0", "checkpoint.every=0"]
+    length = ["seed=0,1", "evaluation.every=0"]
     metrics, lines = runs / "ppo_circle_state_seed0" / "metrics.csv", 1
-    for number in (signal.SIGTERM, signal.SIGINT):
-        launcher = started("experiment", *STATES, *length, "total_env_steps=100000000", cwd=tmp_path)
+    for number, before in ((signal.SIGTERM, ""), (signal.SIGINT, FORKED)):
+        launcher = started("experiment", *STATES, *length, "total_env_steps=100000000", cwd=tmp_path, before=before)
         deadline = time.monotonic() + 200
         while not (metrics.exists() and len(metrics.read_text().splitlines()) > lines):
             assert launcher.process.is_alive() and time.monotonic() < deadline
@@ -203,6 +247,6 @@ def test_a_signal_ends_the_experiment_and_the_next_start_goes_on(tmp_path: Path)
         lines = len(metrics.read_text().splitlines())
     reached = int(latest_checkpoint(runs / "ppo_circle_state_seed0").name.rpartition("-")[2])
     last = [f"total_env_steps={reached + 500}", "seed=0"]
-    done = recipe("experiment", *STATES, *length, *last, cwd=tmp_path)
+    done = recipe("experiment", *STATES, *length, *last, cwd=tmp_path, before=FORKED)
     output = done.stdout + done.stderr
     assert done.returncode == 0 and "seed0: resumed" in output and "seed0: done" in output, output

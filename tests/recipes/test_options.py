@@ -104,19 +104,19 @@ def test_no_option_lets_a_value_of_another_kind_or_size_through_to_a_traceback(
     plain_errors, options = recipe_module("composing.command_line").plain_errors, names(recipe)
     whole = compose(recipe)
     check(recipe, copy.deepcopy(whole))  # as it is, it is taken
-    refused, wrong = 0, []
+    config, refused, wrong = copy.deepcopy(whole), 0, []
     each = 1 if len(options) < MANY else 3  # of the values, in turn
     for index, name in enumerate(options):
         for value in ODD[index % each :: each]:
-            config = copy.deepcopy(whole)
             try:
                 OmegaConf.update(config, name, value)
             except OmegaConfBaseException:
                 continue  # hydra says it as one of its own, which the test above is about
+            taken, config = config, copy.deepcopy(whole)
             capsys.readouterr()
             try:
                 with plain_errors():
-                    check(recipe, config)
+                    check(recipe, taken)
             except SystemExit as error:
                 refused += 1
                 words = capsys.readouterr().err
