@@ -21,8 +21,7 @@ SAFETY = (DOCS / "hil_safety.md").read_text(encoding="utf-8")
 TEXT = "".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("hil*.md")))
 LIMITS = SAFETY.partition("## Limits")[2].partition("\n## ")[0]
 ROWS = {
-    name: cells.split(" | ")
-    for name, cells in re.findall(r"^\| (?:\*\*)?`(\w+)`(?:\*\*)? \| (.*) \|$", LIMITS, re.M)
+    name: cells.split(" | ") for name, cells in re.findall(r"^\| (?:\*\*)?`(\w+)`(?:\*\*)? \| (.*) \|$", LIMITS, re.M)
 }
 
 
