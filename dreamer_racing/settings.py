@@ -199,6 +199,8 @@ def import_own(name: str, asked: str) -> Any:
         ValueError: If it cannot be imported; the message says where it was looked for, and what to set.
     """
     module, _, attribute = name.partition(":")
+    if not module or not attribute:
+        raise ValueError(f"{asked}: must be module:name, a file's name without .py and what it defines.")
     folder = str(Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)

@@ -139,16 +139,20 @@ class OwnFunction:
     def check(self) -> None:
         """Refuse numbers returned since the last check that are not finite; on a CUDA device it waits."""
         if self._broken:
+            self._broken.zero_()
             raise ValueError(f"{self.name} returned numbers that are not finite.")
 
     def _call(self, moment: Transition | RaceState) -> Tensor:
         """Return the function's numbers, float32."""
-        value = self._function(moment)
+        try:
+            value = self._function(moment)
+        except ValueError as error:  # of the function itself: whoever wrote it wants to see where
+            raise RuntimeError(f"{self.name} failed: {error}") from error
         device = self._broken.device
         if not isinstance(value, Tensor) or value.device != device:
             there = f" on {value.device}" if isinstance(value, Tensor) else ""
             raise ValueError(f"{self.name} returned {type(value).__name__}{there}: must be a tensor on {device}.")
-        value, finite = value.detach().float(), value.isfinite()
+        value, finite = value.detach().to(torch.float32, copy=True), value.isfinite()
         if device.type == "cuda":
             self._broken.logical_or_(~finite.all())
         elif not finite.all():

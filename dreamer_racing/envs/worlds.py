@@ -33,6 +33,7 @@ from dreamer_racing.envs.simulator.looks import LooksRandomisation, load_looks
 from dreamer_racing.envs.simulator.scene import Camera, frame_interval, load_camera
 from dreamer_racing.envs.simulator.warp_device import GraphedFunction
 from dreamer_racing.envs.tracks import Track, load_track
+from dreamer_racing.machine import is_out_of_memory
 from dreamer_racing.settings import (
     NOT_NEGATIVE,
     check_flags,
@@ -316,6 +317,8 @@ class RaceWorlds:
             RuntimeError: this process was forked from the one that made the worlds.
         """
         self._check_process()
+        for own in filter(None, (self.own_reward, self.own_vector)):
+            own.check()
         whole = mask is None
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -325,8 +328,6 @@ class RaceWorlds:
         self._images, self.begun = None, True
         if self._remembers:
             self._last_action.masked_fill_(mask.unsqueeze(-1), 0.0)
-        for own in filter(None, (self.own_reward, self.own_vector)):
-            own.check()
         if self._held is not None:
             together = whole or (self.device.type == "cpu" and bool(mask.all()))  # elsewhere that would wait
             self._held.begin(None if together else mask)
@@ -408,11 +409,11 @@ class RaceWorlds:
         try:
             graph = GraphedFunction(fly_and_draw, action)
         except RuntimeError as error:
-            if self.own_reward is None:
+            if self.own_reward is None or is_out_of_memory(error):
                 raise
             raise RuntimeError(
                 f"{self.own_reward.name} cannot be captured as a CUDA graph. It must compute with tensors alone: no "
-                f".item(), no if on a number, no index by a mask. CUDA says: {error}"
+                f".item(), no if on a number, no index by a mask, no tensor of Python's numbers. CUDA says: {error}"
             ) from error
         self.load_state_dict(before)
         return graph

@@ -63,7 +63,7 @@ def held_out_metrics(learner: WorldModelLearner, batch: TensorDictBase) -> dict[
     Raises:
         ValueError: If the windows are too short.
     """
-    horizon = learner.horizon
+    horizon = learner.config.imagination_horizon  # the same over a run, whatever is scheduled
     if batch.shape[1] < SEEN + horizon:
         raise ValueError(f"Windows of {batch.shape[1]} records: {SEEN} + horizon {horizon} are needed.")
     with _untouched(learner):

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.commands import install_extra
+from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, RECURRENT, OnnxActor, RecurrentActor, hash_file
 from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights
@@ -210,6 +211,11 @@ def make_step(agent: Agent, latent: str) -> ActorStep:
     seen = agent.interface.observation_keys
     if seen not in ([PIXELS], [VECTOR], [PIXELS, IMU]):
         raise ValueError(f"This agent sees {' and '.join(seen)}; beside images only an IMU's numbers can be exported.")
+    if seen == [VECTOR] and agent.interface.vector_dim != RACE_VECTOR_SIZE:
+        raise ValueError(
+            f"This agent sees {agent.interface.vector_dim} numbers of its own; only the {RACE_VECTOR_SIZE} of a race "
+            "can be exported."
+        )
     return LATENTS[latent](agent)
 
 

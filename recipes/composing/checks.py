@@ -231,9 +231,20 @@ def try_own(config: RunConfig) -> None:
     env = config.env
     if env.reward is None and env.vector is None:
         return
-    worlds = RaceWorlds(track_as_begun(config), 2, from_pixels=False, reward=env.reward, vector=env.vector)
+    if env.vector is not None and imu_of(config) is not None:
+        raise ValueError("vector and env.imu: agents see one set of numbers, leave one of them out.")
+    worlds = RaceWorlds(
+        track_as_begun(config),
+        2,
+        env.preset,
+        from_pixels=False,
+        control_rate=env.control_rate,
+        device=env.device,
+        reward=env.reward,
+        vector=env.vector,
+    )
     worlds.reset()
-    worlds.step(torch.zeros(2, ACTION_SIZE))
+    worlds.step(torch.zeros(2, ACTION_SIZE, device=env.device))
     worlds.observed_vector()
     worlds.close()
 

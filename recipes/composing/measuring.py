@@ -24,7 +24,7 @@ def measure(
     groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
     numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
     numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
-    windows = replay.held_out(WINDOWS, SEEN + learner.horizon, RECORDS)
+    windows = replay.held_out(WINDOWS, SEEN + learner.config.imagination_horizon, RECORDS)
     if windows is None or not session.counters["updates"]:
         return numbers
     with session.undisturbed():

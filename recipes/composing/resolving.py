@@ -70,7 +70,10 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     if config.env.suite == "race":
         note_track(config)
     if config.env.reward is not None and config.curriculum.maximum:
-        print(f"reward: {config.env.reward}, less the curriculum's penalty of body rates (curriculum=none: without it)")
+        print(
+            f"reward: {config.env.reward}, minus the curriculum's penalty of body rates, which grows once the mean "
+            f"return is above curriculum.threshold={config.curriculum.threshold:g} (curriculum=none: without it)"
+        )
     if config.run_dir is None:
         config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
     return device

@@ -216,6 +216,23 @@ def test_a_reward_that_waits_is_refused_on_a_gpu() -> None:
         worlds.step(ACTIONS[0].cuda())
 
 
+def test_an_error_of_the_function_itself_is_told_as_one() -> None:
+    def unpacks(step: Transition) -> Tensor:
+        rewards, _ = step.default_reward
+        return rewards
+
+    with pytest.raises(RuntimeError, match="reward=unpacks failed: too many values to unpack"):
+        fly(reward=unpacks)
+
+
+def test_what_a_function_keeps_is_not_what_was_seen() -> None:
+    kept = torch.zeros(SMALL["num_envs"], 1)
+    worlds, _ = fly(vector=lambda state: kept)
+    seen = worlds.observed_vector()
+    kept += 1.0
+    assert not seen.any()
+
+
 def test_states_are_copies() -> None:
     worlds, _ = fly(vector=OWN["gate_and_action"])
     state = worlds.race_state()

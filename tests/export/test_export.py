@@ -584,7 +584,9 @@ def test_bad_arguments_are_refused(agent: Agent, tmp_path: Path, monkeypatch: py
     with pytest.raises(ValueError, match="latent=median: there are mode and sample"):
         make_step(agent, "median")
     with pytest.raises(ValueError, match="pixels and vector"):
-        ActorStep(make_agent(interface=Interface(vector_dim=21)))
+        make_step(make_agent(interface=Interface(vector_dim=21)), "mode")
+    with pytest.raises(ValueError, match="sees 5 numbers of its own; only the 21 of a race"):
+        make_step(make_agent(interface=Interface(pixels=False, vector_dim=5)), "mode")
     with pytest.raises(ValueError, match="must end in .onnx"):
         check_output(tmp_path / "actor.pt")
     with pytest.raises(PermissionError, match="output=/dev/null/x/actor.onnx: cannot write"):

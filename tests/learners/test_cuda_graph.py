@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from tensordict import TensorDict
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.losses import Trajectory
 from tests.dreamers import learner_of
 
 
@@ -73,8 +75,16 @@ def test_after_the_capture_a_learner_is_measured_saved_and_flown(tmp_path: Path)
     course.close()
     assert learner.update(batch("cuda"))["loss"].isfinite(), "the graph still replays"
     assert other.update(batch("cuda"))["loss"].isfinite()
+    lengths, objective = [], other.objective
+
+    def noted(trajectory: Trajectory, **numbers: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        lengths.append(len(trajectory.action))
+        return objective(trajectory, **numbers)
+
+    other.objective = noted
     other.adjust(imagination_horizon=2)
-    assert other.update(batch("cuda"))["loss"].isfinite(), "what is scheduled is captured anew"
+    assert other.update(batch("cuda"))["loss"].isfinite()
+    assert lengths and set(lengths) == {2}, "what is scheduled is captured anew"
 
 
 @pytest.mark.gpu

@@ -311,14 +311,16 @@ def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
     assert set(names) == {"discount", "entropy_scale", "max_std", "min_std"}
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
+    overrides += ["schedule.imagination_horizon.to=2"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     begin, end = map(learners.make_schedule(config).at, (0, config.total_env_steps))
-    assert begin == {"rates": 1.0, "world_model_rate": 1.0} | {name: getattr(config.loss, name) for name in names}
-    assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5)
+    own = {"rates": 1.0, "world_model_rate": 1.0, "imagination_horizon": config.model.imagination_horizon}
+    assert begin == own | {name: getattr(config.loss, name) for name in names}
+    assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5) | {"imagination_horizon": 2}
     learner = learners.make_learner(config, Interface(pixels=False, vector_dim=21), "cpu")
     learner.adjust(**end)
     assert "kl_target" not in end  # there is none to begin at
-    assert float(learner.entropy_scale) == float(learner.discount) == 0.5
+    assert float(learner.entropy_scale) == float(learner.discount) == 0.5 and learner.horizon == 2
 
 
 def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
