@@ -18,7 +18,7 @@ from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
 from dreamer_racing.training.checksums import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from tests.running_recipes import ROOT, recipe, recipe_module
+from tests.running_recipes import ROOT, UNDRAWN, recipe, recipe_module
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -29,7 +29,7 @@ EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished debug run that keeps averaged weights, evaluated."""
+    """A finished debug run that is privileged, sees small images and keeps averaged weights."""
     directory = tmp_path_factory.mktemp("runs") / "run"
     done = recipe(
         "dreamer_v3", "track=circle", "model=debug", "model.average_rate=0.1", "loss=privileged", "env.image_size=32",
@@ -49,7 +49,8 @@ def agent(run_dir: Path) -> Path:
     assert early.returncode == 2 and "an agent ships with its numbers. Make it with: " in early.stderr
     assert "recipes/evaluate.py checkpoint=" in early.stderr
     assert not is_agent(folder)
-    trained = recipe("evaluate", f"checkpoint={run_dir}", "weights=trained", *EVALUATION, cwd=run_dir.parent)
+    of_trained = (f"checkpoint={run_dir}", "weights=trained", *EVALUATION)
+    trained = recipe("evaluate", *of_trained, cwd=run_dir.parent, before=UNDRAWN)
     assert trained.returncode == 0 and "weights: trained\n" in trained.stdout, trained.stderr
     other = recipe(*command, cwd=run_dir.parent)
     assert other.returncode == 2 and "evaluation of other weights" in other.stderr, "trained, not averaged ones"
@@ -70,7 +71,9 @@ def test_an_agent_says_where_it_comes_from(agent: Path, run_dir: Path) -> None:
     assert command.startswith("python recipes/dreamer_v3.py track=circle model=debug model.average_rate=0.1 ")
     evaluation = json.loads((run_dir / "evaluation_2" / "evaluation.json").read_text())
     assert evaluation["provenance"]["weights"] == "averaged"
+    assert (run_dir / "evaluation_2" / "videos" / "deterministic.mp4").stat().st_size > 0
     for mode in ("deterministic", "stochastic"):
+        assert len(evaluation[mode]["episodes"]) == 1
         assert about["evaluation"][mode]["return_mean"] == evaluation[mode]["return_mean"]
     texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
     assert not any(str(run_dir.parent) in text for text in texts), "paths of this machine"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.running_recipes import ROOT, TINY, recipe
+from tests.running_recipes import ROOT, TINY, UNDRAWN, recipe
 
 
 def written(page: str) -> list[str]:
@@ -31,7 +31,8 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
     elsewhere.mkdir()
     (home / "my_losses.py").write_text(LOSSES)
     (home / "my_rewards.py").write_text(REWARDS)
-    trained = recipe("dreamer_v3", *TINY, "tuned=none", *OVERRIDES, f"run_dir={run}", "evaluation.every=100", cwd=home)
+    overrides = [*TINY, "tuned=none", *OVERRIDES, f"run_dir={run}", "evaluation.every=100"]
+    trained = recipe("dreamer_v3", *overrides, cwd=home, before=UNDRAWN)
     assert trained.returncode == 0, trained.stderr
     assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
     assert "reward: my_rewards:smooth, less the curriculum's penalty of body rates" in trained.stdout

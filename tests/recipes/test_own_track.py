@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.flyer import trained_track
-from tests.running_recipes import TINY, compose, recipe, recipe_module
+from tests.running_recipes import TINY, UNDRAWN, compose, recipe, recipe_module
 
 EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
 
@@ -41,13 +41,13 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
     # a choice of settings composes everything anew, up to what is noted
     again = recipe("dreamer_v3", "resume=run", "tuned=auto", *short, "total_env_steps=280", cwd=tmp_path)
     assert again.returncode == 0 and "which it no longer is" in again.stdout, again.stderr
-    of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path)
+    of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     assert of_now.returncode == 0, of_now.stderr
     export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
     refused = recipe(*export, cwd=tmp_path)
     assert refused.returncode == 2 and "was flown on another track, or" in refused.stderr, refused.stderr
     file.unlink()
-    evaluated = recipe("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path)
+    evaluated = recipe("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
     assert evaluated.returncode == 0, evaluated.stderr
     exported = recipe(*export, cwd=tmp_path)
     assert exported.returncode == 0, exported.stderr

@@ -18,7 +18,8 @@ from tests.running_recipes import ROOT, TINY, compose, recipe, recipe_module, ro
 
 SETTINGS = [
     *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "prefill=256",
-    "loss.ppo.steps=128", "loss.ppo.minibatch=64", "logger.every=64",
+    "loss.ppo.steps=128", "loss.ppo.minibatch=64", "logger.every=64", "env.start_on_line=0",
+    "schedule.start_on_line.to=null",
 ]  # fmt: skip
 
 
