@@ -36,6 +36,7 @@ GPU_TESTS = (
     "tests/learners/test_cuda_graph.py",
     "tests/envs/simulator/test_mujoco_warp.py",
     "tests/envs/test_camera_rate.py",
+    "tests/envs/test_own.py",
     "tests/envs/race/test_gates.py",
     "tests/experience/test_replay.py",
 )

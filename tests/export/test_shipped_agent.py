@@ -185,7 +185,9 @@ def test_another_environment_is_refused(other: dict, message: str, shipped: Path
 def described(contract: dict, **camera: object) -> SimpleNamespace:
     """What `check_env` looks at of an environment that is as a contract describes it, but for its camera."""
     parameters = SimpleNamespace(control_dt=1.0 / contract["control"]["rate_hz"])
-    worlds = SimpleNamespace(parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera), imu=None)
+    worlds = SimpleNamespace(
+        parameters=parameters, camera=replace(Camera(32, 32, tilt=30.0), **camera), imu=None, own_vector=None
+    )
     return SimpleNamespace(from_pixels=True, worlds=worlds)
 
 

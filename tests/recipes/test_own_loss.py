@@ -35,7 +35,7 @@ def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsew
     trained = recipe("dreamer_v3", *overrides, cwd=home, before=UNDRAWN)
     assert trained.returncode == 0, trained.stderr
     assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
-    assert "reward: my_rewards:smooth, less the curriculum's penalty of body rates" in trained.stdout
+    assert "reward: my_rewards:smooth, minus the curriculum's penalty of body rates" in trained.stdout
     lost = recipe("evaluate", f"checkpoint={run}", "episodes=1", cwd=elsewhere)
     assert lost.returncode == 2 and f"there is no my_losses.py in {elsewhere}" in lost.stderr
     assert "set PYTHONPATH to that folder" in lost.stderr
