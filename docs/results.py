@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
 WIDTH = 128
-BRIEF = "In brief"
+BRIEF = "Index of further files (rarely needed)"
 COLUMNS = ("value", "seeds", "minutes", "command")
 """Of the first table, behind the result."""
 FEW = 1

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -33,8 +35,11 @@ def fly(**own: Any) -> tuple[RaceWorlds, list[Tensor]]:
     return worlds, [worlds.step(action).reward_base for action in ACTIONS]
 
 
-def test_the_page_runs_in_ones_own_code(capsys: pytest.CaptureFixture[str]) -> None:
-    exec(USED, dict(OWN))
+def test_the_page_runs_in_ones_own_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    file = ModuleType("my_rewards")
+    vars(file).update(OWN)
+    monkeypatch.setitem(sys.modules, "my_rewards", file)
+    exec(USED, {})
     assert "[4, 20, 1]" in (printed := capsys.readouterr().out) and "[4, 20, 5]" in printed
 
 
