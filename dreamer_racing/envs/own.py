@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 import torch
@@ -38,8 +39,13 @@ class RaceState:
     """(N, 3) unit vector in which the target gate is to be passed, world."""
     time: Tensor
     """(N,) s since the episode began."""
-    race_vector: Tensor
-    """(N, 21) all of this and the gate after the target in the drone's own frame, see `RaceVector`."""
+    make_race_vector: Callable[[], Tensor] = field(repr=False)
+    """Makes `race_vector`, which few functions read."""
+
+    @cached_property
+    def race_vector(self) -> Tensor:
+        """(N, 21) all of this and the gate after the target in the drone's own frame, see `RaceVector`."""
+        return self.make_race_vector()
 
 
 @dataclass(frozen=True)
@@ -81,16 +87,14 @@ class RaceStates:
     def __call__(self, state: DroneState, action: Tensor) -> RaceState:
         """Return copies of the drones' state, with the action (N, 4) that was flown last and the target gate."""
         race = self._race
-        whole = DroneState(
-            **{field.name: getattr(state, field.name).nan_to_num(0.0, 0.0, 0.0) for field in fields(state)}
-        )
+        whole = DroneState(**{each.name: getattr(state, each.name).nan_to_num(0.0, 0.0, 0.0) for each in fields(state)})
         return RaceState(
             **{name: value.float() for name, value in vars(whole).items()},
             action=action.clone(),
             gate_position=self._positions[race.target_gate],
             gate_direction=self._directions[race.target_gate],
             time=race.step_count * race.control_dt,
-            race_vector=self._vector(whole, race.target_gate),
+            make_race_vector=partial(self._vector, whole, race.target_gate.clone()),
         )
 
 

@@ -178,16 +178,11 @@ class DroneRacingEnv(EnvBase):
     def _observe(self) -> dict[str, Any]:
         """What the worlds' states show now, without images."""
         data: dict[str, Any] = {} if self.worlds.imu is None else {"imu": self.worlds.imu.sample}
-        own = self.worlds.own_vector is not None
-        if own:
+        if not self.from_pixels or self.worlds.own_vector is not None:
             data["vector"] = self.worlds.observed_vector()
-        if self.from_pixels and not self.privileged:
-            return data
-        vector = self.worlds.vector()
-        if not (self.from_pixels or own):
-            data["vector"] = vector
         if self.privileged:
-            data["privileged"] = self._group({**self.worlds.privileged(), "vector": vector})
+            race = data["vector"] if "vector" in data and self.worlds.own_vector is None else self.worlds.vector()
+            data["privileged"] = self._group({**self.worlds.privileged(), "vector": race})
         return data
 
     def _draw(self, mask: Tensor | None) -> Tensor:
