@@ -70,7 +70,6 @@ def launch(
     """
     start_logging()
     threading.excepthook = tell_of_thread
-    sys.path.append(str(Path.cwd()))  # losses of the user's own, loss.world_model=module:Class
     torch.set_float32_matmul_precision("high")  # TF32 on CUDA; on a CPU "medium" would be bfloat16 where it has AMX
     try:
         with plain_errors():
