@@ -23,20 +23,21 @@ NUM_ENVS = 32  # of the recipes with a world model
 SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
 SETTINGS = {
-    "race": """by which latent PPO races from images on a CPU:
-  the world model decodes the simulator's state in training; whoever flies sees images only
+    "race": """for {algorithm} on races from images on a CPU:
+  the world model decodes the simulator's state in training; the actor sees images only
   70 % of training episodes begin in flight on a planned racing line, until every gate is passed; then all come to begin
   at the start, as a race does; a missed gate ends one; 25 actions a second
-  what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
-    "images": """by which latent PPO races Circle from images alone, on a CPU:
+  a KL penalty keeps the model's learning from changing the policy; averaged weights fly evaluations and exports""",
+    "images": """for {algorithm} on Circle from images alone, on a CPU:
   the world model reconstructs images, at a small weight; no network sees the simulator's state, not even in training
   half of the training episodes begin at rest, half before a gate; a missed gate ends one; 25 actions a second
-  what the model learns leaves the policy where it was; averaged weights fly evaluations and exports""",
+  a KL penalty keeps the model's learning from changing the policy; averaged weights fly evaluations and exports""",
     "gpu": "those of tuned=race with more worlds and updates, for a GPU, unmeasured",
     "suite": """which learn a task of the Control Suite from images on a CPU:
   a small model that trains on 128 records for each action, and averaged weights fly evaluations""",
 }
-"""What the files of the group `tuned` set, by their names."""
+"""What the files of the group `tuned` set, by their names; for the algorithm that is trained."""
+NAMES = {"dreamer_v3": "DreamerV3", "latent_ppo": "latent PPO"}
 ACTORS = {
     "dreamer_v3": (
         "the actor learns in imagination, from latents of the replay on; docs/learning.md says how far that has come,",
@@ -166,7 +167,8 @@ def tell_of_tuned(config: DictConfig) -> None:
     if config.tuned not in SETTINGS:
         return
     files = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have every number"
-    said = (f"settings: tuned={config.tuned}, {SETTINGS[config.tuned]}", *ACTORS[config.algorithm], files)
+    settings = SETTINGS[config.tuned].format(algorithm=NAMES[config.algorithm])
+    said = (f"settings: tuned={config.tuned}, {settings}", *ACTORS[config.algorithm], files)
     print("\n  ".join(said))
     if changed := changed_from_tuned(config):
         print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")

@@ -411,11 +411,17 @@ def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytes
     recipe = recipe_module("latent_ppo")
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu"))
     told = capsys.readouterr().out
-    assert "settings: tuned=images, by which latent PPO races Circle from images alone" in told
+    assert "settings: tuned=images, for latent PPO on Circle from images alone" in told
     assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
     assert "env.control_rate=50" in line and "(25)" in line and "loss.image_scale=1.0 (0.003)" in line
+
+
+def test_settings_are_said_of_the_algorithm_that_is_trained(capsys: pytest.CaptureFixture[str]) -> None:
+    recipe_module("dreamer_v3").resolve(compose("dreamer_v3", "tuned=race", "device=cpu"))
+    told = capsys.readouterr().out
+    assert "settings: tuned=race, for DreamerV3 on races" in told and "latent PPO" not in told
 
 
 def test_what_is_not_as_tuned_is_said(capsys: pytest.CaptureFixture[str]) -> None:
