@@ -46,7 +46,7 @@ class SafetyLimits:
         overruns_max: deadlines that the loop may miss within `overrun_window`; a long tick misses several.
         overrun_window: s.
         clock_drift_max: ppm, by which the clock of a sender of stamped poses may go slower, see `stamping.PoseClock`.
-        speed_max: m/s. In simulation the included agents reach 12.4, and the scripted pilot 12.7 (`results/pilot.json`).
+        speed_max: m/s. On Figure 8 in simulation the included agent reaches 12.4, the scripted pilot 12.7.
         jump_tolerance: m by which two poses may be further apart than `speed_max` allows in the time between them.
         turn_rate_max: rad/s, about whatever axis: what a vehicle can turn at between two poses.
         turn_tolerance_degrees: by which two attitudes may be further apart than `turn_rate_max` allows.
