@@ -24,7 +24,7 @@ from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.own import OwnFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
 from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
 from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE, RaceVector
-from dreamer_racing.envs.race.racing_line import LineLimits, plan_racing_line
+from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
 from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.backends import check_device, make_simulator
@@ -45,8 +45,6 @@ from dreamer_racing.settings import (
 )
 
 ACTION_SIZE = 4
-START_LINE = LineLimits(speed=0.7)
-"""Of the line on which training episodes begin: tame enough to fly on from with noise [choice]."""
 
 
 class RaceOptions(TypedDict, total=False):

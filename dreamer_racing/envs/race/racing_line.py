@@ -1,27 +1,33 @@
 """A fast periodic line through a track's gates, for the scripted pilot to fly.
 
 The line is a chain of polynomials of degree 7 through the gate openings. Its nodes and durations are chosen by gradient
-descent on the lap time, with penalties where it would ask for more thrust or body rate than the drone has.
+descent on the lap time, with penalties where it would ask for more thrust or body rate than the drone has. What the
+search finds for tracks and drones that ship is stored beside this module; `store_lines` makes that file.
 
 Shapes: N queries, G race gates, M nodes of the line, S samples per segment, K samples of the finished line. SI units,
 world z up. All numbers are this project's choice.
 """
 
+import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters
-from dreamer_racing.envs.tracks import Track
+from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorParameters
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, load_track
 
 DEGREE = 7  # of a segment: position, velocity, acceleration and jerk are continuous
 LINE_DT = 0.005  # s between samples of the finished line
 SAMPLES = 12  # S, at which a segment must keep the limits
 ADAM_STEPS, LBFGS_STEPS = 200, 800
+STORED = Path(__file__).with_name("racing_lines.npz")
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,10 @@ class LineLimits:
     gate_cosine: float = 0.75
     clearance: float = 0.5
     height_min: float = 0.6
+
+
+START_LINE = LineLimits(speed=0.7)
+"""Of the line on which training episodes begin: tame enough to fly on from with noise."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +118,7 @@ def _hermite_basis(time: Tensor) -> Tensor:
     return torch.stack([_basis_rows(time, order) @ inverse for order in range(4)])
 
 
-class _LineNodes:
+class LineNodes:
     """The free numbers of a line: nodes at the gates and between them, and the durations from each to the next.
 
     The search starts from a slow line of cubic arcs that leave and enter gates along their normals.
@@ -143,6 +153,17 @@ class _LineNodes:
         position = self.gates[here] + (3 * t**2 - 2 * t**3) * gap + (t**3 - 2 * t**2 + t) * out + (t**3 - t**2) * into
         slope = 6 * (t - t**2) * gap + (3 * t**2 - 4 * t + 1) * out + (3 * t**2 - 2 * t) * into
         return torch.stack((position, self.START_SPEED * torch.nn.functional.normalize(slope, dim=-1)), dim=1)
+
+    def free_numbers(self) -> np.ndarray:
+        """What the search chose, all in one row, as `restore` takes it."""
+        return torch.cat((self.change.flatten(), self.log_duration)).detach().numpy()
+
+    def restore(self, numbers: Tensor) -> None:
+        """Take what an earlier search chose."""
+        change, log_duration = numbers.tensor_split([self.change.numel()])
+        with torch.no_grad():
+            self.change.copy_(change.view_as(self.change))
+            self.log_duration.copy_(log_duration)
 
     def durations(self) -> Tensor:
         """Seconds from each node to the next (M,); between two gates they are equal."""
@@ -206,7 +227,7 @@ def _steps(values: Tensor) -> Tensor:
 
 
 def _lap_cost(
-    nodes: _LineNodes, basis: Tensor, dynamics: Dynamics, limits: LineLimits, low: Tensor, high: Tensor
+    nodes: LineNodes, basis: Tensor, dynamics: Dynamics, limits: LineLimits, low: Tensor, high: Tensor
 ) -> Tensor:
     """Lap time in s plus penalties where the line breaks the limits or leaves the box (low, high), both (3,)."""
     durations, ends = nodes.segments()
@@ -231,7 +252,7 @@ def _lap_cost(
 
 @lru_cache(maxsize=32)
 def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> RacingLine:
-    """Plan a fast closed line through all gates of a track (a few seconds of CPU time, then cached).
+    """Plan a fast closed line through all gates of a track: some seconds of CPU time, unless it is stored or cached.
 
     Args:
         track: the track.
@@ -242,17 +263,53 @@ def plan_racing_line(track: Track, parameters: QuadrotorParameters, limits: Line
         The line, float64 on CPU.
     """
     with torch.inference_mode(False):
-        dynamics, nodes = Dynamics(parameters), _LineNodes(track, limits.gate_offset)
-        basis = _hermite_basis(torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES)
-        low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
-        high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
-        low[2] = low[2].clamp(min=limits.height_min)
-        _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
+        dynamics, nodes = Dynamics(parameters), LineNodes(track, limits.gate_offset)
+        found = stored_lines().get(line_key(track, parameters, limits))
+        if found is None:
+            search_line(nodes, track, dynamics, limits)
+        else:
+            nodes.restore(found)
         with torch.no_grad():
             return _finish_line(nodes, dynamics)
 
 
-def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
+def search_line(nodes: LineNodes, track: Track, dynamics: Dynamics, limits: LineLimits) -> None:
+    """Change the free numbers of a line until it is fast and within its limits."""
+    basis = _hermite_basis(torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES)
+    low = torch.tensor(track.bounds_low, dtype=torch.float64) + limits.clearance
+    high = torch.tensor(track.bounds_high, dtype=torch.float64) - limits.clearance
+    low[2] = low[2].clamp(min=limits.height_min)
+    _descend(nodes, lambda: _lap_cost(nodes, basis, dynamics, limits, low, high))
+
+
+def line_key(track: Track, parameters: QuadrotorParameters, limits: LineLimits) -> str:
+    """The name in the file of stored lines: a hash of all numbers that the search reads."""
+    gates = [(gate.position, gate.yaw_degrees) for gate in track.gates]
+    numbers = (gates, track.shape.pass_half_width, track.bounds_low, track.bounds_high, vars(Dynamics(parameters)))
+    return hashlib.sha256(repr((numbers, limits)).encode()).hexdigest()[:16]
+
+
+@cache
+def stored_lines() -> dict[str, Tensor]:
+    """The free numbers of lines that were searched before, by their keys."""
+    with np.load(STORED, allow_pickle=False) as lines:
+        return {key: torch.from_numpy(lines[key]) for key in lines.files}
+
+
+def store_lines() -> None:
+    """Search the lines of all tracks and drones that ship again, for the pilot and for starts, and store them."""
+    lines: dict[str, Any] = {}
+    for track in map(load_track, BUILTIN_TRACKS):
+        for drone in PRESETS.values():
+            for limits in (LineLimits(), START_LINE):
+                if (key := line_key(track, drone, limits)) not in lines:
+                    nodes = LineNodes(track, limits.gate_offset)
+                    search_line(nodes, track, Dynamics(drone), limits)
+                    lines[key] = nodes.free_numbers()
+    np.savez_compressed(STORED, **lines)
+
+
+def _descend(nodes: LineNodes, cost: Callable[[], Tensor]) -> None:
     """Minimise the cost: Adam brings the line near the limits, L-BFGS makes it fast."""
     variables = [nodes.change, nodes.log_duration]
 
@@ -277,7 +334,7 @@ def _descend(nodes: _LineNodes, cost: Callable[[], Tensor]) -> None:
     ).step(evaluate)
 
 
-def _finish_line(nodes: _LineNodes, dynamics: Dynamics) -> RacingLine:
+def _finish_line(nodes: LineNodes, dynamics: Dynamics) -> RacingLine:
     """Sample the line evenly in time."""
     durations, ends = nodes.segments()
     end_times = durations.cumsum(0)

@@ -4,12 +4,23 @@ import pytest
 import torch
 
 from dreamer_racing.envs.drone.parameters import PRESETS
+from dreamer_racing.envs.race import racing_line
 from dreamer_racing.envs.race.flown_laps import fly_laps
 from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.race.pilot import PilotPolicy, ScriptedPilot
-from dreamer_racing.envs.race.racing_line import LineLimits, RacingLine, plan_racing_line
+from dreamer_racing.envs.race.racing_line import (
+    START_LINE,
+    Dynamics,
+    LineLimits,
+    LineNodes,
+    RacingLine,
+    line_key,
+    plan_racing_line,
+    search_line,
+    stored_lines,
+)
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.envs.tracks import PLAIN_TRACKS, load_track
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, PLAIN_TRACKS, load_track
 
 ESTIMATED_LAPS = {"circle": 2.7, "kidney": 3.6, "figure8": 4.3, "split_s": 5.8}
 """s, by hand at a thrust-to-weight ratio of 2.7; of other tracks the planned lap stands for it."""
@@ -99,7 +110,36 @@ def test_line_is_the_integral_of_its_velocity_and_repeats_every_lap(circle_line:
     torch.testing.assert_close(circle_line.at(time - circle_line.lap_time).position, reference.position)
 
 
-def test_planning_again_gives_the_same_line_so_that_a_resumed_run_starts_alike():
-    arguments = (load_track("circle"), PRESETS["easy"], LineLimits(speed=0.7))
+def test_planning_again_gives_the_same_line_so_that_a_resumed_run_starts_alike(monkeypatch):
+    monkeypatch.setattr(racing_line, "ADAM_STEPS", 10)
+    monkeypatch.setattr(racing_line, "LBFGS_STEPS", 20)
+    arguments = (load_track("circle"), PRESETS["easy"], LineLimits(speed=0.63))
     first, second = (plan_racing_line.__wrapped__(*arguments) for _ in range(2))
     assert torch.equal(first.samples, second.samples) and torch.equal(first.gate_times, second.gate_times)
+
+
+def test_a_stored_line_is_what_planning_finds(monkeypatch):
+    arguments = (load_track("circle"), PRESETS["easy"], START_LINE)
+    stored = plan_racing_line.__wrapped__(*arguments)
+    monkeypatch.setattr(racing_line, "stored_lines", dict)
+    planned = plan_racing_line.__wrapped__(*arguments)
+    assert stored.lap_time == pytest.approx(planned.lap_time, rel=1e-3)  # bit for bit where it was stored
+    everywhere = torch.linspace(0.0, 1.0, 200, dtype=torch.float64)
+    places = [line.at(everywhere * line.lap_time).position for line in (stored, planned)]
+    assert (places[0] - places[1]).norm(dim=-1).max() < 0.05
+
+
+@pytest.mark.parametrize("limits", [LineLimits(), START_LINE], ids=["pilot", "starts"])
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("track", BUILTIN_TRACKS)
+def test_the_line_of_what_ships_is_stored_and_searching_on_finds_no_better(track, preset, limits, monkeypatch):
+    """If not: a track, a drone or the search has changed, so call `racing_line.store_lines()`."""
+    track, drone = load_track(track), PRESETS[preset]
+    nodes, costs = LineNodes(track, limits.gate_offset), []
+    nodes.restore(stored_lines()[line_key(track, drone, limits)])
+    cost = racing_line._lap_cost
+    monkeypatch.setattr(racing_line, "_lap_cost", lambda *given: (costs.append(cost(*given)), costs[-1])[1])
+    monkeypatch.setattr(racing_line, "ADAM_STEPS", 0)
+    monkeypatch.setattr(racing_line, "LBFGS_STEPS", 10)
+    search_line(nodes, track, Dynamics(drone), limits)
+    assert min(costs) > costs[0] * (1.0 - 1e-3)
