@@ -1,7 +1,7 @@
 """The simulated rate loop of a Betaflight against a recording of the unmodified firmware.
 
     python benchmarks/betaflight.py --recording tests/envs/drone/betaflight_firmware.csv.gz
-    python benchmarks/betaflight.py --recording steps_seed0.csv.gz --json results/betaflight/errors.json
+    python benchmarks/betaflight.py --recording steps_seed0.csv.gz --json results/betaflight.json
     python benchmarks/betaflight.py --speed  # CPU seconds of collected steps beside those of `faithful`, in one run
 
 A recording has a row for each ms: `phase`; `t` s; channels `A E T R` in µs, AETR; body rates `wx wy wz` in rad/s, FLU;

@@ -98,13 +98,13 @@ def test_the_page_prints_what_starts_it_today_and_links_what_was_run(results, fo
     assert f"[Commands and commits](../{folder.name}/one/deep/provenance.json). Machine: M." in page
 
 
-def test_headlines_are_the_first_table_and_link_to_their_sections(results, folder):
+def test_headlines_are_the_second_table_and_link_to_their_sections(results, folder):
     assert "## At a glance" not in results.make_page(folder)
     row = {"result": "PPO", "value": "99 %", "seeds": "2", "minutes": "3", "command": "`ppo.py`"}
     change(folder, headline=[row])
     page = results.make_page(folder)
     assert "| [PPO](#one-a-result) | 99 % | 2 | 3 | `ppo.py` |" in page
-    assert page.index("## At a glance") < page.index("## Planned")
+    assert page.index("## Planned") < page.index("## At a glance")
 
 
 def test_many_files_are_linked_by_their_folder(results, folder):
