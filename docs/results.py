@@ -40,15 +40,15 @@ FEW = 1
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
-How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md) draws
-the conclusions. To check a number at once, fly the included Kidney agent 100 times, a minute of CPU:
+How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
+draws the conclusions. To check a number at once, fly the included Kidney agent 100 times, a minute of CPU:
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-On an AMD EPYC it prints `finished 100 (100%)` for the deterministic policy, then `finished 99 (99%)` for the stochastic one.
-All runs were evaluated like this at their end, unless a table says otherwise, with `checkpoint=runs/RUN`.
+On an AMD EPYC it prints `finished 100 (100%)` for the deterministic policy, then `finished 99 (99%)` for the stochastic
+one. All runs were evaluated like this at their end, unless a table says otherwise, with `checkpoint=runs/RUN`.
 
 | word | meaning on this page |
 |---|---|
@@ -62,12 +62,12 @@ All runs were evaluated like this at their end, unless a table says otherwise, w
 """
 FOOT = """## Where the numbers come from
 
-Commands on this page start an experiment with today's code, whose defaults may differ. *Commands and commits* links to those that
-made the numbers. Before commit 2c16a57 they call `recipes/latent_ppo.py` by its old name, `recipes/dreamer_v3.py`. Files
-`metrics*.csv` keep all rows with evaluations, and every fourth to twentieth of the others.
+Commands on this page start an experiment with today's code, whose defaults may differ. *Commands and commits* links to
+those that made the numbers. Before commit 2c16a57 they call `recipes/latent_ppo.py` by its old name,
+`recipes/dreamer_v3.py`. Files `metrics*.csv` keep all rows with evaluations, and some of the others.
 
-This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results): change those, not
-the page. Results of earlier defaults are in the tree of commit 3c460b3."""
+This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results): change
+those, not the page. Results of earlier defaults are in the tree of commit 3c460b3."""
 
 
 @dataclass
