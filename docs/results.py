@@ -15,7 +15,7 @@ files where they have it (`machine`, `commit`), and otherwise the page says that
 was run at `commit`, which the page links; `today` starts the same now, and is printed. Rows of `headline` make the
 second table. `fills` names cells of results/planned.json, the table of what is to be run, and may say what a cell
 shows instead of the title; a cell that nothing fills says so. With `"brief": true` an entry is a row of the last table,
-which shows its `result`, with no commands and no pictures.
+which shows its `result`, with no commands and no pictures; without a `result` another page shows it.
 """
 
 import argparse
@@ -55,15 +55,15 @@ one. All runs were evaluated like this at their end, unless a table says otherwi
 | success | share of flights that finish three laps, each from another randomised start, deterministic |
 | sampled | success of the stochastic policy |
 | seed | the number of a training: two seeds are two trainings |
-| minutes | of one CPU core, for the whole training |
+| minutes | of one core of an AMD EPYC or an Intel Xeon, for the whole training |
 | state decoded | in training the world model learns the true state; in flight the agent sees images alone |
 | from state | the agent sees 21 numbers of the true state instead of images |
 | stopped | ended by hand, before the planned number of env_steps |
 """
 FOOT = """## Where the numbers come from
 
-Commands on this page start an experiment with today's code, whose defaults may differ. *Commands and commits* links to
-those that made the numbers. Before commit 2c16a57 they call `recipes/latent_ppo.py` by its old name,
+Commands on this page start an experiment with today's code, whose defaults may differ. *Commands, commits, machine*
+links to those that made the numbers. Before commit 2c16a57 they call `recipes/latent_ppo.py` by its old name,
 `recipes/dreamer_v3.py`. Files `metrics*.csv` keep all rows with evaluations, and some of the others.
 
 This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results): change
@@ -124,7 +124,7 @@ def make_page(results: Path) -> str:
     # As the tables link to them; then those of the second table
     entries.sort(key=lambda entry: (min(map(known.index, entry.fills), default=len(known)), not entry.headline))
     long = [entry_text(entry, results) for entry in entries if not entry.brief]
-    brief = [entry for entry in entries if entry.brief]
+    brief = [entry for entry in entries if entry.brief and entry.result]  # the others are shown on pages of their own
     parts = [HEAD, *tables, *headline_text(entries), *long, *brief_text(brief, results), FOOT]
     return "\n".join(parts).rstrip("\n") + "\n"
 
@@ -234,16 +234,20 @@ def brief_text(entries: list[Entry], results: Path) -> list[str]:
         one = len(numbers) == 1
         linked = f"[{numbers[0]}](../{place}/{numbers[0]})" if one else f"[{len(numbers)} files](../{place})"
         rows.append(f"| {entry.title} | {entry.result} | {linked} |")
-    head = "Commands, commits and machines are in the `provenance.json` beside the numbers, or in the numbers.\n"
+    head = (
+        "Speed, simulators, faults and firmware are on pages of their own. Commands, commits and machines of all are\n"
+        "in the `provenance.json` beside the numbers, or in the numbers.\n"
+    )
     table = "| measured | result | numbers |\n|---|---|---|"
     return [f"## {BRIEF}\n", head, table, *rows, ""] if rows else []
 
 
 def provenance(entry: Entry, place: Path) -> str:
-    """Say where an entry comes from; its commands and commits are where the link leads."""
-    recorded = f"[Commands and commits](../{place.as_posix()}/provenance.json)."
-    start = recorded if entry.command else f"Command: {NOT_RECORDED}. Commit: {entry.commit or NOT_RECORDED}."
-    return f"{start} Machine: {entry.machine or NOT_RECORDED}. Time: {entry.wall_clock or NOT_RECORDED}."
+    """Link to where commands, commits, machine and time are recorded, or say what is not."""
+    facts = {"Command": entry.command, "Commit": entry.commit, "Machine": entry.machine, "Time": entry.wall_clock}
+    lacking = [name for name, fact in facts.items() if not fact]
+    recorded = f"[Commands, commits, machine](../{place.as_posix()}/provenance.json)."
+    return " ".join([recorded, *(f"{name}: {NOT_RECORDED}." for name in lacking)])
 
 
 def links(entry: Entry, results: Path) -> str:

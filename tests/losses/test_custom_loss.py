@@ -19,13 +19,14 @@ from tests.learners.test_latent_ppo import PPO, make_rollout
 
 PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+LARGER = (Path(__file__).parents[2] / "examples" / "losses" / "overshooting.py").read_text(encoding="utf-8")
 CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
 
 
 @pytest.fixture
 def my_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The page's file, in the folder that one starts from."""
-    (tmp_path / "my_losses.py").write_text("\n\n".join(BLOCKS))
+    """The page's file and its larger example, in the folder that one starts from."""
+    (tmp_path / "my_losses.py").write_text("\n\n".join([*BLOCKS, LARGER]))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     learner_of(world_model="my_losses:Overshooting")

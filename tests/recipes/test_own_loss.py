@@ -16,7 +16,8 @@ def written(page: str) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
 
 
-LOSSES, REWARDS = "\n\n".join(written("losses.md")), "\n\n".join(written("own_rewards.md")[:-1])
+LARGER = (ROOT / "examples" / "losses" / "overshooting.py").read_text(encoding="utf-8")
+LOSSES, REWARDS = "\n\n".join([*written("losses.md"), LARGER]), "\n\n".join(written("own_rewards.md")[:-1])
 OVERRIDES = [
     "loss.world_model=reconstruction+my_losses:Overshooting",
     "loss.actor=my_losses:smooth_reinforce",
