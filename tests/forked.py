@@ -114,6 +114,11 @@ def started(name: str, *overrides: str, cwd: Path, before: str = "") -> Forked:
     return Forked(_run, str(RECIPES / f"{name}.py"), overrides, before, cwd=cwd)
 
 
+def program(path: Path, *arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
+    """Run any file of Python, as `recipe` does."""
+    return Forked(_run, str(path), arguments, "", cwd=cwd).communicate(timeout)
+
+
 def _run(path: str, overrides: tuple[str, ...], before: str) -> None:
     """Be the recipe, as `python PATH OVERRIDE...` would be."""
     sys.argv = [path, *overrides]

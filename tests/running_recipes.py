@@ -26,9 +26,9 @@ EXPERIMENTS = ("ablation", "race_ablation")
 """Configurations of `recipes/experiment.py`, beside the one of its name."""
 
 SMALL = [
-    "track=circle", "model=debug", "env.num_envs=4", "prefill=400", "total_env_steps=800", "replay.capacity=4000",
-    "evaluation.every=400", "evaluation.episodes=2", "evaluation.video_steps=60", "checkpoint.every=400",
-    "logger.every=200",
+    "track=circle", "model=debug", "env.num_envs=4", "env.episode_steps=40", "prefill=200", "total_env_steps=400",
+    "replay.capacity=4000", "evaluation.every=200", "evaluation.episodes=2", "evaluation.video_steps=20",
+    "checkpoint.every=200", "logger.every=100",
 ]  # fmt: skip
 """A short run that evaluates and saves on the way."""
 TINY = [

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.forked import program
+
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples" / "first_flight.ipynb"
 EXAMPLES = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
@@ -22,9 +24,7 @@ RACES = re.compile(r"(sampled|clipped mean) actions: three laps from (\d+) of (\
 
 def run(name: str, *arguments: str, cwd: Path) -> str:
     """What an example prints; it must succeed and write nothing where it runs."""
-    command = [sys.executable, str(EXAMPLES[name]), *arguments]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = program(EXAMPLES[name], *arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr, done.stderr
     assert not list(cwd.iterdir())

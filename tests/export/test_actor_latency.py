@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from contextlib import ExitStack
 
 import pytest
 
 from dreamer_racing.hil.flyer import ActorFlyer
+from tests.forked import program
 from tests.running_recipes import ROOT, recipe_module
 
 
@@ -17,8 +16,7 @@ from tests.running_recipes import ROOT, recipe_module
 def test_a_size_is_exported_timed_and_taken_by_the_loop(tmp_path):
     script, folder = ROOT / "benchmarks" / "actor_latency.py", tmp_path / "exports"
     options = ["--sizes", "debug", "--actors", "circle", "--steps", "20", "--keep", str(folder)]
-    command = [sys.executable, str(script), *options, "--json", str(tmp_path / "latency.json")]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    ended = program(script, *options, "--json", str(tmp_path / "latency.json"), cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     records = json.loads((tmp_path / "latency.json").read_text())
     assert [record["actor"] for record in records] == ["circle", "debug"]
