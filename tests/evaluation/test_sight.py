@@ -1,4 +1,4 @@
-"""What the camera is turned to: angles and views by hand."""
+"""What a world model sees and dreams, also in damaged images."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import math
 import pytest
 import torch
 from PIL import Image
+from tensordict import TensorDict
 
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator.camera_view import is_in_view, points_in_camera
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, load_track, make_track
 from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.evaluation.dreams import BelievedView, find_painter
+from dreamer_racing.evaluation.image_corruptions import CORRUPTIONS, CorruptedPolicy, Frozen, Noise, blank, intact
 from dreamer_racing.evaluation.sight import Sight, angles, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
+from dreamer_racing.modules import Interface
+from tests.dreamers import learner_of
 
 LEVEL = Camera(tilt=0.0, position=(0.0, 0.0, 0.0))
 
@@ -175,4 +180,146 @@ def test_points_are_where_the_renderer_draws_them():
     row, column = (32 * (1 - offset / depth)[near] for offset in (up, left))
     colors = images[world, row.long(), column.long()].int()
     assert (colors[:, 0] > 150).all() and (colors[:, 2] < 60).all()
+    worlds.close()
+
+
+# Image corruptions: what the policy sees, and that nobody else sees it.
+
+
+def images(*values: int) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 2, 2, 3).clone()
+
+
+class Watching:
+    """Remembers what it saw."""
+
+    deterministic = False
+
+    def __init__(self) -> None:
+        self.seen: list[torch.Tensor] = []
+
+    def __call__(self, tensordict):
+        self.seen.append(tensordict["pixels"].clone())
+        return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
+
+
+def root(pixels: torch.Tensor, *is_init: bool) -> TensorDict:
+    return TensorDict({"pixels": pixels, "is_init": torch.tensor(is_init).unsqueeze(1)}, [len(pixels)])
+
+
+def test_frozen_shows_the_first_image_of_each_episode():
+    frozen = Frozen()
+    shown = [
+        frozen(images(1, 2), torch.tensor([True, True])),
+        frozen(images(3, 4), torch.tensor([False, False])),
+        frozen(images(5, 6), torch.tensor([False, True])),
+        frozen(images(7, 8), torch.tensor([False, False])),
+    ]
+    assert [image[:, 0, 0, 0].tolist() for image in shown] == [[1, 2], [1, 2], [1, 6], [1, 6]]
+
+
+def test_frozen_survives_images_that_are_changed_in_place():
+    frozen, pixels = Frozen(), images(1)
+    frozen(pixels, torch.tensor([True]))
+    pixels.fill_(9)
+    assert frozen(pixels, torch.tensor([False])).unique().tolist() == [1]
+
+
+def test_blank_is_grey_and_intact_is_itself():
+    pixels = images(1, 2)
+    assert blank(pixels, torch.ones(2)).unique().tolist() == [128]
+    assert intact(pixels, torch.ones(2)) is pixels
+
+
+def test_noise_is_uniform_new_at_every_step_and_seeded():
+    pixels, begins = torch.zeros(4, 64, 64, 3, dtype=torch.uint8), torch.zeros(4)
+    noise = Noise(seed=3)
+    first, second = noise(pixels, begins), noise(pixels, begins)
+    assert first.dtype == torch.uint8 and not torch.equal(first, second)
+    assert torch.equal(first, Noise(seed=3)(pixels, begins))
+    counts = torch.bincount(first.flatten().int(), minlength=256) / (first.numel() / 256)
+    assert counts.min() > 0.6 and counts.max() < 1.4
+
+
+def test_only_the_policy_sees_corrupted_images():
+    watching, data = Watching(), root(images(1, 2), True, True)
+    policy = CorruptedPolicy(watching, blank)
+    acted = policy(data)
+    assert watching.seen[0].unique().tolist() == [128]
+    assert acted["pixels"][:, 0, 0, 0].tolist() == data["pixels"][:, 0, 0, 0].tolist() == [1, 2]
+    assert acted["action"].shape == (2, 4)
+    policy.deterministic = True
+    assert watching.deterministic and policy.deterministic
+
+
+def test_every_corruption_is_made_afresh():
+    assert set(CORRUPTIONS) == {"intact", "frozen", "blank", "noise"}
+    assert CORRUPTIONS["frozen"]() is not CORRUPTIONS["frozen"]()
+
+
+def test_blind_policies_are_refused():
+    data = TensorDict({"vector": torch.zeros(1, 21), "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1])
+    with pytest.raises(ValueError, match="no 'pixels'"):
+        CorruptedPolicy(Watching(), blank)(data)
+
+
+# What shows a world model's latents; how dreams are stored is tested in tests/figures/test_flights.py.
+
+
+def flown(worlds: RaceWorlds, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Race vectors (N, T, 21), images (N, T, H, W, 3) and target gates (N, T) of a flight."""
+    worlds.reset()
+    seen = []
+    for _ in range(steps):
+        worlds.step(torch.zeros(worlds.num_envs, 4))
+        seen.append((worlds.vector(), worlds.render(), worlds.race.target_gate.clone()))
+    vector, images, gate = (torch.stack(parts, 1) for parts in zip(*seen, strict=True))
+    return vector, images, gate
+
+
+def test_who_believes_the_truth_sees_what_the_camera_saw() -> None:
+    """Latents that are the race vector, over more frames than there are worlds; the drones stay where they are."""
+    worlds = RaceWorlds("kidney", num_envs=3, start_on_line=1.0)
+    vector, images, gate = flown(worlds, 4)
+    before = worlds.simulator.state.position.clone()
+    painter = BelievedView(torch.nn.Identity(), worlds)
+    views = painter(vector[..., :9], vector[..., 9:], gate)
+    assert views.shape == images.shape and views.dtype == torch.uint8
+    difference = (views.int() - images.int()).abs()
+    assert (difference > 8).float().mean() < 0.002, "but for edges, by the rounding of float32"
+    assert torch.equal(worlds.simulator.state.position, before)
+    early = painter(vector[..., :9], vector[..., 9:], (gate + 1) % worlds.track.num_gates)
+    assert ((early.int() - images.int()).abs() > 8).float().mean() < 0.002, (
+        "the model passes a gate later than the flight"
+    )
+    worlds.close()
+
+
+def test_a_model_that_believes_nonsense_is_shown_all_the_same() -> None:
+    worlds = RaceWorlds("kidney", num_envs=2)
+    painter = BelievedView(torch.nn.Identity(), worlds)
+    for nonsense in (torch.nan, torch.inf, 1e30, 0.0):
+        vector = torch.full((1, 3, 21), nonsense)
+        assert painter(vector[..., :9], vector[..., 9:], torch.zeros(1, 3, dtype=torch.int64)).shape == (
+            1,
+            3,
+            64,
+            64,
+            3,
+        )
+    worlds.close()
+
+
+def test_latents_are_shown_by_what_decodes_them() -> None:
+    worlds = RaceWorlds("kidney", num_envs=2)
+    decoders = {"reconstruction": True, "privileged": True, "decoder_free": False, "informed": True}
+    for world_model, shown in decoders.items():
+        learner = learner_of("debug", Interface(privileged_dim=21), world_model=world_model)
+        painter = find_painter(learner, worlds)
+        assert (painter is not None) == shown, world_model
+        if painter is not None:
+            size = learner.size
+            belief, state = torch.zeros(1, 3, size.belief), torch.zeros(1, 3, size.state)
+            images = painter(belief, state, torch.zeros(1, 3, dtype=torch.int64))
+            assert images.shape == (1, 3, 64, 64, 3) and images.dtype == torch.uint8
     worlds.close()

@@ -1,23 +1,27 @@
-"""Collection by workers on a real Ray cluster, one of which is killed on the way."""
+"""Collection on Ray: arrays, the cluster, rollouts."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import pickle
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import ModuleType, SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.ray_arrays import as_arrays, unpack_rollout
-from dreamer_racing.experience.ray_cluster import Share, start_workers
+from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors, pack_rollout, unpack_rollout
+from dreamer_racing.experience.ray_cluster import Share, check_resources, check_versions, join, start_workers
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
 from dreamer_racing.experience.ray_worker import RayWorker, Request
 from dreamer_racing.experience.replay import make_replay
@@ -25,6 +29,134 @@ from dreamer_racing.modules import DreamerPolicy, Interface
 from dreamer_racing.training.episodes import EpisodeTracker
 from tests.dreamers import learner_of
 from tests.ray_workers import small_race, worlds_of_worker
+
+
+def sent(arrays: Any) -> Any:
+    """Return what another process gets: arrays in memory that is not to be written."""
+    buffers: list[pickle.PickleBuffer] = []
+    data = pickle.dumps(arrays, protocol=5, buffer_callback=buffers.append)
+    assert len(buffers) == len(arrays.entries), "each in memory of its own, not within the pickle"
+    return pickle.loads(data, buffers=[memoryview(buffer).toreadonly() for buffer in buffers])
+
+
+def rollout_of(worlds: int, steps: int) -> TensorDict:
+    """A rollout as a collector makes it: observed before a step is what came of the last, or an episode begins."""
+    after, begins = TensorDict(_observed(worlds, steps), [worlds, steps]), torch.rand(worlds, steps, 1) > 0.6
+    before = TensorDict(_observed(worlds, steps), [worlds, steps])
+    before[:, 1:] = torch.where(begins[:, 1:, 0], before[:, 1:], after[:, :-1])
+    after.update({"reward": torch.randn(worlds, steps, 1), "is_init": torch.zeros_like(begins)})
+    return before.update({"action": torch.randn(worlds, steps, 4), "is_init": begins, "next": after})
+
+
+def _observed(worlds: int, steps: int) -> dict[str, Any]:
+    return {
+        "pixels": torch.randint(256, (worlds, steps, 4, 4, 3), dtype=torch.uint8),
+        "race": TensorDict({"crash": torch.randint(9, (worlds, steps))}, [worlds, steps]),
+        "belief": torch.randn(worlds, 5, steps).transpose(1, 2).half(),  # not contiguous
+    }
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_rollouts_of_several_workers_arrive_side_by_side(steps: int) -> None:
+    rollouts = [rollout_of(worlds, steps) for worlds in (2, 3)]
+    for given in (rollouts, rollouts[:1]):
+        packed, expected = [sent(pack_rollout(rollout)) for rollout in given], torch.cat(given)
+        arrived = unpack_rollout(*packed)
+        assert arrived.batch_size == expected.batch_size and set(arrived.keys(True)) == set(expected.keys(True))
+        for key, value in expected.items(True, True):
+            assert arrived[key].dtype == value.dtype and torch.equal(arrived[key], value), key
+        arrived.zero_()  # memory of its own
+
+
+def test_each_observation_goes_once() -> None:
+    """After its step; before it, too, where a rollout or an episode begins."""
+    rollout = rollout_of(worlds=3, steps=4)
+    begins = rollout["is_init"][..., 0].clone()
+    begins[:, 0] = True
+    packed = pack_rollout(rollout).entries
+    for key in ("pixels", ("race", "crash"), "belief"):
+        assert len(packed[key]) == begins.sum() < rollout.numel()
+    assert packed["next", "pixels"].shape[:2] == packed["action"].shape[:2] == (3, 4)
+
+
+def test_weights_arrive_in_another_module() -> None:
+    one, other = (nn.Sequential(nn.Linear(3, 4), nn.Sequential(nn.BatchNorm1d(4))) for _ in range(2))
+    TensorDict.from_module(other).data.update_(as_tensors(sent(as_arrays(TensorDict.from_module(one)))))
+    for key, value in one.state_dict().items():
+        assert torch.equal(other.state_dict()[key], value), key
+
+
+# What is refused before workers begin, in plain words; no Ray is needed to know it.
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"Ray is not installed here.*\[ray\].*collector=local"):
+        join("local")
+
+
+@pytest.mark.parametrize("address", ["auto", "somewhere"])
+def test_where_there_is_no_cluster_the_address_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason="Ray, the extra `ray`, is not installed")
+
+    def refuse(**arguments: object) -> None:
+        raise ConnectionError("Could not find any running Ray instance.\nPlease specify another.")
+
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    monkeypatch.setattr("ray.init", refuse)
+    words = rf"workers\.address={address}: no Ray cluster .*\(Could not find .* another\).*workers\.address=local"
+    with pytest.raises(ValueError, match=words):
+        join(address)
+
+
+def test_where_nobody_answers_ray_does_not_try_for_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason="Ray, the extra `ray`, is not installed")
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # a port that is nobody's once it is closed
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(ValueError, match=rf"workers\.address={address}: no Ray cluster .*refused"):
+        join(address)
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (Share(1.0, 0.0), r"num_workers=4 with workers\.cpus=1 need 4 CPUs, and .* has 3, of which 2 are free"),
+        (Share(0.5, 0.5), r"num_workers=4 with workers\.gpus=0\.5 need 2 GPUs, and .* has 0, of which 0 are free"),
+    ],
+)
+def test_what_a_cluster_does_not_have_is_not_waited_for(share: Share, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        check_resources(4, share, [{"CPU": 2.0}, {"CPU": 1.0}], {"CPU": 2.0})
+    check_resources(2, Share(1.0, 0.0), [{"CPU": 3.0}], {"CPU": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("share", "nodes", "room"),
+    [
+        (Share(1.0, 0.6), [{"CPU": 16.0, "GPU": 2.0}], 2),  # one on each GPU
+        (Share(2.0, 0.0), [{"CPU": 3.0}, {"CPU": 3.0}], 2),
+        (Share(1.0, 2.0), [{"CPU": 9.0, "GPU": 3.0}, {"CPU": 9.0, "GPU": 3.0}], 2),
+        (Share(0.1, 0.1), [{"CPU": 1.0, "GPU": 1.0}], 10),
+    ],
+)
+def test_a_worker_is_not_spread_over_nodes_or_gpus(share: Share, nodes: list[dict[str, float]], room: int) -> None:
+    free = {name: sum(node.get(name, 0.0) for node in nodes) + 9.0 for name in ("CPU", "GPU")}
+    check_resources(room, share, nodes, free)
+    with pytest.raises(ValueError, match=rf"there is room for {room} of them on the cluster's {len(nodes)} nodes"):
+        check_resources(room + 1, share, nodes, free)
+
+
+def test_nodes_of_other_versions_are_refused() -> None:
+    here = {"python": "3.11.2", "torch": "2.13.0", "ray": "2.60.0"}
+    check_versions("one", here, here)
+    words = r"node two has torch 2\.12\.0 \(here 2\.13\.0\), ray None \(here 2\.60\.0\)\. Install the same there"
+    with pytest.raises(ValueError, match=words):
+        check_versions("two", {"python": "3.11.2", "torch": "2.12.0"}, here)
+
+
+# Collection by workers on a real Ray cluster, one of which is killed on the way.
+
 
 N, W, T = 4, 2, 5
 FRAMES = N * T  # of a round

@@ -1,4 +1,4 @@
-"""Plots: what is drawn is where it belongs, for every track, and no global state is left behind."""
+"""What is drawn of tracks, flights and reports."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +14,19 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
+from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.drone.rotation import from_roll_pitch_yaw
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.drawing import camera_directions, draw_track
 from dreamer_racing.figures.film import top_down_frames
+from dreamer_racing.figures.report import ReturnReport
 from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.figures.tracks import CELL, plot_tracks
+from dreamer_racing.modules import Interface
 from dreamer_racing.training.metrics import read_metrics
+from tests.dreamers import learner_of
 
 
 def straight_flight(track, steps: int = 60, outcome: str | None = "ground") -> Trajectory:
@@ -160,3 +166,36 @@ def test_metrics_of_nothing_are_refused(tmp_path):
 
 def test_pyplot_is_not_touched():
     assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+# Maps of tracks side by side.
+
+
+def test_every_track_is_drawn_from_above_and_from_the_side(tmp_path):
+    tracks = [load_track(name) for name in BUILTIN_TRACKS[:4]]
+    plot_tracks(tracks, tmp_path / "new" / "tracks.png")
+    with Image.open(tmp_path / "new" / "tracks.png") as image:
+        assert image.size == (round(3 * CELL[0] * 150), round(2 * CELL[1] * 150))
+        pixels = image.convert("L")
+        cells = [pixels.crop((left, 0, left + 750, 840)).getextrema() for left in (0, 750, 1500)]
+        assert all(low < 128 for low, _ in cells)
+        assert pixels.crop((760, 850, 2240, 1670)).getextrema() == (255, 255), "cells to spare stay white"
+
+
+def test_no_track_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no track"):
+        plot_tracks([], tmp_path / "tracks.png")
+
+
+# Evaluations by returns: what they depend on, and what not.
+
+
+def test_an_evaluation_by_returns_does_not_depend_on_those_before_it(tmp_path: Path) -> None:
+    env = ControlSuiteEnv("cartpole_swingup", 2, from_pixels=False, action_repeat=50, seed=4)
+    report = ReturnReport(tmp_path, learner_of(interface=Interface.of(env), seed=0), env, episodes=3, seed=4)
+    torch.manual_seed(0)  # the model's latents are samples
+    first = report.make(0)
+    torch.manual_seed(0)
+    second = report.make(1)
+    report.close()
+    assert first == second and first["evaluation/return_std"] > 0, "all episodes were one"

@@ -1,4 +1,4 @@
-"""The page on which people look on: what it shows, whom it lets in, and that it disturbs nobody."""
+"""What a flight shows: the page for people, the images for actors, and gates passed."""
 
 from __future__ import annotations
 
@@ -12,14 +12,25 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
+from dreamer_racing.envs.simulator.rendering import make_renderer
+from dreamer_racing.envs.simulator.scene import Camera, build_scene
+from dreamer_racing.envs.tracks import Gate, load_track, make_track
+from dreamer_racing.export.contract import describe_camera
+from dreamer_racing.hil.camera import NoseCamera, camera_of
 from dreamer_racing.hil.chain import Outputs
+from dreamer_racing.hil.progress import GateProgress
 from dreamer_racing.hil.safety import State, Verdict
+from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.vehicle import Command, Pose, at_rest, hover
 from dreamer_racing.hil.view import LiveView, read_frame
 
@@ -212,3 +223,120 @@ def test_it_ends_with_a_flight_that_is_killed():
 def test_what_flies_with_it_needs_no_torch():
     code = "import sys, dreamer_racing.hil.view, dreamer_racing.hil.loop; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+# The loop's images are those of training, and no torch is needed for them.
+
+
+TRACK = load_track("figure8")
+
+
+@pytest.mark.parametrize("camera", [Camera(), Camera(width=96, height=96, field_of_view=100.0, tilt=10.0)])
+def test_images_are_those_of_training(camera):
+    try:
+        ours = NoseCamera(TRACK, camera, "egl")
+    except RendererUnavailableError as error:
+        pytest.skip(str(error))
+    model = build_scene(TRACK, QuadrotorParameters(), camera).compile()
+    theirs = make_renderer("egl", model, camera, 1, 1)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        position, attitude = generator.uniform((-4, -3, 0.5), (4, 3, 3)), generator.normal(size=4)
+        attitude /= np.linalg.norm(attitude)
+        image = ours.see(Pose(0.0, position, attitude, np.zeros(3), np.zeros(3)))
+        trained = theirs.render(torch.from_numpy(position)[None], torch.from_numpy(attitude)[None])[0].numpy()
+        assert np.array_equal(image, trained)
+        assert image.std() > 5
+    ours.close()
+    theirs.close()
+
+
+def test_a_contract_gives_its_camera_back():
+    camera = Camera(width=96, height=48, field_of_view=75.0, tilt=-5.0, position=(0.2, 0.01, 0.0))
+    assert camera_of({"camera": describe_camera(camera)}) == camera
+    assert camera_of({"camera": describe_camera(replace(camera, rate=25.0))}) == replace(camera, rate=25.0)
+    with pytest.raises(ValueError, match="trained on numbers, not on images"):
+        camera_of({"camera": None})
+
+
+def test_what_is_unknown_or_missing_is_said(monkeypatch):
+    monkeypatch.setattr(
+        "dreamer_racing.envs.simulator.opengl.ctypes.CDLL", lambda name: (_ for _ in ()).throw(OSError())
+    )
+    with pytest.raises(RendererUnavailableError, match=r"egl needs libEGL.so.1.*osmesa needs libOSMesa.so.8"):
+        NoseCamera(TRACK, Camera())
+
+
+def test_nothing_that_flies_loads_torch():
+    """Every module of the package `hil`, in a process of its own."""
+    code = (
+        "import importlib, pkgutil, sys, dreamer_racing.hil as hil\n"
+        "names = [module.name for module in pkgutil.walk_packages(hil.__path__, 'dreamer_racing.hil.')]\n"
+        "[importlib.import_module(name) for name in names if not name.endswith('__main__')]\n"
+        "assert len(names) > 5, names\n"
+        "print([name for name in ('torch', 'torchrl', 'tensordict') if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == "[]", done.stdout
+
+
+# Gates passed in order, by hand, and as the race itself counts them.
+
+
+LINE = make_track("line", [Gate((0.0, 0.0, 1.35), 0.0), Gate((5.0, 0.0, 1.35), 0.0)])
+
+
+def at(time: float, *position: float) -> Pose:
+    return Pose(time, np.array(position), np.array([1.0, 0, 0, 0]), np.zeros(3), np.zeros(3))
+
+
+def fly(*poses: Pose) -> GateProgress:
+    progress = GateProgress(LINE, SafetyLimits.of_track(LINE))
+    for pose in poses:
+        progress.update(pose)
+    return progress
+
+
+def test_a_pass_has_a_time_and_an_offset():
+    progress = fly(at(1.0, -0.3, 0.3, 1.35), at(1.1, 0.1, 0.3, 1.75))
+    assert progress.target == 1
+    assert progress.passes[0].gate == 0
+    assert progress.passes[0].time == pytest.approx(1.075)
+    assert progress.passes[0].offset == pytest.approx(np.hypot(0.3, 0.3))
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [
+        (at(0, 0.1, 0, 1.35), at(1, -0.1, 0, 1.35)),  # backwards
+        (at(0, -0.1, 0.8, 1.35), at(1, 0.1, 0.8, 1.35)),  # beside the opening
+        (at(0, -0.1, 0, 2.1), at(1, 0.1, 0, 2.1)),  # over it
+        (at(0, 4.9, 0, 1.35), at(1, 5.1, 0, 1.35)),  # the second first
+        (at(0, 0.1, 0, 1.35), at(1, 0.3, 0, 1.35)),  # behind it all the time
+    ],
+)
+def test_what_is_no_pass(poses):
+    assert not fly(*poses).passes
+
+
+def test_a_pose_counts_where_safety_would_allow_it():
+    """5 ms after the one before it may be 0.175 m further; several gates may be passed from one tick to the next."""
+    near = make_track("near", [Gate((0.0, 0.0, 1.35), 0.0), Gate((0.3, 0.0, 1.35), 0.0)])
+    progress = GateProgress(near, SafetyLimits.of_track(near))
+    for number, x in enumerate((-0.05, 0.05, 0.15, 0.25, 0.35)):
+        progress.update(at(0.005 * number, x, 0.0, 1.35), judged=x > 0.3)
+    assert [passed.gate for passed in progress.passes] == [0, 1]
+    progress.reset()
+    progress.update(at(1.0, -0.2, 0.0, 1.35))
+    assert progress.update(at(1.005, 0.2, 0.0, 1.35), judged=False) is None
+    assert progress.update(at(1.010, -0.1, 0.0, 1.35)) is None
+    assert progress.update(at(1.015, 0.2, 0.0, 1.35)) is None, "safety judges it, and cuts"
+    assert progress.passes == []
+
+
+def test_laps_go_on_and_a_reset_begins_anew():
+    lap = [at(0, -1, 0, 1.35), at(1, 1, 0, 1.35), at(2, 6, 0, 1.35), at(3, 6, 9, 1.35), at(4, -1, 9, 1.35)]
+    progress = fly(*lap, *lap)
+    assert [passed.gate for passed in progress.passes] == [0, 1, 0, 1]
+    progress.reset()
+    assert (progress.target, progress.passes) == (0, [])

@@ -1,4 +1,6 @@
-"""PPO: advantages by hand and against TorchRL's own, learning on a bandit, and states that come back."""
+"""Baselines: PPO, SAC, and their networks."""
+
+from __future__ import annotations
 
 import copy
 
@@ -9,8 +11,10 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives.value import GAE
 
-from dreamer_racing.learners import NetworkSize, PPOConfig, PPOLearner
+from dreamer_racing.experience.replay import make_replay
+from dreamer_racing.learners import NetworkSize, PPOConfig, PPOLearner, SACConfig, SACLearner
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
+from dreamer_racing.learners.networks import ImageTrunk, ObservationNetwork
 from dreamer_racing.modules import Interface
 
 SMALL, NUMBERS = NetworkSize(2, 16), Interface(action_dim=1, pixels=False, vector_dim=1)
@@ -168,3 +172,169 @@ def test_a_reward_that_is_not_finite_spoils_no_network() -> None:
         learner.update(rollout)
     for network in (learner.actor, learner.critic):
         assert all(value.isfinite().all() for value in network.state_dict().values())
+
+
+# Networks of the baselines: what they read, in which order, and what the acting step writes.
+
+
+def test_the_papers_networks() -> None:
+    network = ObservationNetwork(Interface(), 4, NetworkSize())
+    widths = [layer.out_features for layer in network.mlp if isinstance(layer, torch.nn.Linear)]
+    assert widths == [768, 768, 768, 768, 4]
+    assert network.in_keys == ["pixels"]
+
+
+def test_images_numbers_and_actions_are_read_side_by_side() -> None:
+    network = ObservationNetwork(Interface(vector_dim=3), 2, SMALL, with_action=True)
+    assert network.in_keys == ["pixels", "vector", "action"]
+    assert network.mlp[0].in_features == ImageTrunk.features + 3 + 4
+    pixels = torch.randint(0, 256, (5, 6, 64, 64, 3), dtype=torch.uint8)
+    vector, action = torch.randn(5, 6, 3), torch.randn(5, 6, 4)
+    outputs = network(pixels, vector, action)
+    assert outputs.shape == (5, 6, 2)
+    for position, other in ((0, 255 - pixels), (1, vector + 1), (2, action + 1)):
+        inputs = [pixels, vector, action]
+        inputs[position] = other
+        assert not torch.allclose(network(*inputs), outputs), f"input {position} has no influence"
+
+
+def test_images_are_scaled_to_one() -> None:
+    trunk = ImageTrunk()
+    seen = []
+    trunk.convolutions[0].register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    trunk(torch.full((1, 64, 64, 3), 255, dtype=torch.uint8))
+    assert seen[0].shape == (1, 3, 64, 64) and torch.all(seen[0] == 1.0)
+
+
+def test_images_that_are_too_small_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"image_size=32: .* at least 36 × 36"):
+        ImageTrunk(32)
+    ImageTrunk(36)
+
+
+def test_the_deterministic_policy_takes_the_mode() -> None:
+    seen = TensorDict({"vector": torch.randn(8, 21)}, [8])
+    interface = Interface(pixels=False, vector_dim=21)
+    for kind in (PPOLearner, SACLearner):
+        learner = kind(SMALL, interface, seed=0)
+        policy = learner.policy(deterministic=True)
+        first, second = policy(seen.clone())["action"], policy(seen.clone())["action"]
+        assert torch.equal(first, second) and first.abs().max() < 0.1, "the first policy is near the middle"
+        policy.deterministic = False
+        assert not torch.equal(policy(seen.clone())["action"], policy(seen.clone())["action"])
+
+
+def test_squashed_actions_stay_in_bounds() -> None:
+    learner = SACLearner(SMALL, Interface(pixels=False, vector_dim=21), seed=0)
+    action = learner.policy()(TensorDict({"vector": 100 * torch.randn(500, 21)}, [500]))["action"]
+    assert action.abs().max() <= 1.0
+
+
+# SAC: transitions of replay records, learning on a bandit, and states that come back.
+
+
+WIDE = NetworkSize(2, 32)
+
+
+def make_windows(batch: int = 6) -> TensorDict:
+    """Windows ``[B, 2]`` of replay records, none of which begins or ends an episode."""
+    generator = torch.Generator().manual_seed(0)
+    flags = {key: torch.zeros(batch, 2, 1, dtype=torch.bool) for key in ("is_init", "terminated", "truncated")}
+    numbers = {key: torch.randn(batch, 2, 1, generator=generator) for key in ("vector", "previous_action", "reward")}
+    return TensorDict({**numbers, **flags}, [batch, 2])
+
+
+def test_a_transition_leads_from_one_record_to_the_next() -> None:
+    windows = make_windows()
+    windows["is_init"][1, 1] = True
+    windows["terminated"][2, 1] = True
+    windows["truncated"][3, 1] = True
+    windows["terminated"][4, 0] = True  # of the transition before
+    batch = SACLearner(WIDE, NUMBERS, SACConfig(reward_scale=0.5), seed=0).transitions(windows)
+    assert torch.equal(batch["vector"], windows["vector"][:, 0])
+    assert torch.equal(batch["next", "vector"], windows["vector"][:, 1])
+    assert torch.equal(batch["action"], windows["previous_action"][:, 1])
+    assert torch.equal(batch["next", "reward"], 0.5 * windows["reward"][:, 1])
+    assert batch["next", "terminated"].flatten().tolist() == [False, False, True, False, False, False]
+    assert batch["next", "done"].flatten().tolist() == [False, False, True, True, False, False]
+    assert batch["priority_weight"].tolist() == pytest.approx([1, 0, 1, 1, 1, 1], abs=1e-20)
+
+
+def test_a_batch_without_a_transition_is_survived() -> None:
+    windows = make_windows()
+    windows["is_init"][:, 1] = True
+    metrics = SACLearner(WIDE, NUMBERS, seed=0).update(windows)
+    assert all(value.isfinite() for value in metrics.values())
+
+
+def test_what_is_no_transition_has_no_influence() -> None:
+    losses = []
+    for reward in (0.0, 1e6):
+        windows = make_windows()
+        windows["is_init"][1, 1] = True
+        windows["reward"][1, 1] = reward
+        torch.manual_seed(0)
+        losses.append(SACLearner(WIDE, NUMBERS, seed=0).update(windows))
+    for name in ("loss_qvalue", "loss_actor", "gradient_norm/critic"):
+        assert torch.equal(losses[0][name], losses[1][name]), name
+
+
+def test_it_learns_a_bandit_through_the_replay() -> None:
+    torch.manual_seed(0)
+    learner = SACLearner(WIDE, NUMBERS, SACConfig(learning_rate=5e-3, reward_scale=1.0), seed=0)
+    replay = make_replay(8000, 64, 128, 2, observation_keys=["vector"], reward_keys=["reward"])
+    policy, best = learner.policy(), learner.policy(deterministic=True)
+    ended = torch.ones(64, 4, 1, dtype=torch.bool)
+    for _ in range(80):
+        seen = TensorDict({"vector": torch.zeros(64, 4, 1), "is_init": ended}, [64, 4])
+        acted = policy(seen)
+        following = {
+            "vector": torch.zeros(64, 4, 1),
+            "reward": -(acted["action"] - 0.5).square(),
+            "terminated": ended,
+            "truncated": ~ended,
+        }
+        replay.extend(acted.select("vector", "is_init", "action").set("next", TensorDict(following, [64, 4])))
+        for _ in range(4):
+            learner.update(replay.sample())
+    action = best(TensorDict({"vector": torch.zeros(1, 1)}, [1]))["action"].item()
+    assert action == pytest.approx(0.5, abs=0.15)
+
+
+def test_the_target_critics_follow_slowly() -> None:
+    learner = SACLearner(WIDE, NUMBERS, SACConfig(target_rate=0.25), seed=0)
+    target = {name: value.clone() for name, value in learner._loss.target_qvalue_network_params.items(True, True)}
+    learner.update(make_windows())
+    for name, value in learner._loss.target_qvalue_network_params.items(True, True):
+        critic = learner._loss.qvalue_network_params[name]
+        torch.testing.assert_close(value, 0.75 * target[name] + 0.25 * critic.detach())
+
+
+def test_a_restored_learner_of_sac_goes_on_as_the_one_that_was_saved() -> None:
+    torch.manual_seed(0)
+    learner, other = SACLearner(WIDE, NUMBERS, seed=0), SACLearner(WIDE, NUMBERS, seed=1)
+    learner.update(make_windows())
+    other.load_state_dict(copy.deepcopy(learner.state_dict()))
+    metrics = []
+    for each in (learner, other):
+        torch.manual_seed(1)
+        metrics.append(each.update(make_windows()))
+    assert all(torch.equal(metrics[0][name], metrics[1][name]) for name in metrics[0])
+    seen = TensorDict({"vector": torch.randn(5, 1)}, [5])
+    actions = [each.policy(deterministic=True)(seen.clone())["action"] for each in (learner, other)]
+    assert torch.equal(*actions)
+
+
+def test_a_reward_that_is_not_finite_changes_no_network() -> None:
+    learner = SACLearner(WIDE, NUMBERS, seed=0)
+    before = {name: value.clone() for name, value in learner.actor.state_dict().items()}
+    windows = make_windows()
+    windows["reward"][0, 1] = float("nan")
+    with pytest.raises(NonFiniteLossError):
+        learner.update(windows)
+    assert all(torch.equal(value, before[name]) for name, value in learner.actor.state_dict().items())
+
+
+def test_networks_of_another_size_are_refused_by_sac() -> None:
+    with pytest.raises(ValueError, match="network.layers=3, this learner's with 2"):
+        SACLearner(WIDE, NUMBERS).load_state_dict(SACLearner(NetworkSize(3, 8), NUMBERS).state_dict())

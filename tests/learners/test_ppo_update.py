@@ -1,8 +1,9 @@
-"""Epochs of minibatches: with masks, which a CUDA device makes without being asked, the same as without."""
+"""PPO's update, and the guard against what is not finite."""
 
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.learners import ppo_update
+from dreamer_racing.learners.finite_guard import FiniteGuard, NonFiniteLossError
 from dreamer_racing.learners.ppo_update import PPOUpdate
 from dreamer_racing.losses import PPOUpdateConfig
 
@@ -102,3 +104,18 @@ def test_the_learning_rate_follows_the_divergence(monkeypatch, kl, scale):
     assert update.learning_rate_scale.item() == pytest.approx({0.005: 0.625, 0.012: 0.5}.get(kl, 0.4))
     update.kl_target = None
     assert update.run(RECORDS, loss)["ppo/learning_rate_scale"] == 1.0, "without a target it is the full one"
+
+
+# The guard against losses that are not finite, alone; with a learner it is in ``test_dreamer_v3.py``.
+
+
+def test_a_lagging_guard_names_the_batch_that_was_bad():
+    guard, names = FiniteGuard(lag=2), ("loss", "reward_error", "gradient_norm/actor")
+    metrics = {name: torch.tensor(1.0) for name in names} | {"agreement": torch.tensor(math.nan)}
+    for number in range(4):
+        guard.check(metrics, number)
+    guard.check(metrics | {"gradient_norm/actor": torch.tensor(math.inf)}, "bad")
+    guard.check(metrics, 5)
+    with pytest.raises(NonFiniteLossError) as error:
+        guard.check(metrics, 6)
+    assert error.value.batch == "bad"

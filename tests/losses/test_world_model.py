@@ -1,16 +1,27 @@
+"""Losses of the world model, and one's own."""
+
+from __future__ import annotations
+
 import math
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.losses import LossConfig, WorldModelLoss, kl_losses
+from dreamer_racing.losses import TARGETS, LossConfig, WorldModelLoss, kl_losses
 from dreamer_racing.modules import SIZES, Agent, Interface
-from tests.dreamers import learner_of
+from tests.dreamers import latent_ppo_of, learner_of
+from tests.learners.test_dreamer_v3 import make_batch
+from tests.learners.test_latent_ppo import PPO, make_rollout
 
 
-def make_batch(batch: int = 2, time: int = 4, image_size: int = 64) -> TensorDict:
+def make_windows(batch: int = 2, time: int = 4, image_size: int = 64) -> TensorDict:
     torch.manual_seed(0)
     flag = torch.zeros(batch, time, 1, dtype=torch.bool)
     is_init, terminated = flag.clone(), flag.clone()
@@ -80,7 +91,7 @@ def test_free_nats_bound_the_sum_over_latents():
 
 @pytest.mark.parametrize("image_size", [32, 64, 96])
 def test_losses_of_a_new_model(image_size):
-    batch = make_batch(image_size=image_size)
+    batch = make_windows(image_size=image_size)
     loss = WorldModelLoss(Agent(SIZES["debug"], Interface(image_size=image_size)), LossConfig())
     losses, latents = loss(batch)
     # Uniform over 255 bins, whatever the reward.
@@ -96,7 +107,7 @@ def test_continue_target_is_one_minus_terminated():
     with torch.no_grad():
         output.weight.zero_()
         output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
-    batch = make_batch()
+    batch = make_windows()
     batch["truncated"][1, 1] = True
     loss = WorldModelLoss(agent, LossConfig())(batch)[0]["loss_continue"]
     expected = -(7 * math.log(0.75) + 1 * math.log(0.25)) / 8
@@ -109,7 +120,7 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
     world_model = agent.world_model
     with torch.no_grad():
         world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
-    losses, _ = WorldModelLoss(agent, LossConfig(free_nats=0.0))(make_batch(image_size=image_size))
+    losses, _ = WorldModelLoss(agent, LossConfig(free_nats=0.0))(make_windows(image_size=image_size))
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in world_model.named_parameters():
         assert not parameter.requires_grad or parameter.grad.abs().sum() > 0, name
@@ -117,7 +128,6 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
 
 def test_a_window_begins_with_the_first_records_context():
     from dreamer_racing.modules.stored_latents import CONTEXT
-    from tests.learners.test_dreamer_v3 import make_batch
 
     learner = learner_of(seed=0)
     loss, batch = learner.world_model_loss, make_batch()
@@ -158,3 +168,110 @@ def test_a_refreshed_context_is_what_the_next_window_begins_with():
     belief, state = learner.latent_format.unpack(again)
     torch.testing.assert_close(belief[1:], learner.latents["belief"][0, :-1], atol=5e-4, rtol=0)
     assert torch.equal(state[1:], learner.latents["state"][0, :-1].round())
+
+
+# The losses that docs/losses.md writes, run as a reader would run them.
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+LARGER = (Path(__file__).parents[2] / "examples" / "losses" / "overshooting.py").read_text(encoding="utf-8")
+CONFIG = {"horizon": 4, "learning_rate": 1e-3, "warmup_updates": 0}
+
+
+@pytest.fixture
+def my_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The page's file and its larger example, in the folder that one starts from."""
+    (tmp_path / "my_losses.py").write_text("\n\n".join([*BLOCKS, LARGER]))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    learner_of(world_model="my_losses:Overshooting")
+    yield sys.modules["my_losses"]
+    del sys.modules["my_losses"]
+
+
+def test_a_target_is_learned_beside_others(my_losses):
+    learner = learner_of(seed=0, world_model="reconstruction+my_losses:Overshooting", **CONFIG)
+    for _ in range(3):
+        metrics = learner.update(make_batch())
+    assert {"loss_overshooting", "overshooting_kl", "loss_image", "loss_actor"} < metrics.keys()
+    assert all(value.isfinite() for value in metrics.values()) and metrics["overshooting_kl"] > 0
+    total = sum(value for key, value in metrics.items() if key.startswith("loss_"))
+    torch.testing.assert_close(metrics["loss"], total)
+
+
+def test_the_smallest_target_is_learned(my_losses):
+    learner = learner_of(seed=0, world_model="reconstruction+my_losses:LastAction", **CONFIG)
+    metrics = learner.update(make_batch())
+    assert metrics["loss_last_action"] > 0 and "loss_image" in metrics
+
+
+def test_the_target_is_what_its_text_says(my_losses):
+    """The prior after three blind steps, by hand; nothing is compared across a reset."""
+    learner = learner_of(seed=0, world_model="my_losses:Overshooting", free_nats=0.0)
+    batch = make_batch(time=16)
+    batch["is_init"] = torch.zeros_like(batch["is_init"])
+    batch["is_init"][:, 7] = True
+    model = learner.agent.world_model
+    rssm = model.rssm
+    rssm.draw_noise = lambda *shape: torch.full((*shape, rssm.latents, 1), 0.5)
+    posterior = model.observe(batch, batch["previous_action"], batch["is_init"].squeeze(-1))
+    kl = []
+    for start in range(13):
+        belief, state = posterior.belief[:, start], posterior.state[:, start]
+        for step in (1, 2, 3):
+            belief, state = rssm.imagine_step(belief, state, batch["previous_action"][:, start + step])
+        target = posterior.posterior_logits[:, start + 3]
+        kl.append(kl_losses(target, rssm.prior_logits(belief), 0.0, rssm.unimix)[2])
+    counted = [value for start, value in enumerate(kl) if not start < 7 <= start + 3]
+    losses, _ = learner.world_model_loss(batch)
+    torch.testing.assert_close(losses["overshooting_kl"], torch.stack(counted).mean())
+    torch.testing.assert_close(losses["loss_overshooting"], 0.3 * torch.stack(counted).sum() / (13 * 3))
+    losses["loss_overshooting"].backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in rssm.prior.parameters())
+    assert all(parameter.grad is None for parameter in model.reward_head.parameters())
+
+
+def test_an_objective_of_the_default_algorithm_is_what_moves_the_actor(my_losses):
+    gradients = []
+    for actor in ("reinforce", "my_losses:smooth_reinforce"):
+        learner = learner_of(seed=0, actor=actor, **CONFIG)
+        torch.nn.init.normal_(learner.agent.actor.mlp.output.weight, generator=torch.Generator().manual_seed(0))
+        torch.manual_seed(1)
+        metrics = learner._backward(make_batch())
+        gradients.append([parameter.grad for parameter in learner.agent.actor.parameters()])
+    assert metrics["roughness"] > 0
+    assert not any(map(torch.equal, *gradients))
+
+
+def test_an_objective_of_latent_ppo_is_what_moves_the_actor(my_losses):
+    """Where nothing is paid, all that is left is to be smooth."""
+    rough = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        learner = latent_ppo_of(seed=0, actor="my_losses:smooth_clipped", ppo=PPO, entropy_scale=0.0)
+        rollouts = [make_rollout(learner, 3, 4) for _ in range(2)]
+        for rollout in rollouts:
+            rollout["next", "reward"].zero_()
+            learner.collect(rollout)
+        rough.append(learner.update_actor()["ppo/roughness"])
+    assert rough[0] == rough[1] > 0
+    steps = learner.storage.steps
+    after = learner.agent.actor(steps["features"]).mean - steps["previous_action"]
+    before = steps["behavior"].chunk(2, -1)[0] - steps["previous_action"]
+    assert after.square().sum() < before.square().sum()
+
+
+def test_the_page_names_every_target_and_what_it_adds():
+    quoted = set(re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)))
+    for name, targets in TARGETS.items():
+        row = re.search(rf"^\| `{name}` \| (.*?) \|", PAGE, re.MULTILINE)
+        listed = re.findall(r"`(\w+)`", row[1]) if row else []
+        assert listed == [target.__name__ for target in targets], name
+        learner = learner_of(interface=Interface(vector_dim=3, privileged_dim=5), world_model=name)
+        batch = make_batch()
+        batch["vector"] = torch.zeros(*batch.shape, 3)
+        batch["privileged", "vector"] = torch.zeros(*batch.shape, 5)
+        added = learner.world_model_loss(batch)[0].keys()
+        always = {"loss_reward", "loss_continue", "reward_error", "loss_dynamics", "loss_representation", "kl"}
+        assert added - always <= quoted, name

@@ -1,6 +1,13 @@
+"""The world model, its encoder and its decoder."""
+
+from __future__ import annotations
+
 import pytest
 import torch
 
+from dreamer_racing.modules.decoder import ImageDecoder
+from dreamer_racing.modules.encoder import ImageEncoder, _centred, fold_patches, smallest_map, unfold_patches
+from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.world_model import WorldModel
 
 
@@ -42,3 +49,84 @@ def test_open_loop_refuses_a_context_outside_the_window(context):
 def test_whole_window_may_be_context():
     belief, state = WorldModel("debug").open_loop(*make_records(), context=5)
     assert belief.shape[:2] == state.shape[:2] == (2, 5)
+
+
+VARIANTS = [
+    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": False, "norm": "rms"},
+    {"multipliers": (2, 3, 4, 4), "kernel": 5, "strided": True, "norm": "rms"},
+    {"multipliers": (1, 2, 4, 8), "kernel": 4, "strided": True, "norm": "layer"},
+    {"multipliers": (1, 2, 4), "kernel": 4, "strided": True, "norm": "layer", "patch": 2},
+]
+
+
+@pytest.mark.parametrize(("image_size", "side"), [(32, 2), (64, 4), (96, 6)])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_encoder_and_decoder_shapes(variant, image_size, side):
+    encoder = ImageEncoder(depth=2, **variant, image_size=image_size)
+    embedding = encoder(torch.randint(0, 256, (2, 3, image_size, image_size, 3), dtype=torch.uint8))
+    channels = 2 * variant["multipliers"][-1]
+    assert embedding.shape == (2, 3, encoder.embedding_size) == (2, 3, side * side * channels)
+    for blocks in (1, 2):
+        decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=blocks, **variant, image_size=image_size)
+        images = decoder(torch.randn(2, 3, 8), torch.randn(2, 3, 6))
+        assert images.shape == (2, 3, image_size, image_size, 3)
+        assert images.min() > 0
+        assert images.max() < 1
+
+
+@pytest.mark.parametrize("image_size", [40, 8, 0, -16])
+def test_images_that_cannot_be_halved_are_refused(image_size):
+    assert smallest_map(16, patch=2, stages=3) == 1
+    message = f"image_size={image_size}: .* 2 × 2 pixels .* 3 times, .* multiple of 16, for instance 32, 64 or 96"
+    with pytest.raises(ValueError, match=message):
+        ImageEncoder(depth=2, **VARIANTS[-1], image_size=image_size)
+    with pytest.raises(ValueError, match=message):
+        ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **VARIANTS[-1], image_size=image_size)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_squared_error_is_that_of_the_images(variant):
+    torch.manual_seed(0)
+    decoder = ImageDecoder(belief=8, state=6, units=4, depth=2, blocks=1, **variant)
+    belief, state = torch.randn(2, 3, 8), torch.randn(2, 3, 6)
+    pixels = torch.randint(0, 256, (2, 3, 64, 64, 3), dtype=torch.uint8)
+    expected = (decoder(belief, state) - pixels / 255).square().mean()
+    torch.testing.assert_close(decoder.squared_error(belief, state, pixels), expected)
+
+
+def test_folding_is_undone_by_unfolding():
+    images = torch.arange(2 * 4 * 4 * 3).view(2, 4, 4, 3)
+    folded = fold_patches(images, 2)
+    assert folded.shape == (2, 2, 2, 12)
+    assert folded[0, 0, 0].tolist() == [*range(6), *range(12, 18)]  # the top left block: two pixels of two rows
+    assert torch.equal(unfold_patches(folded, 2), images)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_first_stage_sees_pixels_scaled_to_half(variant):
+    encoder = ImageEncoder(depth=2, **variant)
+    seen = []
+    encoder.convolutions[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    encoder(torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 64, 64, 3))
+    torch.testing.assert_close(seen[0][0], torch.full_like(seen[0][0], -0.5))
+    torch.testing.assert_close(seen[0][1], torch.full_like(seen[0][1], 0.5))
+    assert seen[0].is_contiguous(memory_format=torch.channels_last)
+
+
+def test_embedding_depends_on_every_region_of_the_image():
+    torch.manual_seed(0)
+    for variant in VARIANTS:
+        encoder = ImageEncoder(depth=2, **variant)
+        black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
+        for row, column in ((0, 0), (0, 60), (60, 0), (30, 30)):
+            spotted = black.clone()
+            spotted[:, row : row + 4, column : column + 4] = 255
+            assert not torch.allclose(encoder(spotted), encoder(black))
+
+
+def test_images_are_centred_under_autocast_as_in_float32_and_rounded_once():
+    images = torch.arange(256, dtype=torch.uint8).view(1, 16, 16, 1)
+    exact = _centred(images)
+    assert exact.dtype == torch.float32 and (exact.min(), exact.max()) == (-0.5, 0.5)
+    with autocast(torch.device("cpu"), enabled=True):
+        assert torch.equal(_centred(images), exact.to(torch.bfloat16))

@@ -1,4 +1,4 @@
-"""The simulated drone: closed forms, the stand, what differs, and the race's own end."""
+"""The simulated drone, and studies of its flights."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from dreamer_racing.envs.race.pilot import ScriptedPilot
 from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.hil.vehicle import Command, Setpoint, at_rest, hover
+from dreamer_racing.plant.pilot import PilotFlyer
+from dreamer_racing.plant.study import fly
 from dreamer_racing.plant.vehicle import LIFT_OFF, Mismatch, PlantVehicle
 
 MOTOR_LAG = PRESETS["easy"].motor_time_constant
@@ -320,3 +322,42 @@ def test_parts_of_a_physics_step_add_up() -> None:
 def test_a_command_that_is_not_finite_is_refused() -> None:
     with pytest.raises(ValueError, match="must be finite"):
         PlantVehicle("circle").command(armed(math.nan))
+
+
+# A study's flights: one thing is changed, the rest stays, and a seed gives the same flight again.
+
+
+class Hover:
+    rate, camera = 50.0, None
+
+    def reset(self):
+        pass
+
+    def act(self, pose, image, target_gate):
+        return hover()
+
+    def prepare(self):
+        pass
+
+
+def test_what_ends_at_once_is_said_and_repeats():
+    class Fall(Hover):
+        def act(self, pose, image, target_gate):
+            return hover()._replace(collective_thrust=7.0, body_rates=np.array([1.0, 0.0, 0.0]))
+
+    flown = [fly(Fall(), "circle", "easy", "position_noise", 0.02, seed) for seed in (0, 0, 1)]
+    assert flown[0] == flown[1]
+    assert (flown[0].gates, flown[0].finished, flown[0].lap_time) == (0, False, None)
+    assert flown[0].speed_max > 1.0 and flown[0].ended.startswith("cut: ")
+
+
+@pytest.mark.slow
+def test_the_pilot_finishes_through_the_rate_loop_of_a_betaflight():
+    flown = fly(PilotFlyer(load_track("circle"), "betaflight"), "circle", "betaflight", "mass", 1.0, 0)
+    assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0
+
+
+@pytest.mark.slow
+def test_the_pilot_finishes_with_ten_percent_more_mass():
+    flown = fly(PilotFlyer(load_track("circle"), "faithful"), "circle", "faithful", "mass", 1.1, 0)
+    assert flown.finished and flown.gates == 12 and 2.0 < flown.lap_time < 6.0

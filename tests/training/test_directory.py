@@ -1,14 +1,21 @@
-"""What lies where in a run directory, and the history that it keeps."""
+"""A run's directory: its files, its lock, its journal."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from dreamer_racing.training import directory
 from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, replace_text
+from dreamer_racing.training.journal import Interval, Journal, Periods
+from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.metrics import PendingMetrics
 
 
 def test_a_run_is_found_from_its_checkpoints_and_from_those_of_its_best(tmp_path: Path) -> None:
@@ -109,3 +116,108 @@ def test_the_best_of_a_run_before_there_is_one_says_what_to_do(tmp_path: Path) -
         complete_checkpoints(tmp_path / "best")
     with pytest.raises(FileNotFoundError, match="does not exist"):
         complete_checkpoints(tmp_path / "better")
+
+
+# One process at a time in a run directory.
+
+
+def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> None:
+    lock = RunLock(tmp_path)
+    with pytest.raises(ValueError, match=rf"run_dir={tmp_path} is in use by a live run \(process {os.getpid()} on "):
+        RunLock(tmp_path)
+    lock.release()
+    RunLock(tmp_path).release()
+
+
+def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
+    code = f"""if True:
+        from dreamer_racing.training.lock import RunLock
+        lock = RunLock({str(tmp_path)!r})
+        print("held", flush=True)
+        input()"""
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"held\n"
+        with pytest.raises(ValueError, match=f"process {process.pid} "):
+            RunLock(tmp_path)
+        process.kill()
+        process.wait()
+    RunLock(tmp_path).release()
+
+
+def test_an_abandoned_folder_goes_if_it_was_made_for_the_lock(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    directory.claim().abandon()
+    assert not directory.path.exists()
+
+
+@pytest.mark.parametrize("written", ["before", "after"])
+def test_an_abandoned_folder_stays_if_it_was_there_or_was_written_to(written: str, tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    if written == "before":
+        directory.path.mkdir()
+    lock = directory.claim()
+    if written == "after":
+        directory.config.touch()
+    lock.abandon()
+    assert directory.path.exists()
+    directory.claim().release()  # the next one gets it
+
+
+def test_what_cannot_be_taken_away_stays_and_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = RunDirectory(tmp_path / "run")
+    lock = directory.claim()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", Mock(side_effect=OSError("busy")))
+        lock.abandon()
+    directory.claim().release()
+
+
+# When something is due, and that a resumed run finds the same.
+
+
+def test_something_is_due_once_a_period() -> None:
+    periods = Periods(log=100, never=0)
+    assert [steps for steps in range(0, 450, 30) if periods.due("log", steps)] == [120, 210, 300, 420]
+    assert not periods.due("never", 10_000) and not periods.due("never", 10_000, last=True)
+
+
+def test_at_the_end_what_has_been_since_the_latest_is_due() -> None:
+    periods = Periods(log=100)
+    assert periods.due("log", 100, last=True) and not periods.due("log", 100, last=True)
+    assert not periods.due("log", 130) and periods.due("log", 130, last=True)
+
+
+def test_what_was_due_when_a_run_was_saved_is_due_when_it_goes_on() -> None:
+    saved = Journal(Periods(log=100, save=100), PendingMetrics())
+    assert saved.periods.due("log", 130)
+    journal = Journal(Periods(log=100, save=100), PendingMetrics())
+    journal.load_state_dict(saved.state_dict())
+    assert not journal.periods.due("log", 130) and journal.periods.due("save", 130)
+
+
+def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    interval, never = Interval(2.0), Interval(0.0)
+    for now[0], due in ((119.0, False), (120.0, True), (200.0, False), (245.0, True)):
+        assert interval.due() == due and not never.due()
+
+
+def test_the_first_time_of_an_interval_may_come_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    intervals = {minutes: Interval(minutes, first=2.0) for minutes in (0.0, 1.0, 10.0)}
+    due: dict[float, list[int]] = {minutes: [] for minutes in intervals}
+    for minute in range(1, 25):
+        now[0] = 60.0 * minute
+        for minutes, interval in intervals.items():
+            due[minutes] += [minute] if interval.due() else []
+    assert due == {0.0: [2], 1.0: list(range(1, 25)), 10.0: [2, 12, 22]}
+
+
+def test_a_first_one_comes_before_the_periods_once_and_costs_none_of_them():
+    periods = Periods({"evaluate": 30}, evaluate=100, log=100)
+    places = (10, 29, 31, 60, 99, 105, 150, 210)
+    assert [place for place in places if periods.due("evaluate", place)] == [31, 105, 210]
+    assert [place for place in places if periods.due("log", place)] == [105, 210]
+    assert not Periods({"evaluate": 30}, evaluate=0).due("evaluate", 40)

@@ -1,7 +1,17 @@
-"""Ramps by hand, and what they refuse."""
+"""What a run's settings follow: schedules, the replay ratio, gates passed, and the model's lag."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
 
 import pytest
+import torch
+from tensordict import TensorDict
 
+from dreamer_racing.training.gate_pass_rate import KNOWN, MEMORY, PACE, GatePassRate
+from dreamer_racing.training.model_lag import LOOKS, PATIENCE, ModelLag
+from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import Ramp, RampClock
 
 
@@ -30,3 +40,210 @@ def test_a_ramp_without_length_is_a_step():
 def test_a_ramp_that_ends_before_it_begins_or_outside_the_run_is_refused(begin, end):
     with pytest.raises(ValueError, match=f"schedule.discount: begin={begin} and end={end} are shares"):
         Ramp(to=0.5, begin=begin, end=end).check("schedule.discount")
+
+
+# Updates that are due, by hand.
+
+
+@pytest.mark.parametrize(
+    ("env_steps", "updates"), [(0, 0), (100, 0), (115, 0), (116, 1), (180, 5), (260, 10), (1700, 100)]
+)
+def test_updates_follow_the_steps_after_the_prefill(env_steps: int, updates: int) -> None:
+    assert ReplayRatio(4.0, 64, 100).updates(env_steps) == updates
+    assert ReplayRatio(4.0, 64, 100).updates_due(env_steps, made=3) == max(0, updates - 3)
+
+
+def resumed(*ratios: float, every: int = 1000) -> ReplayRatio:
+    """Of a run that was resumed every so many env_steps, with one ratio after the other."""
+    ratio = ReplayRatio(ratios[0], 64, 100)
+    for number, (_, following) in enumerate(pairwise(ratios), 1):
+        ratio.updates_due(number * every)
+        after = ReplayRatio(following, 64, 100)
+        after.load_state_dict(ratio.state_dict())
+        ratio = after
+    return ratio
+
+
+def test_another_ratio_counts_from_where_it_begins_whatever_was_due_before() -> None:
+    by_hand = int(900 * 4 / 64) + int(1000 * 8 / 64)
+    assert resumed(4.0, 8.0).updates(2000) == by_hand
+    assert resumed(4.0, 8.0, 1.0).updates(3000) == by_hand + int(1000 * 1 / 64)
+
+
+def test_the_same_ratio_goes_on_as_if_nothing_had_been() -> None:
+    assert [resumed(4.0, 4.0, 4.0).updates(steps) for steps in (0, 116, 5000)] == [0, 1, int(4900 * 4 / 64)]
+
+
+def test_what_another_ratio_asked_for_is_not_forgotten_by_going_on_twice() -> None:
+    assert resumed(4.0, 8.0, 8.0).updates(3000) == resumed(4.0, 8.0).updates(3000)
+
+
+def test_a_ratio_that_changes_within_the_prefill_begins_after_it() -> None:
+    assert resumed(4.0, 8.0, every=50).updates(180) == int(80 * 8 / 64)
+
+
+# The share of flights that pass the hardest gate, by hand.
+
+
+def episodes(gates: list[int], targets: list[int], crashes: list[int]) -> TensorDict:
+    columns = {"gates_passed": gates, "target_gate": targets, "crash": crashes}
+    return TensorDict({name: torch.tensor(column, dtype=torch.int64) for name, column in columns.items()}, [len(gates)])
+
+
+def test_an_episode_counts_the_gates_after_its_first():
+    passes = GatePassRate(3)
+    assert passes.share == 0.0
+    passes.update(episodes([3], [0], [1]), 0)  # from gate 0 on: 0 does not count, 1 and 2 are passed, crash before 0
+    assert passes.shares.tolist() == [0.0, 1.0, 1.0]
+    assert passes.share == 0.0 and passes.hardest_gate == 0
+    passes.update(episodes([], [], []), 0)
+    passes.update(episodes([0, 1], [0, 1], [1, 0]), 0)  # a crash before the first gate, and time that ran out after it
+    assert passes.shares.tolist() == [0.0, 1.0, 1.0]
+
+
+def test_laps_count_each_pass():
+    passes = GatePassRate(3)
+    passes.update(episodes([7, 1, 1], [2, 1, 1], [0, 2, 3]), 0)  # 1, then 2 0 1 2 0 1; twice 0 and a crash at 1
+    assert passes.shares.tolist() == pytest.approx([1.0, 2 / 4, 1.0], abs=0.01)
+    assert passes.share == pytest.approx(0.5, abs=0.01) and passes.hardest_gate == 1
+
+
+def test_where_there_are_no_gates_the_share_stays_0():
+    passes = GatePassRate(0)
+    assert passes.update(TensorDict({}, [3]), 0) == 0.0 and passes.best == 0.0
+
+
+def test_the_best_counts_once_each_gate_was_tried_and_never_goes_back():
+    passes = GatePassRate(2)
+    passes.update(episodes([150, 2], [0, 0], [0, 0]), 0)
+    assert passes.best == 0.0  # 75 attempts at each
+    for _ in range(4):
+        passes.update(episodes([150], [0], [0]), 0)
+    assert passes.best == 1.0
+    passes.update(episodes([1] * 1000, [0] * 1000, [1] * 1000), 0)
+    assert passes.share < 0.1 and passes.best == 1.0
+
+
+def test_once_the_hardest_gate_is_known_its_clock_goes_on_by_itself():
+    passes = GatePassRate(2)
+    for _ in range(4):
+        passes.update(episodes([150, 149], [0, 1], [0, 1]), 500)  # past both, but for a crash now and then
+    assert passes.best > KNOWN and passes.known_since == 500
+    passes.best = 0.5
+    passes.update(episodes([2], [0], [0]), 700)
+    assert passes.known_since == 500
+    passes.best = 0.5
+    assert passes.known(510, 1000) == 0.5  # 0.43 by time
+    assert passes.known(600, 1000) == pytest.approx(KNOWN + 0.1 * PACE)
+    resumed = GatePassRate(0)
+    resumed.load_state_dict(passes.state_dict())
+    assert resumed.known(600, 1000) == passes.known(600, 1000)
+
+
+def test_before_that_the_clock_is_the_best_share():
+    passes = GatePassRate(2)
+    passes.best = 0.3
+    assert passes.known(900, 1000) == 0.3 and passes.known_since is None
+
+
+def test_old_attempts_are_forgotten_and_a_resumed_run_remembers_what_is_left():
+    passes = GatePassRate(2)
+    for _ in range(MEMORY):
+        passes.update(episodes([11], [0], [0]), 0)
+    before = passes.share
+    for _ in range(MEMORY):
+        passes.update(episodes([1], [0], [1]), 0)
+    assert before == 1.0 and 0.2 < passes.share < 0.6
+    resumed = GatePassRate(0)
+    resumed.load_state_dict(passes.state_dict())
+    assert (resumed.share, resumed.best, resumed.hardest_gate) == (passes.share, passes.best, 0)
+
+
+# When a policy waits for its model.
+
+
+def of(error: float) -> dict[str, torch.Tensor]:
+    return {"reward_error": torch.tensor(error)}
+
+
+def measure(lag: ModelLag, ratio: float) -> float | torch.Tensor:
+    for _ in range(3):
+        lag.trained(of(0.5))
+    return lag.measured(of(0.5 * ratio))["lag/ratio"]
+
+
+def test_it_waits_above_the_limit_and_goes_on_below():
+    lag = ModelLag(limit=1.25)
+    assert measure(lag, 1.2) == pytest.approx(1.2) and not lag.waits
+    for _ in range(LOOKS):
+        measure(lag, 1.5)
+    assert lag.waits
+    for _ in range(LOOKS):
+        measure(lag, 1.0)
+    assert not lag.waits
+
+
+def test_one_odd_flight_is_no_lag_and_one_good_one_not_its_end():
+    lag = ModelLag(limit=2.0)
+    for ratio in (1.0, 1.0, 1.0, 30.0, 1.0, 1.0):
+        assert measure(lag, ratio) == pytest.approx(1.0) and not lag.waits
+    for _ in range(LOOKS):
+        measure(lag, 3.0)
+    assert measure(lag, 1.0) == pytest.approx(3.0) and lag.waits
+
+
+def test_it_does_not_wait_for_ever_and_again_only_after_the_model_has_caught_up():
+    lag = ModelLag(limit=2.0)
+    waited = [measure(lag, 3.0) and lag.waits for _ in range(2 * PATIENCE)]
+    assert waited == [True] * PATIENCE + [False] * PATIENCE
+    for _ in range(LOOKS):
+        measure(lag, 1.0)
+    for _ in range(LOOKS):
+        measure(lag, 3.0)
+    assert lag.waits
+
+
+def test_the_training_error_is_the_mean_since_the_last_measurement():
+    lag = ModelLag(limit=9.0)
+    for error in (1.0, 2.0, 3.0):
+        lag.trained(of(error))
+    assert lag.measured(of(4.0))["lag/ratio"] == pytest.approx(2.0)
+
+
+def test_without_a_limit_or_before_any_update_it_never_waits():
+    lag = ModelLag(limit=None)
+    assert not lag.due(10_000) and math.isnan(measure(lag, 100.0)) and not lag.waits
+    lag = ModelLag(limit=1.1)
+    assert math.isnan(lag.measured(of(1.0))["lag/ratio"]) and not lag.waits
+    assert lag.measured({"loss": torch.tensor(1.0)}) == {}
+
+
+def test_a_restored_one_goes_on_as_if_it_had_never_stopped():
+    lag = ModelLag(limit=1.25)
+    measure(lag, 1.5)
+    lag.trained(of(0.5))
+    other = ModelLag(limit=1.25)
+    other.load_state_dict(lag.state_dict())
+    for ratio in (1.1, 3.0, 1.0, 1.0):
+        assert measure(lag, ratio) == measure(other, ratio)
+        assert (lag.waits, lag.state_dict()) == (other.waits, other.state_dict())
+
+
+def test_one_that_waited_goes_on_where_the_limit_was_taken_away():
+    lag = ModelLag(limit=1.25)
+    measure(lag, 1.5)
+    assert lag.waits
+    other = ModelLag(limit=None)
+    other.load_state_dict(lag.state_dict())
+    assert not other.waits
+
+
+def test_it_is_measured_once_a_period_and_tells_when_the_actor_waits(caplog: pytest.LogCaptureFixture):
+    lag = ModelLag(limit=2.0, every=100)
+    assert [steps for steps in range(0, 450, 30) if lag.due(steps)] == [120, 210, 300, 420]
+    with caplog.at_level("INFO", "dreamer_racing"):
+        for ratio in (1.0, *(3.0,) * LOOKS, *(1.0,) * LOOKS):
+            measure(lag, ratio)
+    assert len(caplog.messages) == 2
+    assert caplog.messages[0].startswith("the actor waits: ") and caplog.messages[0].endswith("(wait_for_model=2)")
+    assert caplog.messages[1].startswith("the actor goes on: ")

@@ -1,7 +1,9 @@
-"""An agent with a slow camera and an IMU: seen in training, exported, and flown the same by every copy."""
+"""Parts of an export: the file of weights, actors with an IMU, and how long they take."""
 
 from __future__ import annotations
 
+import json
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,58 @@ from dreamer_racing.export.actor_step import LATENTS, export_actor, make_step
 from dreamer_racing.export.contract import make_contract
 from dreamer_racing.export.onnx_actor import CONTRACT, OnnxActor, read_contract
 from dreamer_racing.export.parity import MIN_STEPS, RecordedFlight, TorchActor, episode_steps, record_flight
+from dreamer_racing.export.weights_file import read_weights, write_weights
 from dreamer_racing.hil.camera import camera_of
+from dreamer_racing.hil.flyer import ActorFlyer
 from dreamer_racing.modules import Interface, get_size
 from dreamer_racing.modules.agent import Agent
+from tests.forked import program
+from tests.running_recipes import ROOT, recipe_module
+
+WEIGHTS = {"b": torch.tensor([[1.0, -2.0], [0.5, 3e-8]]), "a": torch.tensor(7.0), "empty": torch.zeros(0, 3)}
+
+
+def test_the_bytes_by_hand(tmp_path: Path) -> None:
+    extents = write_weights(tmp_path / "weights", WEIGHTS)
+    content = (tmp_path / "weights").read_bytes()
+    first = 8 + int.from_bytes(content[:8], "little")
+    assert first % 8 == 0 and json.loads(content[8:first]) == {
+        "a": {"dtype": "F32", "shape": [], "data_offsets": [0, 4]},
+        "b": {"dtype": "F32", "shape": [2, 2], "data_offsets": [4, 20]},
+        "empty": {"dtype": "F32", "shape": [0, 3], "data_offsets": [20, 20]},
+    }
+    assert content[first:] == np.array([7, 1, -2, 0.5, 3e-8], "<f4").tobytes()
+    assert extents == {"a": (first, 4), "b": (first + 4, 16), "empty": (first + 20, 0)}
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    transposed = {**WEIGHTS, "c": torch.arange(6.0).reshape(2, 3).T}
+    write_weights(tmp_path / "weights", transposed)
+    read = read_weights(tmp_path / "weights")
+    assert read.keys() == transposed.keys()
+    assert all(torch.equal(read[name], value) for name, value in transposed.items())
+    read["a"] += 1.0  # the memory is its own
+
+
+def test_other_types_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="half is torch.float16: only float32"):
+        write_weights(tmp_path / "weights", {"half": torch.zeros(1, dtype=torch.float16)})
+    text = b'{"x":{"dtype":"F16","shape":[1],"data_offsets":[0,2]}}'
+    (tmp_path / "half").write_bytes(len(text).to_bytes(8, "little") + text + b"00")
+    with pytest.raises(ValueError, match=r"half is no complete safetensors file .*F16"):
+        read_weights(tmp_path / "half")
+
+
+@pytest.mark.parametrize("keep", [0, 6, 40, -1], ids=["nothing", "length", "header", "tensors"])
+def test_a_file_that_was_cut_off_is_refused(keep: int, tmp_path: Path) -> None:
+    write_weights(tmp_path / "weights", WEIGHTS)
+    (tmp_path / "weights").write_bytes((tmp_path / "weights").read_bytes()[:keep])
+    with pytest.raises(ValueError, match="weights is no complete safetensors file"):
+        read_weights(tmp_path / "weights")
+
+
+# An agent with a slow camera and an IMU: seen in training, exported, and flown the same by every copy.
+
 
 CAMERA = Camera(32, 32)
 
@@ -88,3 +139,23 @@ def test_an_actor_without_one_takes_none() -> None:
         TorchActor(contract, step).step(np.zeros((32, 32, 3), np.uint8), imu=np.zeros(6, np.float32))
     with pytest.raises(ValueError, match="sees pixels and vector; beside images only an IMU"):
         make_step(Agent(get_size("debug"), Interface(image_size=32, vector_dim=5), decode=False), "mode")
+
+
+# `benchmarks/actor_latency.py`: sizes with initial weights are exported, timed, and fly in the loop like any other.
+
+
+@pytest.mark.slow
+def test_a_size_is_exported_timed_and_taken_by_the_loop(tmp_path):
+    script, folder = ROOT / "benchmarks" / "actor_latency.py", tmp_path / "exports"
+    options = ["--sizes", "debug", "--actors", "circle", "--steps", "20", "--keep", str(folder)]
+    ended = program(script, *options, "--json", str(tmp_path / "latency.json"), cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    records = json.loads((tmp_path / "latency.json").read_text())
+    assert [record["actor"] for record in records] == ["circle", "debug"]
+    for record in records:
+        assert 0.0 < record["p50_ms"] <= record["p99_ms"] <= record["max_ms"] and record["threads"] == 1
+    assert ActorFlyer(folder / "debug").rate == 50.0
+    hil = recipe_module("hil")
+    config = hil.HilConfig(actor=str(folder / "debug"), run_dir=str(tmp_path / "run"), record=False, pose_port=9127)
+    with ExitStack() as opened:
+        assert hil.prepare(config, opened).chain.safety.armed is False
