@@ -1,18 +1,22 @@
-"""What fits into memory, with the machine's numbers put in by hand."""
+"""The machine: its devices, its terminal, its caches."""
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import platform
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
-from dreamer_racing import machine
+from dreamer_racing import caches, devices, doctor, machine, terminal
 from dreamer_racing.machine import (
     KeptMemory,
     available_memory,
@@ -22,6 +26,7 @@ from dreamer_racing.machine import (
     out_of_memory_advice,
     usable_threads,
 )
+from tests.running_recipes import ROOT, recipe_module
 
 
 def test_available_memory_is_read_from_the_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,3 +118,138 @@ def test_threads_are_one_a_cpu_and_at_most_what_the_variable_says(
     if asked is not None:
         monkeypatch.setenv("OMP_NUM_THREADS", asked)
     assert usable_threads() == expected
+
+
+# In what a recipe computes: measured, since a list of instructions does not say how fast they are.
+
+
+INSTRUCTIONS = {"avx512_bf16": True, "amx_bf16": False}
+
+
+@pytest.mark.parametrize("slow", [torch.float32, torch.bfloat16])
+def test_a_cpu_computes_in_bfloat16_where_that_is_faster(slow: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    def as_slow_as_said(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        time.sleep(0.001 if left.dtype == slow else 0.0)
+        return left
+
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: INSTRUCTIONS)
+    monkeypatch.setattr(torch, "mm", as_slow_as_said)
+    chosen, reason = devices.choose_mixed_precision(torch.device("cpu"))
+    assert chosen == (slow is torch.float32)
+    assert "times as fast in bfloat16" in reason
+
+
+def test_a_cpu_without_instructions_for_bfloat16_does_not_compute_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
+    chosen = devices.choose_mixed_precision(torch.device("cpu"))
+    assert chosen == (False, "this cpu device does not compute in bfloat16")
+
+
+# Terminals that do not take every letter, and pipes that nobody reads.
+
+
+def latin_stream() -> io.TextIOWrapper:
+    return io.TextIOWrapper(io.BytesIO(), encoding="iso-8859-1", errors="strict")
+
+
+def test_letters_that_are_not_there_are_written_in_plainer_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = latin_stream()
+    monkeypatch.setattr(sys, "stdout", stream)
+    terminal.take_any_terminal()
+    terminal.say("a → b – 64×64 ≥ σ, 日, \udcff")
+    assert stream.buffer.getvalue().decode("iso-8859-1") == "a -> b - 64×64 >= sigma, ?, ?\n"
+
+
+@pytest.mark.parametrize("program", [["recipes/dreamer_v3.py", "--help"], ["-m", "dreamer_racing", "--help"]])
+def test_help_is_printed_under_any_locale(tmp_path: Path, program: list[str]) -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *(str(ROOT / word) if word.endswith(".py") else word for word in program)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=120, check=False)
+    assert done.returncode == 0 and b"->" in done.stdout, done.stderr
+
+
+class Report:
+    """Flies nothing, and notes what was written."""
+
+    def __init__(self) -> None:
+        self.written: list[str] = []
+
+    def evaluate(self, deterministic: bool) -> Any:
+        return SimpleNamespace(episodes=[], summary=lambda: "σ", to_dict=dict)
+
+    def write(self, name: str, result: object) -> None:
+        self.written.append(name)
+
+    def close(self) -> None:
+        pass
+
+
+class Unread(io.StringIO):
+    """A pipe whose reader has left."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_an_evaluation_is_written_though_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    report = Report()
+    monkeypatch.setattr(sys, "stdout", Unread())
+    written = recipe_module("evaluate").evaluate_nominal(report)
+    assert list(written) == report.written == ["deterministic", "stochastic"]
+
+
+# Programs of a user whose home takes no files.
+
+
+@pytest.fixture
+def homeless(tmp_path: Path) -> dict[str, str]:
+    """An environment without a home: below a file there is no folder, whoever asks, root too."""
+    (tmp_path / "file").write_text("")
+    (tmp_path / "temporary").mkdir()
+    kept = {name: value for name, value in os.environ.items() if name not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    return {**kept, "HOME": str(tmp_path / "file" / "home"), "TMPDIR": str(tmp_path / "temporary")}
+
+
+@pytest.mark.slow
+def test_a_race_is_flown_and_it_is_said_once_and_nothing_is_left(tmp_path: Path, homeless: dict[str, str]) -> None:
+    program = "import dreamer_racing.envs as envs; envs.DroneRacingEnv('circle', 2, from_pixels=False).rollout(2)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=homeless, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("takes no files (Not a directory)") == 1 and "WARP_CACHE_PATH=FOLDER" in done.stderr
+    assert list((tmp_path / "temporary").glob("dreamer_racing_*")) == []
+
+
+def test_the_doctor_says_so(tmp_path: Path, homeless: dict[str, str]) -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / "doctor.py")],
+        env=homeless, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("caches")]
+    assert "note" in line and "takes no files" in line
+    assert "Matplotlib created" not in done.stderr
+
+
+def test_the_doctor_tries_to_write_where_runs_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "why_not_writable", lambda folder: "Read-only file system")
+    found = doctor.disk(1.0, tmp_path / "runs")
+    assert found.state.name == "wrong" and f"{tmp_path} takes no files (Read-only file system)" in found.found
+
+
+def test_without_any_folder_it_is_said_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> str:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(caches, "why_not_writable", lambda folder: "Permission denied")
+    monkeypatch.setattr(caches.tempfile, "mkdtemp", full)
+    with pytest.raises(caches.CacheError, match=r"Permission denied.*No usable temporary.*WARP_CACHE_PATH=FOLDER"):
+        caches.ensure_caches.__wrapped__()
+
+
+def test_a_user_without_a_home_does_not_write_to_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert caches.why_not_writable(Path("~/.cache/warp")) == "this user has no home"
+    assert list(tmp_path.iterdir()) == []

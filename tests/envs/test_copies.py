@@ -1,15 +1,20 @@
-"""What is copied or pickled works as the original does, or is refused at once, in words."""
+"""Environments that are copied, saved and restored, or never closed."""
 
 from __future__ import annotations
 
 import copy
+import io
+import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import pytest
 import torch
+from tensordict import TensorDict
 
 from dreamer_racing.envs import ControlSuiteEnv, DroneRacingEnv, load
 from dreamer_racing.envs.tracks import load_track
@@ -49,3 +54,98 @@ def test_a_copy_of_the_control_suite_goes_on_as_the_original_does(way: Callable[
 def test_a_track_is_copied() -> None:
     track = load_track("kidney")
     assert copy.deepcopy(track) == pickle.loads(pickle.dumps(track)) == track
+
+
+# An environment restored from its state goes on exactly as the one it was taken from.
+
+
+def through_a_file(state: dict) -> dict:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.mark.parametrize(("preset", "looks"), [("easy", None), ("faithful", None), ("faithful", "randomised")])
+def test_restored_worlds_go_on_bit_for_bit(preset: str, looks: str | None) -> None:
+    def make(seed: int) -> DroneRacingEnv:
+        return DroneRacingEnv(
+            "circle", 6, from_pixels=looks is not None, preset=preset, seed=seed, episode_steps=30, looks=looks
+        )
+
+    torch.manual_seed(0)
+    env, other = make(1), make(2)
+    env.rollout(25, break_when_any_done=False)
+    other.rollout(3, break_when_any_done=False)
+    env.body_rate_weight = 0.004
+    other.load_state_dict(through_a_file(env.state_dict()))
+    assert other.body_rate_weight == 0.004
+    root = TensorDict({}, [6])  # neither is observed here: images have noise from the generator
+    for _ in range(60):  # past the end of every episode: resets draw from the restored generator
+        action = torch.rand(6, 4) * 2 - 1
+        steps = [each.step(root.clone().set("action", action))["next"] for each in (env, other)]
+        assert (steps[0] == steps[1]).all()
+        if steps[0]["done"].any():
+            resets = [each.reset(root.clone().set("_reset", steps[0]["done"])) for each in (env, other)]
+            assert (resets[0] == resets[1]).all()
+
+
+def test_a_state_of_another_number_of_worlds_is_refused() -> None:
+    env, other = (DroneRacingEnv("circle", n, from_pixels=False, seed=0) for n in (2, 3))
+    with pytest.raises(ValueError, match="2 worlds, these are 3: resume with num_envs=2"):
+        other.load_state_dict(env.state_dict())
+
+
+def test_a_state_of_another_device_is_refused() -> None:
+    env = DroneRacingEnv("circle", 2, from_pixels=False, seed=0)
+    state = env.state_dict()
+    state["worlds"]["generator"] = torch.zeros(16, dtype=torch.uint8)  # as a CUDA generator's
+    with pytest.raises(ValueError, match="worlds on cuda, these are on cpu.*env.device=cuda"):
+        env.load_state_dict(state)
+
+
+# Programs that end without closing their environments end well.
+
+
+PROGRAM = """
+import os
+import sys
+
+import gymnasium
+import torch  # what takes long is imported once, before the processes part
+
+import dreamer_racing.envs.gym_vector_env
+import dreamer_racing.envs.sb3_env
+from dreamer_racing.envs import DroneRacingEnv
+
+for number in range(10):
+    child = os.fork()
+    if not child:
+        break
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if status:
+        sys.exit(f"process {number} ended with {status}")
+else:
+    sys.exit()
+KINDS = (
+    lambda: gymnasium.make("dreamer_racing/Circle-v0"),
+    lambda: gymnasium.make_vec("dreamer_racing/Circle-v0", num_envs=2),
+    lambda: dreamer_racing.envs.sb3_env.DroneRaceVecEnv("circle", 2),
+    lambda: DroneRacingEnv("circle", 2),
+)
+first, second = KINDS[number % 4](), KINDS[(number + 1) % 4]()
+for env in (first, second):
+    env.reset()
+    print("drawn")
+"""
+
+
+@pytest.mark.slow
+def test_ten_processes_that_close_nothing_end_with_status_zero() -> None:
+    pytest.importorskip("stable_baselines3")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["drawn"] * 20

@@ -196,7 +196,7 @@ def test_kernels_waits_and_devices_are_told_apart() -> None:
     ):
         assert len(launches(waits).waits) == 1
     seen = launches(lambda: values.to("meta") + torch.ones(()))
-    assert len(seen.mixed) == 1 and seen.mixed[0].startswith("_to_copy at learners/test_launches.py:")
+    assert len(seen.mixed) == 1 and seen.mixed[0].startswith("_to_copy at learners/test_cuda_graph.py:")
     assert len(launches(lambda: torch.ones(3, device="meta").mul_(torch.ones(3))).mixed) == 1
     assert not launches(lambda: values * torch.ones(())).mixed, "a number goes with every device"
 

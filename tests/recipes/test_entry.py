@@ -1,4 +1,4 @@
-"""The command line: numbers as people write them, and hydra's refusals in plain words."""
+"""How a recipe starts: signals, packages that are missing, and what is said while one waits."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from hydra.errors import HydraException
 
-from tests.running_recipes import CONFIG, ROOT, compose, recipe, recipe_module
+from dreamer_racing.training.model_lag import LOOKS
+from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, recipe, recipe_module
 
 
 @pytest.mark.parametrize(
@@ -179,3 +181,57 @@ def test_a_race_does_without_dm_control_which_opens_a_display(tmp_path: Path) ->
     without = "import sys; sys.modules['dm_control'] = None"
     done = recipe("dreamer_v3", "model=debug", "total_env_steps=1", cwd=tmp_path, before=without)
     assert done.returncode == 2 and "prefill" in done.stderr, done.stderr
+
+
+# A recipe that is started by a Python without the project's packages.
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.py")), ids=lambda path: path.stem)
+def test_every_recipe_says_how_to_run_it(tmp_path: Path, path: Path) -> None:
+    command = [sys.executable, "-S", "-E", str(path)]  # no packages
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "has no dreamer_racing" in done.stderr and f"{ROOT}/dev python {path}" in done.stderr
+
+
+# The actor waits where the model lags behind.
+
+
+SETTINGS = [
+    *TINY, "tuned=race", "model=debug", "model.batch_size=4", "env.from_pixels=false", "loss.ppo.steps=32",
+    "loss.ppo.minibatch=32", "env.start_on_line=0", "schedule.start_on_line.to=null", "schedule.wait_every=32",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_actor_waits_while_the_newest_records_are_not_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.measuring")
+    config, session = open_session(
+        *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}", name="latent_ppo"
+    )
+    looked, waited = [], []
+
+    def measure(learner, windows):
+        replay = session.parts["replay"]
+        newest = torch.stack([replay.records(world)["reward"][-8:] for world in range(replay.num_streams)])
+        assert torch.equal(windows["reward"], newest), "of all worlds, what the newest rollout brought"
+        looked.append(learner.updates)
+        return {"privileged_error": torch.tensor(1e3 if session.env_steps <= 12 * 32 else 0.0)}
+
+    def watched(self, batch, timed, update=latent_ppo.LatentPPO.update):
+        before = [parameter.clone() for parameter in self.agent.actor.parameters()]
+        if looked and looked[-1] == self.updates:  # the first update after a look
+            waited.append(self.actor_waits)
+        metrics = update(self, batch, timed)
+        if self.actor_waits:
+            assert all(map(torch.equal, before, self.agent.actor.parameters()))
+        assert self.actor_waits is session.parts["lag"].waits
+        return metrics
+
+    monkeypatch.setattr(measuring, "world_model_metrics", measure)
+    monkeypatch.setattr(latent_ppo.LatentPPO, "update", watched)
+    latent_ppo.train(config, session)
+    session.close()
+    assert True in waited and waited[-1] is False and waited == sorted(waited, reverse=True)

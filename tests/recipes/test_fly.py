@@ -1,7 +1,8 @@
-"""`recipes/fly.py viewer=true`: flights before someone's eyes, in a stand-in for the window; refusals without one."""
+"""Recipes around flights: fly, tracks, sim_to_real."""
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from types import ModuleType
@@ -12,9 +13,11 @@ from PIL import Image
 from tensordict import TensorDictBase
 
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, load_track
 from dreamer_racing.envs.viewer import WindowClosedError
 from dreamer_racing.envs.worlds import RaceWorlds
-from tests.running_recipes import recipe, recipe_module
+from dreamer_racing.plant.study import StudyFlight
+from tests.running_recipes import ROOT, recipe, recipe_module
 
 
 class StandIn:
@@ -138,3 +141,81 @@ def test_without_opengl_no_flight_is_filmed_and_none_is_flown(
         fly.fly(fly.FlyConfig(pilot="hover", view="chase", run_dir=str(tmp_path / "new")))
     assert "by OpenGL alone, and here is none." in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+# The list of tracks.
+
+
+TRIANGLE = """name: triangle
+gates:
+  - {position: [0.0, 0.0, 1.35], yaw_degrees: 0.0}
+  - {position: [8.0, 0.0, 1.35], yaw_degrees: 120.0}
+  - {position: [8.0, 6.0, 1.35], yaw_degrees: -120.0}
+"""
+
+
+def test_the_list_needs_no_torch_and_has_every_track(tmp_path: Path) -> None:
+    before = (
+        "import builtins; imports = builtins.__import__\n"
+        "def without_torch(name, *rest, **named):\n"
+        "    assert name.partition('.')[0] != 'torch'\n"
+        "    return imports(name, *rest, **named)\n"
+        "builtins.__import__ = without_torch"
+    )
+    done = recipe("tracks", cwd=tmp_path, before=before)
+    head, *lines = done.stdout.splitlines()
+    assert done.returncode == 0 and head.startswith("track"), done.stderr
+    assert [line.split()[0] for line in lines] == list(BUILTIN_TRACKS)
+    assert not list(tmp_path.iterdir())
+    assert done.stdout in (ROOT / "docs" / "tracks.md").read_text(encoding="utf-8")
+
+
+def test_a_track_of_ones_own_is_measured_and_drawn(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(TRIANGLE)
+    done = recipe("tracks", "track=mine.yaml", "picture=mine.png", "--json", cwd=tmp_path)
+    (found,) = json.loads(done.stdout)
+    assert found["track"] == "triangle" and (found["gates"], found["decoys"], found["laps"]) == (3, 0, 3)
+    assert found["lap_length"] == 8.0 + 6.0 + 10.0 and found["least_gate_distance"] == 6.0
+    with Image.open(tmp_path / "mine.png") as image:
+        assert image.width > 500
+
+
+def test_what_cannot_be_flown_or_drawn_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("gates: 3\n")
+    for overrides, said in ((["track=mine.yaml"], "mine.yaml: gates is 3"), (["picture=a.gif"], "picture=a.gif")):
+        done = recipe("tracks", *overrides, cwd=tmp_path)
+        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+
+
+# `recipes/sim_to_real.py` before anything flies.
+
+
+sim_to_real = recipe_module("sim_to_real")
+
+
+def test_an_actor_of_another_track_is_refused():
+    assert sim_to_real.check(sim_to_real.SimToRealConfig(actor="kidney"))[0] == load_track("kidney")
+    with pytest.raises(ValueError, match="source.track is 'kidney', .* track=circle"):
+        sim_to_real.check(sim_to_real.SimToRealConfig(actor="kidney", track="circle"))
+
+
+def test_the_pilot_is_not_flown_beside_itself():
+    with pytest.raises(ValueError, match="beside=pilot and actor=pilot"):
+        sim_to_real.check(sim_to_real.SimToRealConfig(track="circle", beside="pilot"))
+
+
+def test_agent_and_pilot_come_of_one_command(monkeypatch, tmp_path):
+    made = []
+
+    def flown(make_flyer, track, *others):
+        made.append(make_flyer.func.__name__)
+        yield StudyFlight("delay", 0.0, 0, 18, True, 4.0 + len(made), 9.0, "over")
+
+    monkeypatch.setattr(sim_to_real, "study", flown)
+    monkeypatch.setattr("sys.argv", ["sim_to_real", "actor=kidney", "beside=pilot", f"run_dir={tmp_path}", "flights=1"])
+    sim_to_real.main()
+    assert made == ["ActorFlyer", "PilotFlyer"]
+    for name, actor, lap in (("sim_to_real", "kidney", 5.0), ("sim_to_real_pilot", "pilot", 6.0)):
+        result = json.loads((tmp_path / f"{name}.json").read_text())
+        assert result["provenance"]["actor"] == actor and result["flights"][0]["lap_time"] == lap
+    assert (tmp_path / "sim_to_real.png").stat().st_size > 1000

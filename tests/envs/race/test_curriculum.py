@@ -1,12 +1,16 @@
-"""The schedule of b₂ and the relabelling of sampled rewards."""
+"""Rewards, their curriculum, and the race vector."""
 
 from __future__ import annotations
+
+import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, BodyRateSchedule, RelabelReward
+from dreamer_racing.envs.race.rewards import RewardWeights, race_reward
+from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.experience.replay import make_replay
 
 
@@ -102,3 +106,112 @@ def test_relabelling_agrees_with_the_environment_at_the_same_weight():
     slot = sample["index"][~sample["is_init"].squeeze(-1)]
     collected = data["next", "reward"][slot // 50, slot % 50 - 1]
     assert torch.allclose(sample["reward"][~sample["is_init"].squeeze(-1)], collected, atol=1e-6)
+
+
+# Eq. 1 by hand.
+
+
+GATE = torch.tensor([[10.0, 0.0, 0.0]])
+RATES = torch.tensor([[1.0, 2.0, 2.0]])  # norm 3
+
+
+def reward(previous, position, passes=0, crashed=False, weights=None, rates=RATES):
+    """Reward one drone."""
+    base, rate = race_reward(
+        weights or RewardWeights(),
+        GATE,
+        torch.tensor([previous]),
+        torch.tensor([position]),
+        rates,
+        torch.tensor([passes]),
+        torch.tensor([crashed]),
+    )
+    return base.item(), rate.item()
+
+
+@pytest.mark.parametrize("name", ["progress", "body_rate", "gate", "collision"])
+@pytest.mark.parametrize("weight", [math.nan, math.inf, -math.inf, "10", True])
+def test_weights_are_finite_numbers(name, weight):
+    with pytest.raises(ValueError, match=f"RewardWeights.{name}={weight!r}: must be (a number, )?finite"):
+        RewardWeights(**{name: weight})
+
+
+def test_defaults_are_the_papers():
+    assert RewardWeights() == RewardWeights(progress=1.0, body_rate=0.0, gate=10.0, collision=-4.0)
+
+
+@pytest.mark.parametrize(
+    ("previous", "position", "progress"),
+    [
+        ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 0.2),
+        ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0), -0.2),
+        ((10.0, 3.0, 4.0), (10.0, 0.0, 1.0), 4.0),  # from 5 m away to 1 m away
+        ((7.0, 4.0, 0.0), (7.0, -4.0, 0.0), 0.0),  # along a sphere about the gate
+    ],
+)
+def test_progress_is_the_decrease_of_the_distance(previous, position, progress):
+    assert reward(previous, position) == (pytest.approx(progress), pytest.approx(3.0))
+
+
+def test_a_pass_replaces_progress_and_the_rate_term():
+    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=1) == (10.0, 0.0)
+
+
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_crash_outweighs_everything(passes):
+    assert reward((9.9, 0.0, 0.0), (10.1, 0.0, 0.0), passes=passes, crashed=True) == (-4.0, 0.0)
+
+
+def test_a_crash_hides_lost_numbers():
+    lost = torch.full((1, 3), math.nan)
+    assert reward((0.0, 0.0, 0.0), (math.nan, 0.0, math.inf), crashed=True, rates=lost) == (-4.0, 0.0)
+
+
+def test_weights():
+    weights = RewardWeights(progress=2.0, body_rate=0.5, gate=7.0, collision=-1.0)
+    flight = ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
+    # The rate term is left to the caller, so b₂ changes neither part.
+    assert reward(*flight, weights=weights) == (pytest.approx(0.4), pytest.approx(3.0))
+    assert reward(*flight, weights=weights, passes=1) == (7.0, 0.0)
+    assert reward(*flight, weights=weights, crashed=True) == (-1.0, 0.0)
+
+
+def test_drones_are_independent():
+    base, rate = race_reward(
+        RewardWeights(),
+        GATE.expand(3, 3),
+        torch.zeros(3, 3),
+        torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]),
+        RATES.expand(3, 3),
+        torch.tensor([False, True, False]),
+        torch.tensor([False, False, True]),
+    )
+    assert base.tolist() == [1.0, 10.0, -4.0]
+    assert rate.tolist() == [3.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("track", ["kidney", "figure8", "split_s", "circle"])
+def test_a_race_vector_says_where_the_drone_is(track: str) -> None:
+    worlds = RaceWorlds(track, num_envs=64, from_pixels=False, start_on_line=1.0)
+    worlds.reset()
+    for _ in range(10):
+        worlds.step(torch.rand(64, 4) * 0.4 - 0.2)
+    gate, state = worlds.race.target_gate, worlds.simulator.state
+    position, attitude, misfit = worlds.race_vector.pose(worlds.vector(), gate)
+    torch.testing.assert_close(position, state.position, atol=1e-4, rtol=0)
+    same = (attitude * state.attitude).sum(-1).abs()
+    torch.testing.assert_close(same, torch.ones_like(same), atol=1e-6, rtol=0)
+    assert misfit.max() < 1e-8
+    worlds.close()
+
+
+def test_other_gates_fit_worse_than_those_that_were_seen() -> None:
+    worlds = RaceWorlds("kidney", num_envs=64, from_pixels=False, start_on_line=1.0)
+    worlds.reset()
+    vector = worlds.vector() + 0.02 * torch.randn(64, 21)  # as a model that is not exact decodes it
+    gate = worlds.race.target_gate
+    misfits = [worlds.race_vector.pose(vector, (gate + offset) % worlds.track.num_gates)[2] for offset in (0, -1, 1)]
+    assert (torch.stack(misfits).argmin(0) == 0).float().mean() > 0.9
+    position = worlds.race_vector.pose(vector, gate)[0]
+    assert (position - worlds.simulator.state.position).norm(dim=-1).median() < 0.5
+    worlds.close()

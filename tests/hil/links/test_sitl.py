@@ -200,7 +200,7 @@ def test_beside_a_receiver_nothing_that_is_sent_could_arm(server: socket.socket)
 # Every link by the bytes that it sends: which way each axis goes, and how far, read by hand or by pymavlink.
 
 
-HOVER_THROTTLE = 1604.45  # µs, see test_sticks
+HOVER_THROTTLE = 1604.45  # µs, see tests/hil/test_flyer.py
 
 
 class Recorder:

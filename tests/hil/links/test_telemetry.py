@@ -43,7 +43,7 @@ FRAMES = {"crsf": (CrsfTelemetry, CRSF_252, 25.2), "msp": (MspTelemetry, MSP_152
 
 
 def test_frames_by_hand():
-    """The CRC by long division is that of `test_channel_codecs`; the XOR: 0B^82=89, ^04=8D, ^DC^05=54, ^98=CC, ^64=A8,
+    """The CRC by long division is that of `test_udp`; the XOR: 0B^82=89, ^04=8D, ^DC^05=54, ^98=CC, ^64=A8,
     ^D0^07=7F, ^F3^05=89."""
     assert CRSF_252[:-1] == bytes.fromhex("c80a0800fc00bd00089764") and len(CRSF_252) == 12
     assert b"$M>" + bytes.fromhex("0b82 04dc0598 6400 d007 00 f305 89") == MSP_1523

@@ -1,15 +1,60 @@
-"""`benchmarks/learning_signal.py`: what it makes of rollouts and gradients that can be worked out by hand."""
+"""What benchmarks measure."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
+from dreamer_racing import machine
 from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.heads import symexp
 from tests.running_recipes import module_of
+
+
+def test_records_name_the_commit_that_measuring_began_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measuring = module_of("benchmarks", "measuring")
+    begun = machine.provenance()["commit"]
+    monkeypatch.setattr(machine, "git_commit", lambda folder: "later")
+    assert machine.provenance()["commit"] == "later" != begun
+    measuring.write_json([{"speed": 1.0}, {"speed": 2.0}], str(tmp_path / "sub" / "records.json"))
+    records = json.loads((tmp_path / "sub" / "records.json").read_text())
+    assert [(record["speed"], record["commit"]) for record in records] == [(1.0, begun), (2.0, begun)]
+
+
+# What a linear map and a probe do not tell of latents: nothing, all, or only what is tangled.
+
+
+state_estimation = module_of("benchmarks", "state_estimation")
+
+
+def shown(number: int, tangled: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Latents, probabilities among them, and a state that is linear in them or in products of them."""
+    latents = torch.randn(number, 4)
+    state = latents[:, :2] * latents[:, 2:] if tangled else latents[:, :2] + 2.0 * latents[:, 2:]
+    return torch.cat((latents, torch.softmax(torch.randn(number, 3), -1)), 1), symexp(state)
+
+
+@pytest.mark.parametrize(("tangled", "least", "most"), [(False, 0.0, 1e-6), (True, 0.95, 1.1)])
+def test_a_linear_map_tells_what_is_linear(tangled: bool, least: float, most: float) -> None:
+    torch.manual_seed(0)
+    assert least <= state_estimation.linear_share(shown(4000, tangled), shown(1000, tangled)) <= most
+
+
+def test_a_probe_that_learns_on_tells_what_is_tangled() -> None:
+    torch.manual_seed(0)
+    learned, measured = shown(4000, tangled=True), shown(1000, tangled=True)
+    probe = state_estimation.Probe(7, 2)
+    late = state_estimation.settle(probe, learned, measured, 20)["share"]
+    assert state_estimation.settle(probe, learned, measured, 400)["share"] < 0.5 * late
+
+
+# `benchmarks/learning_signal.py`: what it makes of rollouts and gradients that can be worked out by hand.
+
 
 learning_signal = module_of("benchmarks", "learning_signal")
 

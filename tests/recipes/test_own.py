@@ -1,0 +1,216 @@
+"""One's own: losses, rewards, tracks."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from omegaconf import OmegaConf
+
+from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.envs.tracks import Track, describe_track, load_track
+from dreamer_racing.export.onnx_actor import read_contract
+from dreamer_racing.hil.flyer import trained_track
+from dreamer_racing.modules import Interface
+from tests.running_recipes import ROOT, TINY, UNDRAWN, compose, recipe, recipe_module
+
+
+def written(page: str) -> list[str]:
+    """The Python that a page writes."""
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
+
+
+LARGER = (ROOT / "examples" / "losses" / "overshooting.py").read_text(encoding="utf-8")
+LOSSES, REWARDS = "\n\n".join([*written("losses.md"), LARGER]), "\n\n".join(written("own_rewards.md")[:-1])
+OVERRIDES = [
+    "loss.world_model=reconstruction+my_losses:Overshooting",
+    "loss.actor=my_losses:smooth_reinforce",
+    "env.reward=my_rewards:smooth",
+]
+
+
+@pytest.mark.slow
+def test_an_agent_of_own_losses_is_evaluated_flown_exported_and_drawn_from_elsewhere(tmp_path: Path) -> None:
+    home, elsewhere, run = tmp_path / "home", tmp_path / "elsewhere", tmp_path / "run"
+    home.mkdir()
+    elsewhere.mkdir()
+    (home / "my_losses.py").write_text(LOSSES)
+    (home / "my_rewards.py").write_text(REWARDS)
+    overrides = [*TINY, "tuned=none", *OVERRIDES, f"run_dir={run}", "evaluation.every=100"]
+    trained = recipe("dreamer_v3", *overrides, cwd=home, before=UNDRAWN)
+    assert trained.returncode == 0, trained.stderr
+    assert "my_losses:Overshooting" in (run / "config.yaml").read_text()
+    assert "reward: my_rewards:smooth, minus the curriculum's penalty of body rates" in trained.stdout
+    lost = recipe("evaluate", f"checkpoint={run}", "episodes=1", cwd=elsewhere)
+    assert lost.returncode == 2 and f"there is no my_losses.py in {elsewhere}" in lost.stderr
+    assert "set PYTHONPATH to that folder" in lost.stderr
+    path = f"import sys; sys.path.append({str(home)!r})"  # what PYTHONPATH does
+    for name, *overrides in (
+        ("evaluate", f"checkpoint={run}", "episodes=1", "video_steps=5"),
+        ("fly", f"agent={run}", f"run_dir={elsewhere / 'flight'}"),
+        ("export", f"checkpoint={run}", f"output={elsewhere / 'export' / 'actor.onnx'}"),
+        ("plot", f"runs={run}", f"output={elsewhere / 'figures'}"),
+    ):
+        done = recipe(name, *overrides, cwd=elsewhere, before=path)
+        assert done.returncode == 0, f"{name}: {done.stderr}"
+    assert json.loads((run / "evaluation" / "evaluation.json").read_text())["deterministic"]["num_episodes"] == 1
+    assert list((elsewhere / "flight").rglob("*trajectory.csv"))
+    assert (elsewhere / "export" / "actor.onnx").is_file()
+    assert (elsewhere / "figures" / "learning_curves.png").is_file()
+
+
+# A reward and an observation of one's own, by their names in a run's configuration.
+
+
+SOURCE = """import torch
+
+def constant(step):
+    return torch.full_like(step.default_reward, 3.0)
+
+def action(state):
+    return state.action
+
+def wide(step):
+    return step.after.action
+"""
+OWN = ["env.reward=my_own:constant", "env.vector=my_own:action"]
+RUN = ["track=circle", "model=debug", "device=cpu", "env.num_envs=2"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a file of one's own, from which one starts."""
+    (tmp_path / "my_own.py").write_text(SOURCE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    sys.modules.pop("my_own", None)
+
+
+def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -> None:
+    dreamer, arena, saved = map(recipe_module, ("dreamer_v3", "composing.arena", "composing.saved"))
+    resolved = dreamer.resolve(compose("dreamer_v3", *RUN, *OWN))
+    OmegaConf.save(resolved, folder / "config.yaml")
+    config = saved.trained_config(folder)
+    trained_in, flown_in = (
+        arena.make_env(config),
+        DroneRacingEnv(num_envs=1, evaluation=True, **arena.worlds_of(config)),
+    )
+    for env in (trained_in, flown_in):
+        interface = Interface.of(env)
+        assert (interface.observation_keys, interface.vector_dim) == (["pixels", "vector"], 4)
+        step = env.rand_step(env.reset())
+        assert step["next", "reward"].eq(3.0).all()
+        torch.testing.assert_close(step["next", "vector"], step["action"])
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ("reward=my_own:wide", r"env\.reward=my_own:wide returned a tensor of shape \(2, 4\): must be \(2,\)"),
+        ("reward=my_own:constnat", r"env\.reward=my_own:constnat: .* \(did you mean constant\?\)"),
+        ("vector=progress", r"env\.vector='progress': must be a function of your own"),
+    ],
+)
+def test_bad_ones_are_refused_before_anything_is_built(folder: Path, own: str, message: str) -> None:
+    dreamer, checks = map(recipe_module, ("dreamer_v3", "composing.checks"))
+    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *RUN, f"env.{own}")))
+    with pytest.raises(ValueError, match=message):
+        checks.check(config)
+
+
+def test_the_control_suite_has_neither() -> None:
+    dreamer, checks = map(recipe_module, ("dreamer_v3", "composing.checks"))
+    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "env=dmc", "model=debug", OWN[0])))
+    with pytest.raises(ValueError, match=r"env\.reward=my_own:constant is for races"):
+        checks.check(config)
+
+
+def test_what_sees_numbers_of_ones_own_is_not_exported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exporting, schema = map(recipe_module, ("export", "composing.schema"))
+    config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *RUN, *OWN)))
+    monkeypatch.setattr(exporting, "find_trained", lambda name: folder)
+    monkeypatch.setattr(exporting, "config_folder", lambda path: path)
+    monkeypatch.setattr(exporting, "trained_config", lambda path: config)
+    with pytest.raises(ValueError, match=r"env\.vector=my_own:action, which computes from the simulator's state"):
+        exporting.export(schema.ExportConfig(checkpoint="run"))
+
+
+# A track of the user's own: a run keeps it as it was, and what comes of the run flies it.
+
+
+EVALUATION = ("episodes=1", "num_envs=1", "video_steps=5")
+
+
+@pytest.fixture
+def track() -> Track:
+    """Circle from a start that is a little higher."""
+    circle = load_track("circle")
+    x, y, z = circle.start_position
+    return replace(circle, name="mine ${oc.env:HOME}", start_position=(x, y, z + 0.1))
+
+
+@pytest.mark.slow
+def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    file, directory, agent = tmp_path / "tracks" / "mine.yaml", tmp_path / "run", tmp_path / "mine"
+    write(track, file)
+    short = [override for override in TINY if not override.startswith("track=")]
+    begun = recipe("dreamer_v3", f"track={file}", *short, "run_dir=run", cwd=tmp_path)
+    assert begun.returncode == 0, begun.stderr
+    write(load_track("circle"), file)
+    resumed = recipe("dreamer_v3", "resume=run", "budget=none", "total_env_steps=240", cwd=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"track: as {file} was when the run was begun, which it no longer is\n" in resumed.stdout
+    # a choice of settings composes everything anew, up to what is noted
+    again = recipe("dreamer_v3", "resume=run", "tuned=auto", *short, "total_env_steps=280", cwd=tmp_path)
+    assert again.returncode == 0 and "which it no longer is" in again.stdout, again.stderr
+    of_now = recipe("evaluate", "checkpoint=run", f"track={file}", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
+    assert of_now.returncode == 0, of_now.stderr
+    export = ("export", f"checkpoint={directory}", "agent=mine", "commit=abc1234")
+    refused = recipe(*export, cwd=tmp_path)
+    assert refused.returncode == 2 and "was flown on another track, or" in refused.stderr, refused.stderr
+    file.unlink()
+    evaluated = recipe("evaluate", "checkpoint=run", *EVALUATION, cwd=tmp_path, before=UNDRAWN)
+    assert evaluated.returncode == 0, evaluated.stderr
+    exported = recipe(*export, cwd=tmp_path)
+    assert exported.returncode == 0, exported.stderr
+    contract = read_contract(agent / "contract.json")
+    assert (contract["source"]["track"], trained_track(contract)) == ("mine.yaml", track)
+    texts = [path.read_text() for path in agent.iterdir() if path.suffix in (".json", ".yaml")]
+    assert not any(str(tmp_path) in text for text in texts), "paths of this machine"
+    flown = recipe("fly", f"agent={agent}", cwd=tmp_path)
+    assert flown.returncode == 0, flown.stderr
+
+
+def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    write(track, file)
+    dreamer, arena = recipe_module("dreamer_v3"), recipe_module("composing.arena")
+    config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
+    assert arena.track_as_begun(config) == track
+    file.write_text("gates: []", encoding="utf-8")
+    assert arena.track_as_begun(config) == track
+    built_in = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=kidney", "model=debug")))
+    assert (arena.track_as_begun(built_in), built_in.track_description) == (load_track("kidney"), None)
+
+
+def test_what_a_run_notes_is_not_to_be_given() -> None:
+    checks = recipe_module("composing.checks")
+    with pytest.raises(ValueError, match=r"track_description= is what a run notes of its track's file"):
+        checks.check_overrides(compose("dreamer_v3"), ["track_description={}"])
+
+
+def write(track: Track, file: Path) -> None:
+    """Write a track's file."""
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(yaml.safe_dump(describe_track(track)), encoding="utf-8")
