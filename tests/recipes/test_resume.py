@@ -141,7 +141,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(name: str, tuned: list[str], 
 def test_a_resumed_run_of_the_control_suite_is_evaluated_as_an_uninterrupted_one(tmp_path: Path) -> None:
     """Also its second evaluation: no world remembers how many there were before."""
     settings = [setting for setting in SETTINGS if not setting.startswith((*RACES, "evaluation.every"))]
-    settings.append("evaluation.every=240")  # twice, of 500 steps each
+    settings += ["env.episode_steps=40", "evaluation.every=240"]  # twice
     suite = ["tuned=none", "env=dmc", "task=cartpole_swingup", "env.from_pixels=false", "run_dir=whole"]
     train(tmp_path, *settings, *suite)
     kill(tmp_path / "whole", tmp_path / "killed")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -42,8 +43,18 @@ def load_track(name_or_path: str | Path | Track) -> Track:
     if isinstance(name_or_path, Track):
         validate_track(name_or_path, source=f"Track({name_or_path.name!r})")
         return name_or_path
-    path = _find(name_or_path)
+    if isinstance(name_or_path, str) and name_or_path in BUILTIN_TRACKS:
+        return _load_builtin(name_or_path)
+    return _load_file(_find(name_or_path))
+
+
+def _load_file(path: Path) -> Track:
     return read_track(_parse(path), str(path), name=path.stem)
+
+
+@functools.cache
+def _load_builtin(name: str) -> Track:
+    return _load_file(_find(name))
 
 
 def read_track(content: Any, source: str, name: str = "track") -> Track:
