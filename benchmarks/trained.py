@@ -11,7 +11,7 @@ from tensordict import TensorDict
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 from composing.arena import Environment, make_env, worlds_of
-from composing.building import Rewards, make_run_replay
+from composing.building import make_curriculum, make_run_replay
 from composing.learners import size_of
 from composing.restoring import restore_learner
 from composing.saved import trained_config
@@ -61,22 +61,12 @@ def restore(path: str) -> Trained:
 def restore_replay(trained: Trained, config: WorldModelRunConfig | None = None) -> StreamReplay:
     """Bring back the replay of a checkpoint that holds one (not `best/`), sampled as the run, or `config`, does."""
     config = config or trained.config
-    settings = config.replay
     env = make_env(replace(config, env=replace(config.env, start_on_line=0.0)), num_envs=1)  # for what it shows
-    rewards = Rewards(config, env)
-    replay = make_run_replay(
-        config,
-        env,
-        rewards,
-        config.model.batch_size,
-        config.model.batch_length,
-        latents=trained.learner.latent_format if settings.context else None,
-        recent_share=settings.recent_share,
-        recent_records=settings.recent_records,
-        held_out=settings.held_out,
-    )
+    curriculum = make_curriculum(config, env)
+    latents = trained.learner.latent_format if config.replay.context else None
+    replay = make_run_replay(config, env, curriculum, (config.model.batch_size, config.model.batch_length), latents)
     env.close()
-    load_components(trained.checkpoint, {"replay": replay} | ({"curriculum": rewards} if rewards.curriculum else {}))
+    load_components(trained.checkpoint, {"replay": replay, "curriculum": curriculum})
     return replay
 
 

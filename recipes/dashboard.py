@@ -15,16 +15,14 @@ TensorBoard's: the page says how to open it.
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
-from composing.restoring import restore
-from composing.schema import EvaluateConfig
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+from composing.restoring import FlightConfig, restore
 
+from dreamer_racing.commands import from_here
 from dreamer_racing.envs.tracks import Track, load_track
 from dreamer_racing.evaluation.protocol import fly as fly_races
 from dreamer_racing.evaluation.trajectory import NUMBERS, read_flight
@@ -36,7 +34,7 @@ from dreamer_racing.figures.dashboard_panel import ShownFlight, missing
 from dreamer_racing.figures.evaluations import evaluation_files
 from dreamer_racing.figures.plotting import run_of, stage_name
 from dreamer_racing.figures.scene_3d import check_viser
-from dreamer_racing.settings import SEED, Range, check_settings, setting
+from dreamer_racing.settings import SEED, Range, setting
 from dreamer_racing.training.directory import RunDirectory
 
 PAGE = "dashboard.html"
@@ -57,9 +55,6 @@ class DashboardConfig:
     seed: int = setting(0, SEED)  # likewise
 
 
-ConfigStore.instance().store(name="dashboard_schema", node=DashboardConfig)
-
-
 class Source(NamedTuple):
     """A flight, and where it came from."""
 
@@ -69,18 +64,17 @@ class Source(NamedTuple):
     """Of the run, or of what else it was stored in."""
 
 
-@recipe("dashboard")
-def main(composed: DictConfig) -> None:
+@recipe("dashboard", DashboardConfig)
+def main(config: DashboardConfig) -> None:
     """Find or fly the flights, write the page, and show it if asked to."""
     start_logging()
     with plain_errors():
-        config = cast(DashboardConfig, OmegaConf.to_object(composed))
         check(config)
         check_viser()
         sources = find(config)
         training = [how_it_trained(sources)]
         flights, track = [source.flight for source in sources], sources[0].track
-        output = Path(config.output or from_here(sources[0].folder) / PAGE)
+        output = Path(config.output or Path(from_here(sources[0].folder)) / PAGE)
         size = write_page(output, track, flights, training)
     for line in (*training, *(line for flight in flights for line in missing(flight))):
         print(line.replace("`", ""))
@@ -90,12 +84,7 @@ def main(composed: DictConfig) -> None:
 
 
 def check(config: DashboardConfig) -> None:
-    """Refuse what would leave open which flight is meant.
-
-    Raises:
-        ValueError: the message names the field and what is right.
-    """
-    check_settings(config)
+    """Refuse what would leave open which flight is meant."""
     if (config.run is None) == (config.agent is None):
         given = "neither is given" if config.run is None else f"both are given, {config.run} and {config.agent}"
         raise ValueError(f"run= names a stored flight, agent= what to fly now: give one of them; {given}.")
@@ -162,7 +151,7 @@ def read(file: Path) -> Source:
 
 def fly(place: str, config: DashboardConfig) -> Source:
     """Fly the deterministic policy of an agent once, as recipes/fly.py does."""
-    restored = restore(EvaluateConfig(checkpoint=place, renderer=config.renderer, seed=config.seed))
+    restored = restore(FlightConfig(checkpoint=place, renderer=config.renderer, seed=config.seed))
     worlds = worlds_of(restored.trained) | {"seed": config.seed}
     policy, value_function = restored.flyer.evaluation_policy(), restored.flyer.value_function()
     flown = fly_races(policy, worlds, episodes=1, value_function=value_function)
@@ -174,18 +163,14 @@ def fly(place: str, config: DashboardConfig) -> Source:
 
 def how_it_trained(sources: list[Source]) -> str:
     """Say how the curves of training are opened: they are TensorBoard's."""
-    logged = {from_here(source.folder): None for source in sources if (source.folder / "tensorboard").is_dir()}
+    # As seen from the working directory, if they lie there: pages are shown to others.
+    logged = {Path(from_here(source.folder)): None for source in sources if (source.folder / "tensorboard").is_dir()}
     if not logged:
         return "Training curves: these flights lie in no run directory with TensorBoard files."
     if len(logged) == 1:
         return f"Training curves: `tensorboard --logdir {shlex.quote(str(*logged))}`"
     runs = ",".join(f"{folder.name}:{folder}" for folder in logged)
     return f"Training curves: `tensorboard --logdir_spec {shlex.quote(runs)}`"
-
-
-def from_here(folder: Path) -> Path:
-    """Return a folder as seen from the working directory, if it lies there: pages are shown to others."""
-    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def show(track: Track, flights: list[ShownFlight], port: int, training: list[str]) -> None:

@@ -11,13 +11,10 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from composing.command_line import plain_errors
 from composing.entry import recipe
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.doctor import Diagnosis, Verdict, examine
-from dreamer_racing.settings import COUNT, check_settings, setting
+from dreamer_racing.settings import COUNT, setting
 
 
 @dataclass
@@ -44,14 +41,9 @@ class DoctorConfig:
     json: bool = False  # for programs, on stdout; --json does the same
 
 
-ConfigStore.instance().store(name="doctor_schema", node=DoctorConfig)
-
-
-@recipe("doctor")
-def main(config: DictConfig) -> None:
+@recipe("doctor", DoctorConfig)
+def main(config: DoctorConfig) -> None:
     """Examine, and print what was found."""
-    with plain_errors():
-        check_settings(OmegaConf.to_object(config))
     findings = []
     for finding in examine(config.replay.capacity, config.checkpoint.keep, Path(config.run_dir)):
         findings.append(finding)

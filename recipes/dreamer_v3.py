@@ -12,55 +12,49 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 from typing import cast
 
 from composing.building import (
-    Rewards,
+    make_curriculum,
     make_run_evaluator,
-    make_sequence_replay,
+    make_run_replay,
     make_tracker,
+    num_gates,
     seed_generators,
 )
-from composing.checks import check_world_model_run
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, make_learner, make_schedule, move_starts
-from composing.measuring import measure
-from composing.resolving import resolve_world_model, tune
-from composing.schema import DreamerV3RunConfig, register
+from composing.learners import begin_with, make_learner, measure
+from composing.resolving import resolve_world_model as resolve
+from composing.schema import DreamerV3RunConfig
 from composing.sharing import share_of
 from composing.workers import make_own_env, make_rollouts
 from omegaconf import DictConfig
 
+from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.modules import Interface
+from dreamer_racing.training.schedule import Schedule
 from dreamer_racing.training.session import Session
 
-register()
 
-
-@recipe("dreamer_v3")
+@recipe("dreamer_v3", DreamerV3RunConfig, composed=True)
 def main(config: DictConfig) -> None:
     """Compose the configuration, and train."""
-    launch(config, resolve, train, tune, remedy="model.learning_rate, or model.mixed_precision=false")
-
-
-def resolve(config: DictConfig) -> DictConfig:
-    """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
-    return resolve_world_model(config)
+    launch(config, resolve, train, remedy="model.learning_rate, or model.mixed_precision=false")
 
 
 def train(config: DreamerV3RunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
-    check_world_model_run(config)
     own = share_of(config)  # of several processes
     env = make_own_env(own)
     learner = cast(DreamerV3, make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
         print(begin_with(learner, config, env))
     seed_generators(own.seed)
-    rewards = Rewards(config, env)
+    curriculum = make_curriculum(config, env)
     rollouts = make_rollouts(own, env, learner)
-    replay = make_sequence_replay(own, env, rewards, learner.latent_format if config.replay.context else None)
+    latents = learner.latent_format if config.replay.context else None
+    replay = make_run_replay(own, env, curriculum, (own.model.batch_size, own.model.batch_length), latents)
     ratio = config.make_replay_ratio()
-    schedule = make_schedule(config, env)
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps, num_gates(env))
     session.track(
         learner=learner,
         env=env,
@@ -70,7 +64,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         replay=replay,
         ratio=ratio,
         schedule=schedule,
-        curriculum=rewards,
+        curriculum=curriculum,
         best=("schedule",),
     )
 
@@ -79,11 +73,13 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         if rollout is not None:
             replay.extend(rollout)
             episodes = session.log_episodes(rollout)
-            session.log(rewards.adapt(episodes))
+            session.log(curriculum.adapt(episodes))
             session.log(schedule.observe(episodes, session.env_steps))
 
         # Move what is scheduled by the length of the run, or by the gates that are passed.
-        scheduled = move_starts(env, schedule.at(session.env_steps))
+        scheduled = schedule.at(session.env_steps)
+        if "start_on_line" in scheduled:
+            cast(DroneRacingEnv, env).worlds.start_on_line = scheduled.pop("start_on_line")
         learner.adjust(**scheduled)
 
         # Update world model, actor and critic on replayed windows, which later ones go on from.

@@ -11,15 +11,14 @@ docs/evaluation.md, with both presets of physics, and adds evaluation.md. An ear
 
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from composing.arena import make_evaluator, track_as_begun, worlds_of
 from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
-from composing.restoring import Restored, fresh_directory, heading, restore
-from composing.schema import EvaluateConfig, register
-from omegaconf import DictConfig, OmegaConf
+from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
@@ -38,36 +37,45 @@ from dreamer_racing.figures.hud import caption, race_words
 from dreamer_racing.figures.protocol import plot_conditions, plot_crashes
 from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
-from dreamer_racing.settings import check_settings
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION, RunDirectory, replace_text
 
 PROTOCOLS = ("nominal", "full")
 
-register()
+
+@dataclass
+class EvaluateConfig(FlightConfig):
+    """`recipes/evaluate.py`."""
+
+    protocol: str = "nominal"  # nominal | full: every condition of docs/evaluation.md, with both presets
+    # with protocol=nominal: of starts, as a multiple of the noise of training
+    start_noise: float = setting(0.0, NOT_NEGATIVE)
+    run_dir: str | None = None  # null: <run of the checkpoint>/evaluation
+    video_steps: int = setting(500, COUNT)
+    seed: int = setting(1, SEED)  # of starts and drones: others than those of evaluations in training, whose seed is 0
 
 
-@recipe("evaluate")
-def main(config: DictConfig) -> None:
+@recipe("evaluate", EvaluateConfig)
+def main(config: EvaluateConfig) -> None:
     """Restore the policy, fly it, report."""
     start_logging()
     started = time.monotonic()
     with plain_errors():
-        settings = cast(EvaluateConfig, OmegaConf.to_object(config))
-        check(settings)
-        restored = restore(settings)
-        refuse_races(settings, track_as_begun(restored.trained))
-        directory = fresh_directory(settings.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
-        print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {settings.episodes} episodes")
-        report = make_nominal_report(settings, restored, directory) if settings.protocol == "nominal" else None
+        check(config)
+        restored = restore(config)
+        refuse_races(config, track_as_begun(restored.trained))
+        directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
+        print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
+        report = make_nominal_report(config, restored, directory) if config.protocol == "nominal" else None
     with plain_disk_errors():
         if report:
             written = evaluate_nominal(report)
         else:
-            results = evaluate_fully(settings, restored, directory)
+            results = evaluate_fully(config, restored, directory)
             written = describe(results, restored.trained.env.preset)
-        written["provenance"] = restored.provenance(settings, time.monotonic() - started)
-        written["provenance"]["start_noise"] = settings.start_noise
+        written["provenance"] = restored.provenance(config, time.monotonic() - started)
+        written["provenance"]["start_noise"] = config.start_noise
         if not report:
             write_markdown(directory, results, written["provenance"])
         replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
@@ -75,12 +83,7 @@ def main(config: DictConfig) -> None:
 
 
 def check(config: EvaluateConfig) -> None:
-    """Refuse what is no protocol or would be ignored, and numbers out of their range.
-
-    Raises:
-        ValueError: the message names the field and what is allowed.
-    """
-    check_settings(config)
+    """Refuse what is no protocol, or would be ignored."""
     if config.protocol not in PROTOCOLS:
         raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
     if config.protocol == "full" and config.start_noise:
@@ -90,11 +93,7 @@ def check(config: EvaluateConfig) -> None:
 
 
 def refuse_races(config: EvaluateConfig, track: Track) -> None:
-    """Refuse races that a track leaves no room for.
-
-    Raises:
-        ValueError: the message says which.
-    """
+    """Refuse races that a track leaves no room for."""
     if config.protocol == "full":
         check_conditions(CONDITIONS, track, config.seed)
     else:

@@ -15,20 +15,20 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 from composing.callbacks import FAILURES
-from composing.checks import check_variant
 from composing.command_line import as_override, merge_overrides, override_key
 from composing.entry import in_plain_words, recipe
 from composing.saved import read_yaml
-from composing.schema import ExperimentConfig, RunConfig, register
+from composing.schema import RECIPES, RunConfig
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig
+from omegaconf import MISSING, ListConfig
 from yaml import YAMLError, safe_load
 
 from dreamer_racing.settings import shortened
@@ -42,13 +42,25 @@ OWN = ("name", "algorithm", "variant", "variants", "overrides", "directory")  # 
 # Launchers send configurations to processes of theirs, which must find the modules of this folder.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
 
-register()
+
+@dataclass
+class ExperimentConfig(RunConfig):
+    """`recipes/experiment.py`: one run of an experiment; hydra's multirun makes all of them.
+
+    What all recipes have in common is set as with them: `track=`, `seed=`, `budget=`, `env.from_pixels=` ...
+    """
+
+    name: str = MISSING  # of the experiment
+    algorithm: str = "dreamer_v3"  # of a training recipe: its file's name
+    variant: str = "default"  # one of the following
+    variants: dict[str, list[str]] = field(default_factory=dict)  # overrides of the algorithm's recipe by name
+    overrides: list[str] = field(default_factory=list)  # of every run, e.g. "overrides=['loss.entropy_scale=1e-4']"
+    directory: str = "runs"
 
 
-@recipe("experiment")
-def main(config: DictConfig) -> None:
+@recipe("experiment", ExperimentConfig, composed=True)
+def main(settings: ExperimentConfig) -> None:
     """Run one of the experiment's runs, or what is left of it; what fails is noted, so that the others are made."""
-    settings = cast(ExperimentConfig, config)
     run_dir = directory_of(settings)
     note = run_dir.parent / FAILURES / f"{run_dir.name}.txt"
     note.unlink(missing_ok=True)
@@ -62,6 +74,13 @@ def main(config: DictConfig) -> None:
             raise SystemExit(1) from None
         note.parent.mkdir(parents=True, exist_ok=True)
         note.write_text(f"{error}\n", encoding="utf-8")
+
+
+def check(config: ExperimentConfig) -> None:
+    """Refuse an algorithm or a variant that there is not."""
+    for name, known in (("algorithm", tuple(RECIPES)), ("variant", tuple(config.variants))):
+        if (value := getattr(config, name)) not in known:
+            raise ValueError(f"{name}={value}: there are {', '.join(known)}.")
 
 
 def directory_of(config: ExperimentConfig) -> Path:
@@ -101,7 +120,7 @@ def next_command(config: ExperimentConfig, given: list[str]) -> list[str] | None
     Raises:
         ValueError: the algorithm or the variant is unknown, or the directory holds a run with other settings.
     """
-    check_variant(config)
+    check(config)
     run_dir = directory_of(config)
     chosen = [f"track={config.track}", f"seed={config.seed}", f"budget={config.budget}", *config.overrides]
     of_recipe = [override for override in given if override_key(override).partition(".")[0] not in OWN]
@@ -130,11 +149,7 @@ def tuned_by_recipe(run_dir: Path, overrides: list[str]) -> str | None:
 
 
 def refuse_other_settings(run_dir: Path, overrides: list[str]) -> None:
-    """Refuse to continue a run that was started with other overrides, but for its length.
-
-    Raises:
-        ValueError: the message names the overrides that differ.
-    """
+    """Refuse to continue a run that was started with other overrides, but for its length."""
     saved, wanted = settings_of(read_yaml(RunDirectory(run_dir).overrides, ListConfig)), settings_of(overrides)
     saved = {name: value for name, value in saved.items() if name != "tuned" or name in wanted}  # chosen by tuned=auto
     differing = [name for name in sorted(saved.keys() | wanted.keys()) if saved.get(name) != wanted.get(name)]
@@ -172,7 +187,8 @@ def run(command: list[str], run_dir: Path) -> int:
     done at once: that of a Slurm job puts itself into the queue again.
     """
     received: list[signal.Signals] = []
-    before = {number: signal.getsignal(number) for number in SIGNALS} if is_main_thread() else {}
+    here = threading.current_thread()  # signals are the main thread's
+    before = {number: signal.getsignal(number) for number in SIGNALS} if here is threading.main_thread() else {}
     if before.get(signal.SIGHUP) is signal.SIG_IGN:  # nohup
         del before[signal.SIGHUP]
     for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
@@ -198,11 +214,6 @@ def run(command: list[str], run_dir: Path) -> int:
             handler(received[0], None)
         raise SystemExit(128 + received[0])
     return status
-
-
-def is_main_thread() -> bool:
-    """Whether this is the thread that may handle signals."""
-    return threading.current_thread() is threading.main_thread()
 
 
 if __name__ == "__main__":

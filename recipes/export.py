@@ -16,19 +16,19 @@ import shlex
 import sys
 import warnings
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from composing.arena import describe_file, track_as_begun, worlds_of
 from composing.command_line import as_override, override_key, override_value, plain_errors, start_logging
 from composing.entry import recipe
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import read_yaml, trained_config
-from composing.schema import ExportConfig, WorldModelRunConfig, is_race, register
+from composing.schema import WorldModelRunConfig, is_race
 from composing.usage import command
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import MISSING, ListConfig, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.imu import load_imu
@@ -56,17 +56,33 @@ from dreamer_racing.export.shipped_agent import (
     load_agent,
 )
 from dreamer_racing.modules import Interface
-from dreamer_racing.settings import check_settings
+from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.training.directory import RunDirectory
 
 BY_ITEM = ("episodes", "crashes_by_gate")  # numbers of an evaluation that agent.json does without
 OF_A_MACHINE = ("run_dir", "resume", "device", "env.device")  # settings that say nothing of what was learned
 
-register()
+
+@dataclass
+class ExportConfig:
+    """`recipes/export.py`."""
+
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to export; auto takes the averaged where they are kept
+    output: str | None = None  # .onnx file, in a folder of its own; null: <run of the checkpoint>/export/actor.onnx
+    agent: str | None = None  # folder of an agent that is to ship, instead of output, e.g. agents/kidney
+    evaluation: str | None = None  # with agent=: its numbers; null: the run's latest of these weights
+    commit: str | None = None  # with agent=: that it was trained at; null: the one that the run noted
+    latent: str = "mode"  # mode (argmax of the posterior) | sample (takes noise)
+    # write the step in two parts, too: what needs no image can then be done before it (docs/export.md)
+    parts: bool = False
+    steps: int = setting(200, COUNT)  # of a recorded flight, over which the export must fly as the original does
+    renderer: str = "auto"
+    seed: int = setting(0, SEED)
 
 
-@recipe("export")
-def main(config: DictConfig) -> None:
+@recipe("export", ExportConfig)
+def main(config: ExportConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
     start_logging()
     # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of
@@ -76,7 +92,7 @@ def main(config: DictConfig) -> None:
     set_num_threads(1)
     try:
         with plain_errors():
-            export(cast(ExportConfig, OmegaConf.to_object(config)))
+            export(config)
     except (ParityError, MissingPackagesError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error
@@ -84,7 +100,6 @@ def main(config: DictConfig) -> None:
 
 def export(config: ExportConfig) -> None:
     """Do all of it, and print what came of it."""
-    check_settings(config)
     if config.latent not in LATENTS:
         raise ValueError(f"latent={config.latent}: there are {' and '.join(LATENTS)}.")
     checkpoint = find_trained(config.checkpoint)
@@ -167,11 +182,7 @@ def name_of(track: Track, given: str) -> str:
 
 
 def check_agent(config: ExportConfig, checkpoint: Path) -> None:
-    """Refuse settings that go with no agent, or of which one would be ignored.
-
-    Raises:
-        ValueError: the message names the field.
-    """
+    """Refuse settings that go with no agent, or of which one would be ignored."""
     if not config.agent:
         if given := [name for name in ("evaluation", "commit") if getattr(config, name) is not None]:
             raise ValueError(f"{given[0]}={getattr(config, given[0])} is for agent=FOLDER: leave it out.")

@@ -27,9 +27,7 @@ import numpy as np
 from composing.arena import worlds_of
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
-from composing.restoring import restore
-from composing.schema import EvaluateConfig
-from hydra.core.config_store import ConfigStore
+from composing.restoring import FlightConfig, restore
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import set_num_threads, tensor
@@ -49,6 +47,7 @@ from dreamer_racing.figures.chase import chase_beside_onboard
 from dreamer_racing.figures.film import enlarge_to_watch, onboard_beside_map, write_gif, write_video
 from dreamer_racing.figures.hud import caption, laps_completed, race_words
 from dreamer_racing.figures.top_down import plot_top_down
+from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import EVALUATION
 
@@ -72,16 +71,14 @@ class FlyConfig:
     track: str | None = None  # built-in track, or path to a YAML file; null: kidney, or what the agent was trained on
     preset: str | None = None  # physics: easy | faithful | betaflight; null: easy, or what the agent was trained on
     run_dir: str = "runs/fly"
-    image_size: int | None = None  # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
+    # pixels, side of the nose camera's image; null: 64, or the agent's, as the next two
+    image_size: int | None = setting(None, COUNT)
     camera_tilt: float | None = None  # degrees upwards; null: 25
-    control_rate: float | None = None  # Hz; null: 50
+    control_rate: float | None = setting(None, COUNT)  # Hz; null: 50
     renderer: str = "auto"  # as env.renderer in training, docs/options.md
     view: str = "map"  # map | chase; chase: also chase.mp4 and chase.gif, the drone from behind beside its own view
     viewer: bool = False  # watch agent or pilot live in a window instead of writing files
-    seed: int = 0
-
-
-ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
+    seed: int = setting(0, SEED)
 
 
 def scripted(track: Track, parameters: QuadrotorParameters) -> Acting:
@@ -98,7 +95,7 @@ def hover(track: Track, parameters: QuadrotorParameters) -> Acting:
 PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted": scripted, "hover": hover}
 
 
-@recipe("fly")
+@recipe("fly", FlyConfig)
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
     start_logging()
@@ -129,10 +126,6 @@ def check(config: FlyConfig) -> None:
         raise ValueError(f"view={config.view}: there are {', '.join(VIEWS)}.")
     if config.viewer and config.view == "chase":
         raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
-    for name in ("image_size", "control_rate"):
-        value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name}={value}: must be at least 1.")
     if config.viewer:
         check_display(config)
 
@@ -250,7 +243,7 @@ def fly_by_hand(kind: str, env: DroneRacingEnv) -> Evaluation:
 def agents_flight(config: FlyConfig) -> PlannedFlight:
     """Let the deterministic policy of a trained agent fly."""
     with plain_errors():
-        race = EvaluateConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
+        race = FlightConfig(track=config.track, preset=config.preset, renderer=config.renderer, seed=config.seed)
         restored = restore(replace(race, checkpoint=str(config.agent)))
         for name in ("image_size", "camera_tilt", "control_rate"):
             given, trained = getattr(config, name), getattr(restored.trained.env, name)

@@ -24,8 +24,7 @@ from typing import Any, NamedTuple, cast
 from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
 from composing.usage import command
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing.envs.tracks import Track, describe_track, load_track
@@ -59,19 +58,16 @@ from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
 
-ConfigStore.instance().store(name="hil_schema", node=HilConfig)
 
-
-@recipe("hil")
-def main(config: DictConfig) -> None:
+@recipe("hil", HilConfig)
+def main(config: HilConfig) -> None:
     """Fly, or look at a flight."""
     start_logging()
     with plainly():
-        settings = cast(HilConfig, OmegaConf.to_object(config))
-        check(settings)
-        if settings.actor is None:
-            raise SystemExit(replay(settings) if settings.replay else report(settings))
-    raise SystemExit(fly(settings))
+        check(config)
+        if config.actor is None:
+            raise SystemExit(replay(config) if config.replay else report(config))
+    raise SystemExit(fly(config))
 
 
 def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, dict[str, Any]]:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
-from hydra.core.config_store import ConfigStore
 
 from dreamer_racing.envs.drone.variations import SUFFIXES
 
@@ -33,10 +32,7 @@ class IdentificationConfig:
     output: str = "drone.yaml"  # the file to write
 
 
-ConfigStore.instance().store(name="identification_schema", node=IdentificationConfig)
-
-
-@recipe("identification")
+@recipe("identification", IdentificationConfig)
 def main(config: IdentificationConfig) -> None:
     """Read, fit, write."""
     start_logging()
@@ -46,11 +42,7 @@ def main(config: IdentificationConfig) -> None:
 
 
 def check(config: IdentificationConfig) -> None:
-    """Refuse what could only fail once all is done.
-
-    Raises:
-        ValueError: the message names the field and what is allowed.
-    """
+    """Refuse what could only fail once all is done."""
     if not config.output.endswith(SUFFIXES):
         raise ValueError(f"output={config.output}: the name of the file must end in {' or '.join(SUFFIXES)}.")
 

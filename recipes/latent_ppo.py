@@ -12,59 +12,53 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from typing import Any, cast
 
 from composing.building import (
-    Rewards,
+    make_curriculum,
     make_run_evaluator,
-    make_sequence_replay,
+    make_run_replay,
     make_tracker,
+    num_gates,
     seed_generators,
 )
-from composing.checks import check_world_model_run
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, make_learner, make_schedule, move_starts
-from composing.measuring import measure, measure_lag
-from composing.resolving import resolve_world_model, tune
-from composing.schema import LatentPPORunConfig, register
+from composing.learners import begin_with, make_learner, measure, measure_lag
+from composing.resolving import resolve_world_model as resolve
+from composing.schema import LatentPPORunConfig
 from composing.sharing import share_of
 from composing.workers import make_own_env, make_rollouts
 from omegaconf import DictConfig
 
 from dreamer_racing import parallel
+from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.schedule import Schedule
 from dreamer_racing.training.session import Session
 
 REMEDY = "model.learning_rate (of an actor's update loss.ppo.learning_rate), or model.mixed_precision=false"
 
-register()
 
-
-@recipe("latent_ppo")
+@recipe("latent_ppo", LatentPPORunConfig, composed=True)
 def main(config: DictConfig) -> None:
     """Compose the configuration, and train."""
-    launch(config, resolve, train, tune, remedy=REMEDY)
-
-
-def resolve(config: DictConfig) -> DictConfig:
-    """Replace every `auto` and missing number by what it stands for on this machine, and say what was chosen."""
-    return resolve_world_model(config)
+    launch(config, resolve, train, remedy=REMEDY)
 
 
 def train(config: LatentPPORunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
-    check_world_model_run(config)
     own = share_of(config)  # of several processes
     env = make_own_env(own)
     learner = cast(LatentPPO, make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
         print(begin_with(learner, config, env))
     seed_generators(own.seed)
-    rewards = Rewards(config, env)
+    curriculum = make_curriculum(config, env)
     rollouts = make_rollouts(own, env, learner)
-    replay = make_sequence_replay(own, env, rewards, learner.latent_format if config.replay.context else None)
+    latents = learner.latent_format if config.replay.context else None
+    replay = make_run_replay(own, env, curriculum, (own.model.batch_size, own.model.batch_length), latents)
     ratio = config.make_replay_ratio()
-    schedule = make_schedule(config, env)
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps, num_gates(env))
     lag = ModelLag(config.schedule.wait_for_model, config.schedule.wait_every)
     own_parts: dict[str, Any] = {} if parallel.is_first() else {"storage": learner.storage}  # else in the learner's
     session.track(
@@ -76,7 +70,7 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
         replay=replay,
         ratio=ratio,
         schedule=schedule,
-        curriculum=rewards,
+        curriculum=curriculum,
         lag=lag,
         best=("schedule",),
         **own_parts,
@@ -88,13 +82,15 @@ def train(config: LatentPPORunConfig, session: Session) -> None:
             replay.extend(rollout)
             learner.collect(rollout)
             episodes = session.log_episodes(rollout)
-            session.log(rewards.adapt(episodes))
+            session.log(curriculum.adapt(episodes))
             session.log(schedule.observe(episodes, session.env_steps))
 
         # Move what is scheduled; the actor waits while the model does not know the newest records.
         if lag.due(session.env_steps) and session.counters["updates"]:
             session.log(measure_lag(session, config, learner, replay, lag))
-        scheduled = move_starts(env, schedule.at(session.env_steps))
+        scheduled = schedule.at(session.env_steps)
+        if "start_on_line" in scheduled:
+            cast(DroneRacingEnv, env).worlds.start_on_line = scheduled.pop("start_on_line")
         learner.adjust(**scheduled)
         learner.actor_waits = lag.waits
 

@@ -12,14 +12,13 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from composing.arena import track_as_begun, worlds_of
 from composing.command_line import plain_disk_errors, plain_errors, start_logging
 from composing.entry import recipe
-from composing.restoring import Restored, fresh_directory, heading, restore
-from composing.schema import PerceptionConfig, RunConfig, register
-from omegaconf import DictConfig, OmegaConf
+from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
+from composing.schema import RunConfig
 
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Track, decoys_for, with_decoys
@@ -28,7 +27,7 @@ from dreamer_racing.evaluation.protocol import MODES, Result, fly, results_table
 from dreamer_racing.evaluation.sight import Sight, gate_table, measure_sight, sight_table
 from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
-from dreamer_racing.settings import check_settings
+from dreamer_racing.settings import COUNT, setting
 from dreamer_racing.terminal import say
 from dreamer_racing.training.directory import replace_text
 
@@ -37,25 +36,30 @@ WITHOUT, WITH = "without decoys", "with decoys"
 NO_NOISE, START_NOISE = 0.0, 1.0  # of starts, in units of training's; with it no two flights are the same
 START_TEXT = {NO_NOISE: "From the start pose:\n", START_NOISE: "From starts with the noise of training:\n"}
 
-register()
+
+@dataclass
+class PerceptionConfig(FlightConfig):
+    """`recipes/perception.py`."""
+
+    num_envs: int | None = setting(None, COUNT)  # as of `recipes/evaluate.py`; the first flight in each is looked at
+    decoys: str | None = None  # +decoys=paper; null: those that the track has a place for, if any
+    run_dir: str | None = None  # null: <run of the checkpoint>/perception
 
 
-@recipe("perception")
-def main(config: DictConfig) -> None:
+@recipe("perception", PerceptionConfig)
+def main(config: PerceptionConfig) -> None:
     """Restore the policy, fly it with and without decoys and with corrupted images, report."""
     start_logging()
     started = time.monotonic()
     with plain_errors():
-        settings = cast(PerceptionConfig, OmegaConf.to_object(config))
-        check_settings(settings)
-        restored = restore(settings)
+        restored = restore(config)
         if not restored.trained.env.from_pixels:
             raise ValueError(f"{restored.checkpoint} sees numbers, not images: there is nothing to measure.")
         tracks = tracks_to_fly(restored.trained)
-        directory = fresh_directory(settings.run_dir or restored.run_dir / "perception", RESULT)
-    looked = fly_and_look(settings, restored, tracks)
-    corrupted = {noise: fly_corrupted(settings, restored, noise) for noise in (NO_NOISE, START_NOISE)}
-    provenance = restored.provenance(settings, time.monotonic() - started)
+        directory = fresh_directory(config.run_dir or restored.run_dir / "perception", RESULT)
+    looked = fly_and_look(config, restored, tracks)
+    corrupted = {noise: fly_corrupted(config, restored, noise) for noise in (NO_NOISE, START_NOISE)}
+    provenance = restored.provenance(config, time.monotonic() - started)
     with plain_disk_errors():
         write(directory, looked, corrupted, provenance, worlds_of(restored.trained)["camera"])
     say(f"\nwritten to {directory}")

@@ -14,12 +14,9 @@ sitl. With betaflight= one does that runs already.
 """
 
 from dataclasses import dataclass
-from typing import cast
 
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import read_contract
@@ -28,7 +25,6 @@ from dreamer_racing.hil.configuration import PILOT, HilConfig, pilot_contract
 from dreamer_racing.plant.delivery import Delivery
 from dreamer_racing.plant.process import ProcessOptions, by_firmware, open_sockets, run, start_firmware
 from dreamer_racing.plant.vehicle import Mismatch, PlantVehicle
-from dreamer_racing.settings import check_settings
 
 
 @dataclass
@@ -41,22 +37,18 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
     actor: str = "pilot"
 
 
-ConfigStore.instance().store(name="plant_schema", node=PlantConfig)
-
-
-@recipe("plant")
-def main(config: DictConfig) -> None:
+@recipe("plant", PlantConfig)
+def main(config: PlantConfig) -> None:
     """Fly until stopped."""
     start_logging()
     with plain_errors():
-        settings = cast(PlantConfig, OmegaConf.to_object(config))
-        check(settings)
-        vehicle = PlantVehicle(settings.track, settings.preset, settings)
-        sockets = open_sockets(settings)
+        check(config)
+        vehicle = PlantVehicle(config.track, config.preset, config)
+        sockets = open_sockets(config)
         firmware = None
-        if settings.firmware is not None:
-            firmware = start_firmware(settings.firmware, settings, sockets, settings_for(settings.actor))
-    run(vehicle, settings, settings, sockets, firmware)
+        if config.firmware is not None:
+            firmware = start_firmware(config.firmware, config, sockets, settings_for(config.actor))
+    run(vehicle, config, config, sockets, firmware)
 
 
 def settings_for(actor: str) -> list[str]:
@@ -69,12 +61,7 @@ def settings_for(actor: str) -> list[str]:
 
 
 def check(config: PlantConfig) -> None:
-    """Refuse numbers that cannot be, a delay where nothing would be delayed, and an actor for whom nothing is set up.
-
-    Raises:
-        ValueError: The message names the setting and what is allowed.
-    """
-    check_settings(config)
+    """Refuse a delay where nothing would be delayed, and an actor for whom nothing is set up."""
     if config.delay is not None and (name := by_firmware(config)):
         raise ValueError(f"delay={config.delay} is of commands, and {name}={getattr(config, name)}: leave one out.")
     if config.actor != PILOT and config.firmware is None:

@@ -10,24 +10,18 @@ named, and does not cost the others. `learning_curves.csv` beside a figure holds
 `runs=learning_curves.csv` draws it again.
 """
 
-from typing import cast
-
 from composing.command_line import plain_errors, start_logging
 from composing.entry import recipe
-from composing.schema import register
-from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.figures.plotting import PlotConfig, draw
 
-register()
 
-
-@recipe("plot")
-def main(config: DictConfig) -> None:
+@recipe("plot", PlotConfig)
+def main(config: PlotConfig) -> None:
     """Make the figures asked for, say what was left out."""
     start_logging()
     with plain_errors():
-        draw(cast(PlotConfig, OmegaConf.to_object(config)))
+        draw(config)
 
 
 if __name__ == "__main__":

@@ -7,22 +7,22 @@
 Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 """
 
+from functools import partial
 from typing import cast
 
 from composing.arena import make_env
 from composing.building import (
-    Rewards,
     make_collector,
+    make_curriculum,
     make_run_evaluator,
     make_tracker,
     seed_generators,
 )
-from composing.checks import check_ppo
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.resolving import resolve_baseline
-from composing.schema import PPORunConfig, register
+from composing.schema import PPORunConfig
 from omegaconf import DictConfig
 
 from dreamer_racing.experience.rollouts import Rollouts
@@ -30,43 +30,35 @@ from dreamer_racing.learners import PPOLearner
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.session import Session
 
-NUM_ENVS = {"pixels": 64, "state": 1024}
-
-register()
+resolve = partial(resolve_baseline, num_envs={"pixels": 64, "state": 1024})
 
 
-@recipe("ppo")
+@recipe("ppo", PPORunConfig, composed=True)
 def main(config: DictConfig) -> None:
     """Compose the configuration, and train."""
     launch(config, resolve, train, remedy="ppo.learning_rate")
 
 
-def resolve(config: DictConfig) -> DictConfig:
-    """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
-    return resolve_baseline(config, NUM_ENVS)
-
-
 def train(config: PPORunConfig, session: Session) -> None:
     """Collect, update, evaluate, save."""
-    check_ppo(config)
     env = make_env(config)
     learner = cast(PPOLearner, make_learner(config, Interface.of(env), config.device))
     seed_generators(config.seed)
     rollouts = Rollouts(make_collector(config, env, learner.policy()))
-    rewards = Rewards(config, env)
+    curriculum = make_curriculum(config, env)
     session.track(
         learner=learner,
         env=env,
         rollouts=rollouts,
         evaluator=make_run_evaluator(config, session.directory.path, learner),
         tracker=make_tracker(config),
-        curriculum=rewards,
+        curriculum=curriculum,
     )
 
     for rollout in session.rollouts():
         if rollout is not None:
             # Every rollout is learned from in some epochs, and forgotten.
-            session.log(rewards.adapt(session.log_episodes(rollout)))
+            session.log(curriculum.adapt(session.log_episodes(rollout)))
             session.log(learner.update(rollout, session.timed))
             session.counters["updates"] = learner.updates
         if session.due("evaluate"):

@@ -7,23 +7,23 @@
 Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 """
 
+from functools import partial
 from typing import cast
 
 from composing.arena import make_env
 from composing.building import (
-    Rewards,
     make_collector,
+    make_curriculum,
     make_run_evaluator,
     make_run_replay,
     make_tracker,
     seed_generators,
 )
-from composing.checks import check_sac
 from composing.entry import recipe
 from composing.launching import launch
 from composing.learners import make_learner
 from composing.resolving import resolve_baseline
-from composing.schema import SACRunConfig, register
+from composing.schema import SACRunConfig
 from omegaconf import DictConfig
 
 from dreamer_racing.experience.rollouts import Rollouts
@@ -31,32 +31,24 @@ from dreamer_racing.learners import SACLearner
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.session import Session
 
-NUM_ENVS = {"pixels": 64, "state": 256}
+resolve = partial(resolve_baseline, num_envs={"pixels": 64, "state": 256})
 TRANSITION = 2  # records of a window: what was seen before an action, and after it
 
-register()
 
-
-@recipe("sac")
+@recipe("sac", SACRunConfig, composed=True)
 def main(config: DictConfig) -> None:
     """Compose the configuration, and train."""
     launch(config, resolve, train, remedy="sac.learning_rate")
 
 
-def resolve(config: DictConfig) -> DictConfig:
-    """Replace every `auto` and missing number by what it stands for, and say what was chosen."""
-    return resolve_baseline(config, NUM_ENVS)
-
-
 def train(config: SACRunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
-    check_sac(config)
     env = make_env(config)
     learner = cast(SACLearner, make_learner(config, Interface.of(env), config.device))
     seed_generators(config.seed)
     rollouts = Rollouts(make_collector(config, env, learner.policy()))
-    rewards = Rewards(config, env)
-    replay = make_run_replay(config, env, rewards, config.sac.batch_size, TRANSITION)
+    curriculum = make_curriculum(config, env)
+    replay = make_run_replay(config, env, curriculum, (config.sac.batch_size, TRANSITION))
     ratio = config.make_replay_ratio()
     session.track(
         learner=learner,
@@ -66,13 +58,13 @@ def train(config: SACRunConfig, session: Session) -> None:
         tracker=make_tracker(config),
         replay=replay,
         ratio=ratio,
-        curriculum=rewards,
+        curriculum=curriculum,
     )
 
     for rollout in session.rollouts():
         if rollout is not None:
             replay.extend(rollout)
-            session.log(rewards.adapt(session.log_episodes(rollout)))
+            session.log(curriculum.adapt(session.log_episodes(rollout)))
         for _ in session.updates(ratio.updates_due(session.env_steps, learner.updates)):
             with session.timed("sample"):
                 batch = replay.sample()

@@ -14,12 +14,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from composing.command_line import new_run_dir, plain_errors, start_logging
 from composing.entry import recipe
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
 
 from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import Track, load_track
@@ -30,7 +28,7 @@ from dreamer_racing.hil.flyer import ActorFlyer, Flyer, check_contract, trained_
 from dreamer_racing.machine import available_cpus, provenance
 from dreamer_racing.plant.pilot import PilotFlyer
 from dreamer_racing.plant.study import SWEEPS, study
-from dreamer_racing.settings import COUNT, Range, check_settings, setting
+from dreamer_racing.settings import COUNT, Range, setting
 from dreamer_racing.terminal import say
 
 PILOT = "pilot"
@@ -53,25 +51,21 @@ class SimToRealConfig:
     run_dir: str | None = None  # null: runs/sim_to_real_<track>_<time>
 
 
-ConfigStore.instance().store(name="sim_to_real_schema", node=SimToRealConfig)
-
-
-@recipe("sim_to_real")
-def main(config: DictConfig) -> None:
+@recipe("sim_to_real", SimToRealConfig)
+def main(config: SimToRealConfig) -> None:
     """Fly all of it, print a table, write files."""
     start_logging()
     with plain_errors():
-        settings = cast(SimToRealConfig, OmegaConf.to_object(config))
-        track, make_flyer = check(settings)
-        folder = Path(settings.run_dir) if settings.run_dir else new_run_dir("sim_to_real", track.name)
+        track, make_flyer = check(config)
+        folder = Path(config.run_dir) if config.run_dir else new_run_dir("sim_to_real", track.name)
         folder.mkdir(parents=True, exist_ok=True)
-        studies = [(settings.actor, make_flyer)]
+        studies = [(config.actor, make_flyer)]
         others = []
-        if settings.beside == PILOT:
-            studies.append((PILOT, pilot_on(track, settings)))
-        elif settings.beside:
-            others.append(json.loads(Path(settings.beside).read_text(encoding="utf-8")))
-    results = [fly(actor, make, track, settings) for actor, make in studies]
+        if config.beside == PILOT:
+            studies.append((PILOT, pilot_on(track, config)))
+        elif config.beside:
+            others.append(json.loads(Path(config.beside).read_text(encoding="utf-8")))
+    results = [fly(actor, make, track, config) for actor, make in studies]
     for result, name in zip(results, (RESULT, RESULT_BESIDE), strict=False):
         (folder / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     plot_study([*results, *others], folder / RESULT.replace("json", "png"))
@@ -98,7 +92,6 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
         ValueError: the message names the field and what is allowed.
         OSError: there is no such actor.
     """
-    check_settings(config)
     load_preset(config.preset)
     if unknown := sorted(set(config.sweeps or ()) - set(SWEEPS)):
         raise ValueError(f"sweeps={unknown[0]}: there are {', '.join(SWEEPS)}.")

@@ -17,7 +17,6 @@ from typing import Any
 
 from composing.command_line import plain_errors
 from composing.entry import recipe
-from hydra.core.config_store import ConfigStore
 
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, load_track
 
@@ -33,10 +32,7 @@ class TracksConfig:
     json: bool = False  # for programs, on stdout; --json does the same
 
 
-ConfigStore.instance().store(name="tracks_schema", node=TracksConfig)
-
-
-@recipe("tracks")
+@recipe("tracks", TracksConfig)
 def main(config: TracksConfig) -> None:
     """List, and draw."""
     with plain_errors():
@@ -54,11 +50,7 @@ def main(config: TracksConfig) -> None:
 
 
 def check(config: TracksConfig) -> None:
-    """Refuse a picture of an unknown kind.
-
-    Raises:
-        ValueError: the message names the field and what is allowed.
-    """
+    """Refuse a picture of an unknown kind."""
     if config.picture is not None and Path(config.picture).suffix not in PICTURES:
         raise ValueError(f"picture={config.picture}: the name of the file must end in {', '.join(PICTURES)}.")
 

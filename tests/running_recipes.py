@@ -65,9 +65,7 @@ def module_of(folder: str, name: str) -> ModuleType:
 
 
 def compose(recipe_name: str, *overrides: str) -> DictConfig:
-    recipe_module("composing.schema").register()
-    if recipe_name not in EXPERIMENTS:
-        recipe_module(recipe_name)  # some have schemas of their own, and no file
+    recipe_module("experiment" if recipe_name in EXPERIMENTS else recipe_name)  # which has the schema
     with hydra.initialize_config_dir(str(CONFIG), version_base="1.3"):
         return hydra.compose(recipe_name, overrides=list(overrides))
 

@@ -141,12 +141,17 @@ def test_sentences_are_told_apart() -> None:
     ]
 
 
-def test_the_page_of_options_is_up_to_date(options):
-    assert options.PAGE.read_text(encoding="utf-8") == options.make_page(), "run python docs/options.py"
+def test_what_is_made_of_the_options_is_up_to_date(options):
+    for path, text in options.make_files().items():
+        assert path.read_text(encoding="utf-8") == text, "run python docs/options.py"
 
 
-def test_comments_and_attributes_are_read(tmp_path):
-    source = '''class Config:
+def test_comments_and_attributes_are_read(options, tmp_path, monkeypatch):
+    source = '''from dataclasses import dataclass
+
+
+@dataclass
+class Config:
     """Says.
 
     Attributes:
@@ -164,10 +169,9 @@ def test_comments_and_attributes_are_read(tmp_path):
     c: float = 2.0
     d: bool = True
 '''
-    (tmp_path / "config.py").write_text(source)
-    read = module_of("recipes", "composing.options")
-    module = read.Module(tmp_path / "config.py")
-    meanings = read.read_meanings(module.classes["Config"], module)
+    (tmp_path / "described.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    meanings = options.read_meanings(importlib.import_module("described").Config)
     assert meanings == {"a": "of a", "b": "of b, and more", "c": "Of c, and more.", "d": "Of d."}
 
 

@@ -13,12 +13,14 @@ import re
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torchrl.envs import EnvBase
 
 from dreamer_racing.experience.ray_worker import RayWorker, versions
 from dreamer_racing.modules import DreamerPolicy
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, setting
 
 if TYPE_CHECKING:  # which imports Ray where it is installed, and that takes a second
     from torchrl.collectors.distributed import RayCollector
@@ -30,16 +32,17 @@ SEEDS_APART = 1_000_000
 KNOCK, TRY = 5.0, 120.0  # s to wait for an answer of a cluster's head, and of each node that a worker can be had there
 
 
-class Share(NamedTuple):
-    """What each worker is given.
+@dataclass
+class WorkersConfig:
+    """Workers on a Ray cluster, with `collector=ray`."""
 
-    Attributes:
-        cpus: cores, may be a part of one.
-        gpus: likewise.
-    """
-
-    cpus: float
-    gpus: float
+    cpus: float = setting(1.0, POSITIVE)  # cores of each, may be a part of one; as many threads draw and step worlds
+    gpus: float = setting(0.0, NOT_NEGATIVE)  # of each, a part of one or whole ones; its policy and worlds live there
+    # local: a cluster started on this machine, for this run | auto: one that runs here | host:port of one
+    address: str = "local"
+    # env_steps that weights are old at most when what was flown with them is learned from; null: two rounds, the least
+    weight_interval: int | None = setting(None, COUNT)
+    patience: float = setting(600.0, POSITIVE)  # s to wait for a round, before the run is saved and ends
 
     @property
     def device(self) -> str:
@@ -101,7 +104,7 @@ def resources() -> tuple[list[dict[str, float]], dict[str, float]]:
 
 
 def check_resources(
-    workers: int, share: Share, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
+    workers: int, share: WorkersConfig, nodes: Sequence[Mapping[str, float]], free: Mapping[str, float]
 ) -> None:
     """Refuse to wait for what a cluster does not have.
 
@@ -114,13 +117,13 @@ def check_resources(
     Raises:
         ValueError: the message gives what is needed and what is there.
     """
-    for name, setting, each in (("CPU", "workers.cpus", share.cpus), ("GPU", "workers.gpus", share.gpus)):
+    for name, option, each in (("CPU", "workers.cpus", share.cpus), ("GPU", "workers.gpus", share.gpus)):
         there, needed = free.get(name, 0.0), workers * each
         if needed > there:
             raise ValueError(
-                f"num_workers={workers} with {setting}={each:g} need {needed:g} {name}s, and the Ray cluster has "
+                f"num_workers={workers} with {option}={each:g} need {needed:g} {name}s, and the Ray cluster has "
                 f"{sum(node.get(name, 0.0) for node in nodes):g}, of which {there:g} are free: lower num_workers or "
-                f"{setting}, or add nodes to the cluster."
+                f"{option}, or add nodes to the cluster."
             )
     if (room := sum(places(share, node) for node in nodes)) < workers:
         raise ValueError(
@@ -130,11 +133,11 @@ def check_resources(
         )
 
 
-def places(share: Share, node: Mapping[str, float]) -> int:
+def places(share: WorkersConfig, node: Mapping[str, float]) -> int:
     """How many workers a node with such resources can have, if nothing else is there.
 
     Example:
-        >>> places(Share(cpus=2.0, gpus=0.6), {"CPU": 16.0, "GPU": 2.0})  # one on each GPU
+        >>> places(WorkersConfig(cpus=2.0, gpus=0.6), {"CPU": 16.0, "GPU": 2.0})  # one on each GPU
         2
     """
     cpus, gpus = (round(node.get(name, 0.0), 4) for name in ("CPU", "GPU"))
@@ -151,7 +154,7 @@ def start_workers(
     policy: DreamerPolicy,
     *,
     workers: int,
-    share: Share,
+    share: WorkersConfig,
     env_device: str,
     frames: int,
     seed: int,
@@ -198,7 +201,7 @@ def start_workers(
         raise ValueError(f"collector=ray: a worker could not begin ({in_a_line(error, last=True)}).") from error
 
 
-def check_nodes(share: Share, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
+def check_nodes(share: WorkersConfig, make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> None:
     """Refuse nodes that could not have a worker: Ray would begin one there again and again, without a word.
 
     Args:
@@ -259,7 +262,7 @@ def _try_out(make_env: Callable[[], EnvBase], policy: DreamerPolicy) -> dict[str
     return versions()
 
 
-def _await_room(workers: int, share: Share) -> None:
+def _await_room(workers: int, share: WorkersConfig) -> None:
     """Check resources, once those of a run that has just ended are back."""
     for left in reversed(range(10)):
         try:

@@ -13,6 +13,8 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +37,38 @@ from dreamer_racing.experience.streams import (
     send,
 )
 from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SHARE, setting
 
 _FIELD = "{}.zst"
+
+
+class Storage(Enum):
+    """Where replay records live."""
+
+    tensor = "tensor"
+    memmap = "memmap"
+
+
+@dataclass
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = setting(250_000, COUNT)  # records, 12.3 KB each at image_size 64
+    storage: Storage = Storage.tensor  # tensor (memory) | memmap (files)
+    device: str = "auto"  # of storage=tensor: auto takes the learner's if it has room, else cpu
+
+
+@dataclass
+class SequenceReplayConfig(ReplayConfig):
+    """The replay buffer of a world model."""
+
+    # worlds whose records are never trained on, to measure the model; null: one where four or more fly, else none
+    held_out: int | None = setting(None, NOT_NEGATIVE)
+    recent_share: float = setting(0.0, SHARE)  # of a batch's windows, drawn from the newest records
+    recent_records: int = setting(20_000, COUNT)  # how many those are
+    # windows go on from stored latents, refreshed at each update, instead of from none; null: where the recipe shortens
+    # windows, as it does for model=auto on CUDA
+    context: bool | None = None
 
 
 class StreamReplay(TensorDictReplayBuffer):

@@ -10,8 +10,10 @@ import importlib.util
 import json
 import secrets
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -21,53 +23,63 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from dreamer_racing.commands import install_extra
 from dreamer_racing.figures.film import write_gif
+from dreamer_racing.settings import NOT_NEGATIVE, setting
 from dreamer_racing.training.directory import RunDirectory
 
-WANDB_MODES = ("none", "offline", "online")
 GIF_FRAMES = 100  # of a film in TensorBoard, at most
 GIF_WIDTH = 320  # pixels, at most
 OUTCOMES = ("evaluation/success_rate", "evaluation/gates_per_episode", "evaluation/return_mean", "episode/return")
 """Metrics by which TensorBoard's table of hyperparameters compares runs."""
 
 
-def make_loggers(
-    run_dir: str | Path,
-    tensorboard: bool = False,
-    wandb: Literal["none", "offline", "online"] = "none",
-    project: str = "dreamer_racing",
-    resume_env_steps: int | None = None,
-) -> list[RunLogger]:
+class Wandb(Enum):
+    """Where what Weights & Biases gets goes."""
+
+    none = "none"
+    offline = "offline"
+    online = "online"
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides metrics.csv."""
+
+    tensorboard: bool = True
+    wandb: Wandb = Wandb.none  # Weights & Biases; online alone sends anything
+    project: str = "dreamer_racing"  # of W&B
+    media: bool = True  # whether TensorBoard and W&B get plots and films of evaluations
+    every: int = setting(2_000, NOT_NEGATIVE)  # env_steps between rows
+
+    def check(self) -> None:
+        """Refuse W&B where it is not installed.
+
+        Raises:
+            ValueError: so it is.
+        """
+        if self.wandb is not Wandb.none and importlib.util.find_spec("wandb") is None:
+            raise ValueError(
+                f"logger.wandb={self.wandb.value} needs the package wandb: {install_extra('wandb')}, or "
+                "logger.wandb=none."
+            )
+
+
+def make_loggers(run_dir: str | Path, config: LoggerConfig, resume_env_steps: int | None = None) -> list[RunLogger]:
     """Make the loggers of a run.
 
     Args:
-        run_dir: of the run; whatever is written lies in it.
-        tensorboard: whether to write to ``run_dir/tensorboard``.
-        wandb: whether to write to ``run_dir/wandb``, and to the server too.
-        project: of W&B.
+        run_dir: of the run; whatever is written lies in it, in ``tensorboard`` and in ``wandb``.
+        config: says which.
         resume_env_steps: those of the checkpoint this run continues; None if it is new.
 
     Raises:
-        ValueError: `check_loggers` has something against it.
+        ValueError: W&B is not installed.
     """
-    check_loggers(wandb)
-    loggers: list[RunLogger] = [TensorboardRunLogger(run_dir, resume_env_steps)] if tensorboard else []
-    if wandb != "none":
-        loggers.append(WandbRunLogger(run_dir, project, wandb == "offline", resumed=resume_env_steps is not None))
+    config.check()
+    loggers: list[RunLogger] = [TensorboardRunLogger(run_dir, resume_env_steps)] if config.tensorboard else []
+    if config.wandb is not Wandb.none:
+        offline, resumed = config.wandb is Wandb.offline, resume_env_steps is not None
+        loggers.append(WandbRunLogger(run_dir, config.project, offline, resumed=resumed))
     return loggers
-
-
-def check_loggers(wandb: str) -> None:
-    """Refuse a mode of W&B that there is not, or that needs what is not installed.
-
-    Raises:
-        ValueError: so it is.
-    """
-    if wandb not in WANDB_MODES:
-        raise ValueError(f"logger.wandb={wandb}: there are {', '.join(WANDB_MODES)}.")
-    if wandb != "none" and importlib.util.find_spec("wandb") is None:
-        raise ValueError(
-            f"logger.wandb={wandb} needs the package wandb: {install_extra('wandb')}, or logger.wandb=none."
-        )
 
 
 class TensorboardRunLogger(TensorboardLogger):

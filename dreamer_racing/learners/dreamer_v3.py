@@ -56,7 +56,7 @@ class DreamerV3(WorldModelLearner):
         self, agent: Agent, losses: DreamerV3Losses | None = None, config: LearnerConfig | None = None
     ) -> None:
         losses = losses or DreamerV3Losses()
-        self.objective = find_objective(losses.actor)
+        self.objective = find_objective(losses.actor, collected=False)
         device = next(agent.parameters()).device
         self.return_range = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - losses.return_decay, min_scale=1.0).to(
             device

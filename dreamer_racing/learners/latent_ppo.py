@@ -80,7 +80,7 @@ class LatentPPO(WorldModelLearner):
     ) -> None:
         super().__init__(agent, losses, config)
         ppo = self.loss_config.ppo
-        self.objective = find_objective(self.loss_config.actor)
+        self.objective = find_objective(self.loss_config.actor, collected=True)
         self.storage = RolloutStorage(ppo.steps, self.device, privileged=self.loss_config.critic == "state")
         self.actor_update = PPOUpdate(agent.actor, ppo.learning_rate, ppo, ppo.kl_target)
         self.critic_update = PPOUpdate(self.critic, ppo.critic_learning_rate, ppo)

@@ -161,21 +161,29 @@ def gradient_of_actions(objective: Objective, *others: nn.Module) -> AbstractCon
 
 
 OBJECTIVES: dict[str, Objective] = {"reinforce": reinforce, "dynamics": dynamics, "clipped": clipped_surrogate}
-"""Objectives by their names: the first two of imagined steps, the last of collected ones."""
-
+"""Objectives by their names."""
+OF_COLLECTED = ("clipped",)
+"""Those of collected steps; the others are of imagined ones."""
 
 GONE = {
     "ppo": "PPO learns from what was collected, by the algorithm latent_ppo",
     "flown_ppo": "its critic learns from what was collected, too, by the algorithm latent_ppo",
+    "latent_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=latent",
+    "asymmetric_ppo": "it is an algorithm of its own now, recipes/latent_ppo.py loss.critic=state",
 }
 """Actors that there were, and what there is instead."""
 
 
-def find_objective(name: str) -> Objective:
+def find_objective(name: str, collected: bool | None = None) -> Objective:
     """Return the objective of a name, or one of your own, given as ``module:function``.
 
+    Args:
+        name: Of the objective.
+        collected: Whether it is to be of collected steps, or else of imagined ones; None: of either.
+
     Raises:
-        ValueError: If there is none; the message lists those that there are, or says where a module was looked for.
+        ValueError: If there is none, or it is of the other steps; the message lists those that there are, or says where
+            a module was looked for, or which algorithm takes it.
     """
     if ":" in name:
         found = import_own(name, f"Objective {name!r}")
@@ -189,4 +197,7 @@ def find_objective(name: str) -> Objective:
             f"Unknown objective {name!r}{suggestion(name, OBJECTIVES)}. Known here: {', '.join(OBJECTIVES)}; one of "
             "your own is given as module:function."
         )
+    if collected is not None and collected is not (name in OF_COLLECTED):
+        steps, takes = ("imagined", "dreamer_v3") if collected else ("collected", "latent_ppo")
+        raise ValueError(f"loss.actor={name} learns from {steps} steps: recipes/{takes}.py takes it.")
     return OBJECTIVES[name]

@@ -29,7 +29,7 @@ from torchrl.checkpoint import (
 )
 
 from dreamer_racing import parallel
-from dreamer_racing.training.checksums import HAS_CHECKSUMS, damage_of
+from dreamer_racing.training.checksums import damage_of
 from dreamer_racing.training.directory import (
     PREFIX,
     PROCESS,
@@ -125,7 +125,7 @@ class RunCheckpoints:
             return final
         partial = self.directory / f".{final.name}.partial"
         processes = {PROCESSES: parallel.count()} if self._own and parallel.count() > 1 else {}
-        about = {**(metadata or {}), "env_steps": env_steps, **processes, HAS_CHECKSUMS: True}
+        about = {**(metadata or {}), "env_steps": env_steps, **processes}
         first = parallel.is_first()
         try:
             self._step(lambda: self._checkpoint.save(partial, metadata=about), of_this_process=first)

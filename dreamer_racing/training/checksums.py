@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import json
-import logging
 import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -15,10 +13,6 @@ from dreamer_racing.training.directory import PROCESS, PROCESSES
 
 CHECKSUMS = "checksums.json"
 """The file with the CRC-32 of all others of a checkpoint, by path: against damage, not against intent."""
-HAS_CHECKSUMS = "checksums"
-"""In the metadata of a checkpoint that was saved with that file: if it is not there, it was lost."""
-
-logger = logging.getLogger(__name__)
 
 
 def write_checksums(path: Path) -> None:
@@ -29,16 +23,11 @@ def write_checksums(path: Path) -> None:
 
 
 def damage_of(path: Path, parts: Collection[str] | None) -> str | None:
-    """Says which file of some parts is not as it was saved; None if all are, or if an older version noted no sums."""
-    manifest = Checkpoint.manifest(path)
+    """Says which file of some parts is not as it was saved; None if all are."""
     try:
         sums = json.loads((path / CHECKSUMS).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        metadata = manifest.get("metadata")
-        if not isinstance(metadata, dict) or metadata.get(HAS_CHECKSUMS):
-            return f"{CHECKSUMS} is missing"
-        _warn_of_no_checksums(path)
-        return None
+        return f"{CHECKSUMS} is missing"
     except (ValueError, OSError):
         sums = None
     if not isinstance(sums, dict):
@@ -61,11 +50,6 @@ def _files_of(path: Path, parts: Collection[str] | None) -> Iterator[str]:
     for rank in range(1, (manifest.get("metadata") or {}).get(PROCESSES, 1)):
         folder = f"{PROCESS}{rank}"
         yield from (f"{folder}/{name}" for name in _files_of(path / folder, parts))
-
-
-@functools.cache  # once for a checkpoint, however often it is read
-def _warn_of_no_checksums(path: Path) -> None:
-    logger.warning("%s was saved by a version without checksums: whether it is damaged cannot be told.", path)
 
 
 def _checksum(file: Path) -> int | None:

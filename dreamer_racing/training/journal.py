@@ -4,9 +4,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, setting
 from dreamer_racing.training.metrics import PendingMetrics
+
+
+@dataclass
+class EvaluationConfig:
+    """Evaluation during training."""
+
+    every: int = setting(25_000, NOT_NEGATIVE)  # env_steps; 0 never
+    first: int = setting(0, NOT_NEGATIVE)  # env_steps at which there is one before that, to look at; 0 none
+    episodes: int = setting(8, COUNT)
+    stochastic: bool = False  # also fly the sampling policy
+    # of starts, as a multiple of the noise of training; 0: all begin at the start pose
+    start_noise: float = setting(0.0, NOT_NEGATIVE)
+    video_steps: int = setting(500, COUNT)  # control steps in the video
+
+
+@dataclass
+class CheckpointConfig:
+    """Checkpoints during training."""
+
+    every: int = setting(50_000, NOT_NEGATIVE)  # env_steps
+    # of wall clock between two, for machines that are taken away; 0: by env_steps alone
+    minutes: float = setting(0.0, NOT_NEGATIVE)
+    keep: int = setting(2, COUNT)
 
 
 class Periods:

@@ -2,11 +2,10 @@
 
 import sys
 
-from composing.missing import refuse_without_packages
+from composing.messages import end_quietly, refuse_without_packages
 
 refuse_without_packages()  # before anything needs them
 
-from composing.messages import end_quietly  # noqa: E402
 from composing.usage import answer_early  # noqa: E402
 from dreamer_racing.caches import CacheError, ensure_caches  # noqa: E402
 from dreamer_racing.terminal import take_any_terminal  # noqa: E402

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import torch
 
 from composing.schema import EnvConfig, LatentPPORunConfig, RunConfig, WorldModelRunConfig, is_race
-from dreamer_racing.envs.race.gates import CrashCause
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
@@ -23,11 +22,6 @@ if TYPE_CHECKING:
     from dreamer_racing.envs.control_suite import ControlSuiteEnv
 
 Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
-
-
-def scene_name(config: RunConfig) -> str:
-    """The track or the task."""
-    return config.track if is_race(config) else config.task
 
 
 def describe_file(track: str) -> str | None:
@@ -50,12 +44,6 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
     return str(device) if device.type == "cuda" and fits else "cpu"
 
 
-def camera_of(config: RunConfig) -> Camera:
-    """The nose camera."""
-    side = config.env.image_size
-    return Camera(width=side, height=side, tilt=config.env.camera_tilt, rate=config.env.camera_rate)
-
-
 def imu_of(config: RunConfig) -> str | None:
     """The inertial measurements that the agent sees, as `DroneRacingEnv` takes them."""
     return None if config.env.imu == "none" else config.env.imu
@@ -64,17 +52,12 @@ def imu_of(config: RunConfig) -> str | None:
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
     env = config.env
+    same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
     return {
         "track": track_as_begun(config),
-        "preset": env.preset,
-        "renderer": env.renderer,
-        "camera": camera_of(config),
-        "control_rate": env.control_rate,
-        "from_pixels": env.from_pixels,
+        "camera": Camera(env.image_size, env.image_size, tilt=env.camera_tilt, rate=env.camera_rate),
         "imu": imu_of(config),
-        "reward": env.reward,
-        "vector": env.vector,
-        "device": env.device,
+        **{name: getattr(env, name) for name in same},
     }
 
 
@@ -90,18 +73,16 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
     num_envs = num_envs or env.num_envs
     readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
     if is_race(config):
+        training = (
+            "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius",
+            "action_change_weight", "looks",
+        )  # fmt: skip
         return DroneRacingEnv(
             num_envs=num_envs,
-            episode_steps=env.episode_steps,
             privileged=bool(readers),
-            start_beyond_gate=env.start_beyond_gate,
-            start_at_gate=env.start_at_gate,
-            start_on_line=env.start_on_line,
-            miss_radius=env.miss_radius,
-            action_change_weight=env.action_change_weight,
-            looks=env.looks,
             seed=config.seed,
             num_threads=num_threads,
+            **{name: getattr(env, name) for name in training},
             **worlds_of(config),
         )
     if readers:
@@ -152,14 +133,3 @@ def make_evaluator(
     seed = config.seed + 1
     env = make_suite(config, min(8, episodes), seed)
     return ReturnReport(directory, learner, env, episodes, video_steps, seed)
-
-
-def crash_causes(config: RunConfig) -> type[CrashCause] | None:
-    """How episodes may end badly, for the metrics."""
-    return CrashCause if is_race(config) else None
-
-
-def reward_terms(env: Environment) -> list[str]:
-    """What a replay keeps of rewards: `reward`, and the terms of which the curriculum recomputes it."""
-    present = env.observation_spec.keys()
-    return ["reward", *(name for name in ("reward_base", "body_rate_norm") if name in present)]

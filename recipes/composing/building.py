@@ -3,28 +3,25 @@
 import random
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from composing.arena import (
-    Environment,
-    crash_causes,
-    make_evaluator,
-    reward_terms,
-)
-from composing.checks import refuse_to_replace
-from composing.saved import flat_settings
-from composing.schema import ReplayRunConfig, RunConfig, Storage, WorldModelRunConfig, is_race
+from composing.arena import Environment, make_evaluator
+from composing.checks import check
+from composing.saved import settings_of
+from composing.schema import ReplayRunConfig, RunConfig, is_race
 from dreamer_racing import parallel
+from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
-from dreamer_racing.experience.replay import StreamReplay, make_replay, replay_bytes
+from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.experience.replay import SequenceReplayConfig, Storage, StreamReplay, make_replay, replay_bytes
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.learner import Learner, Policy
 from dreamer_racing.machine import (
@@ -35,7 +32,7 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Interface
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training.directory import RunDirectory, replace_text
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint, replace_text
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, NoReport
 from dreamer_racing.training.session import Evaluator, Session
@@ -48,34 +45,14 @@ def seed_generators(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-class Rewards:
-    """Moves the body-rate penalty of a race's rewards by a curriculum; elsewhere there is none.
+def num_gates(env: Environment) -> int:
+    """Return how many gates the track has; 0 where there is no race."""
+    return env.track.num_gates if isinstance(env, DroneRacingEnv) else 0
 
-    Args:
-        config: of the run.
-        env: whose rewards they are.
-    """
 
-    def __init__(self, config: RunConfig, env: Environment) -> None:
-        self.curriculum = BodyRateCurriculum(config.curriculum) if is_race(config) else None
-        self._env = env
-
-    def adapt(self, episodes: TensorDictBase) -> dict[str, float]:
-        """Set the penalty of what comes, by finished episodes ``[E]``; return metrics."""
-        if self.curriculum is None:
-            return {}
-        self._env.body_rate_weight = self.curriculum.update(episodes["return"])
-        return {"curriculum/body_rate_weight": self._env.body_rate_weight}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that a checkpoint needs."""
-        return {} if self.curriculum is None else self.curriculum.state_dict()
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, also in worlds that begin anew."""
-        if self.curriculum is not None:
-            self.curriculum.load_state_dict(state_dict)
-            self._env.body_rate_weight = self.curriculum.body_rate_weight
+def make_curriculum(config: RunConfig, env: Environment) -> BodyRateCurriculum:
+    """Make what moves the body-rate penalty of a race's rewards; elsewhere it moves nothing."""
+    return BodyRateCurriculum(config.curriculum, env if is_race(config) else None)
 
 
 def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Collector:
@@ -99,72 +76,60 @@ def make_collector(config: RunConfig, env: Environment, policy: Policy) -> Colle
 def make_run_replay(
     config: ReplayRunConfig,
     env: Environment,
-    rewards: Rewards,
-    batch_size: int,
-    batch_length: int,
+    curriculum: BodyRateCurriculum,
+    batch: tuple[int, int],
     latents: LatentFormat | None = None,
-    **windows: Any,
 ) -> StreamReplay:
     """Make the replay, on the learner's device if it has room there; say where and how large.
 
     Args:
         config: resolved.
         env: whose records it is to hold.
-        rewards: by whose curriculum old rewards are relabelled, if they are.
-        batch_size: windows in a batch.
-        batch_length: records in a window.
+        curriculum: by which old rewards are relabelled, if they are.
+        batch: windows in a batch, and records in a window.
         latents: how they are kept with the records, if they are.
-        windows: further arguments of `make_replay` on which windows are drawn.
     """
-    settings, interface = config.replay, Interface.of(env)
+    settings, interface, shown = config.replay, Interface.of(env), env.observation_spec.keys()
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
-    assert config.run_dir is not None, "resolve_common() names it"
-    files = RunDirectory(Path(config.run_dir)).replay if settings.storage is Storage.memmap else None
-    storage_device = settings.device if files is None else "cpu"
-    if storage_device == "auto":
-        on_learner = config.device != "cpu" and size < 0.5 * available_memory(config.device)
-        storage_device = config.device if on_learner else "cpu"
+    files = run_directory(config).replay if settings.storage is Storage.memmap else None
+    device = settings.device if files is None else "cpu"
+    if device == "auto":
+        fits = config.device != "cpu" and size < 0.5 * available_memory(config.device)
+        device = config.device if fits else "cpu"
     if files is not None:
         shutil.rmtree(files, ignore_errors=True)  # of a run that was killed
-    check_room(size, settings.capacity, storage_device, files)
+    check_room(size, settings.capacity, device, files)
     if files is not None:
         files.mkdir(parents=True, exist_ok=True)
-    where = f"memory of {storage_device}" if files is None else f"files below {files}, until the process ends"
+    where = f"memory of {device}" if files is None else f"files below {files}, until the process ends"
     print(f"replay: {settings.capacity:,} records, {size / 1e9:.1f} GB when full, in {where}")
     print(disk_needed(config, round(size * min(parallel.count(), config.total_env_steps / settings.capacity))))
+    windows = {}
+    if isinstance(settings, SequenceReplayConfig):
+        windows = {name: getattr(settings, name) for name in ("recent_share", "recent_records", "held_out")}
     return make_replay(
         settings.capacity,
         config.env.num_envs,
-        batch_size,
-        batch_length,
+        *batch,
         config.device,
-        storage_device=storage_device,
+        storage_device=device,
         scratch_dir=files,
         seed=config.seed,
-        transform=RelabelReward(rewards.curriculum) if rewards.curriculum and config.curriculum.relabel else None,
+        transform=RelabelReward(curriculum) if curriculum.env is not None and config.curriculum.relabel else None,
         observation_keys=interface.replay_keys,
-        reward_keys=reward_terms(env),
+        # The terms are those of which the curriculum recomputes rewards.
+        reward_keys=["reward", *(name for name in ("reward_base", "body_rate_norm") if name in shown)],
         latents=latents,
         # Samples drawn ahead would not have the latents that the update before them leaves.
-        prefetch=2 if config.device != "cpu" and storage_device == "cpu" and latents is None else None,
+        prefetch=2 if config.device != "cpu" and device == "cpu" and latents is None else None,
         **windows,
     )
 
 
 def check_room(size: int, capacity: int, device: str, files: Path | None) -> None:
-    """Refuse replays of so many bytes and records, of which each process has one, if they do not fit together.
-
-    Args:
-        size: bytes of one.
-        capacity: its records.
-        device: whose memory it is kept in.
-        files: the folder in which it is kept instead, or None.
-
-    Raises:
-        ValueError: the message gives what is needed, what there is, and what to change.
-    """
+    """Refuse replays that do not fit together; each process has one, of so many bytes and records."""
     asked = f"replay.capacity={capacity * parallel.count():,}"
     if files is not None:
         check_space(size * parallel.count(), files, asked)
@@ -174,8 +139,7 @@ def check_room(size: int, capacity: int, device: str, files: Path | None) -> Non
 
 def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     """Say what checkpoints with a replay of so many bytes take at their peak, and what there is for them."""
-    assert config.run_dir is not None, "resolve_common() names it"
-    directory = RunDirectory(Path(config.run_dir))
+    directory = run_directory(config)
     there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
     peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
     line = (
@@ -186,25 +150,6 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 
-def make_sequence_replay(
-    config: WorldModelRunConfig, env: Environment, rewards: Rewards, latents: LatentFormat | None
-) -> StreamReplay:
-    """Make the replay of a world model, with the latents beside its records if they are kept."""
-    asked = config.replay
-    assert asked.held_out is not None, "resolve() says"
-    return make_run_replay(
-        config,
-        env,
-        rewards,
-        config.model.batch_size,
-        config.model.batch_length,
-        latents=latents,
-        recent_share=asked.recent_share,
-        recent_records=asked.recent_records,
-        held_out=asked.held_out,
-    )
-
-
 def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
     """Keep what a run is started with, beside it and beside its best checkpoint."""
     for place in (directory, directory.best):
@@ -212,6 +157,12 @@ def write_configuration(directory: RunDirectory, config: RunConfig, overrides: S
     kept = [override for override in overrides if not override.startswith("resume=")]
     replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
     directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
+
+
+def run_directory(config: RunConfig) -> RunDirectory:
+    """Return that of a resolved configuration."""
+    assert config.run_dir is not None, "resolve_common() names it"
+    return RunDirectory(Path(config.run_dir))
 
 
 def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:
@@ -224,34 +175,35 @@ def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> 
 
 def make_tracker(config: RunConfig) -> EpisodeTracker:
     """Make what finds the finished episodes of this process's worlds."""
-    return EpisodeTracker(config.env.num_envs // parallel.count(), crash_causes(config))
+    return EpisodeTracker(config.env.num_envs // parallel.count(), CrashCause if is_race(config) else None)
 
 
 def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
     """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
-    asked = config.logger
-    loggers = make_loggers(directory.path, asked.tensorboard, asked.wandb.value, asked.project, resumed)
-    plain = OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True))
+    loggers = make_loggers(directory.path, config.logger, resumed)
+    plain = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True)))
     for sink in loggers:
-        sink.log_configuration(flat_settings(cast(DictConfig, plain)), OmegaConf.to_yaml(plain))
+        sink.log_configuration(settings_of(plain), OmegaConf.to_yaml(plain))
     return loggers
 
 
 def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
-    """Take a run directory, before anything large is made, for a session in it.
+    """Take a run directory for a session in it, if the run can work at all.
 
     Raises:
-        ValueError: it holds another run, or is in use by a live one.
+        ValueError: it cannot; or the directory holds another run, or is in use by a live one.
     """
-    assert config.run_dir is not None, "resolve_common() names it"
-    directory = RunDirectory(Path(config.run_dir))
+    check(config)
+    directory = run_directory(config)
     lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
-    try:
-        if parallel.is_first():
-            refuse_to_replace(config)
-    except BaseException:
-        lock.abandon()
-        raise
+    if parallel.is_first() and not config.resume:
+        with suppress(FileNotFoundError):
+            newest = latest_checkpoint(directory.checkpoints)
+            lock.abandon()
+            raise ValueError(
+                f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with "
+                f"resume={config.run_dir}, or choose another run_dir."
+            )
     return Session(
         config,
         lock,

@@ -3,7 +3,7 @@
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -89,7 +89,7 @@ def hydra_takes(override: str) -> bool:
     return True
 
 
-def merge_overrides(saved: Sequence[str], given: Sequence[str]) -> list[str]:
+def merge_overrides(saved: Iterable[str], given: Sequence[str]) -> list[str]:
     """Overrides of a run that is continued: those it was started with, replaced by the ones given now."""
     replaced = {override_key(override) for override in given}
     return [override for override in saved if override_key(override) not in replaced] + list(given)

@@ -11,12 +11,16 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from composing.command_line import as_override, hydra_takes, override_key
+from composing.command_line import as_override, hydra_takes, override_key, plain_errors
 from composing.messages import INTERRUPTED, follows, say_error
 from composing.options import CONFIG_DIR, FLAGS, no_such_choice, no_such_setting
+from dreamer_racing.settings import check_settings
 
+SCHEMAS: dict[str, type] = {}
+"""Dataclasses of the recipes that are loaded, by their names."""
 WHOLE = re.compile(r"\d{1,9}(\.\d{1,9})?[eE]\+?\d{1,2}")
 """A number such as 1e6."""
 PLAIN = {
@@ -34,19 +38,31 @@ TEXTS = (
 """Settings that are no numbers, whatever they look like."""
 
 
-def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
-    """Make a function of a configuration the recipe of a name, whose file in `config` hydra composes it from.
-
-    A recipe without a file has the schema of its name for a configuration, and hydra leaves nothing behind.
+def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
+    """Make a function of a configuration the recipe of a name.
 
     An override that hydra does not take is said in one paragraph on stderr, with exit status 2. Ctrl-C, where the
     recipe has no use for it, ends it with the shell's status.
+
+    Args:
+        name: of the recipe. Hydra composes the configuration from the file of this name in `config`; where there is
+            none it is the schema alone, and hydra leaves nothing behind.
+        schema: dataclass of the configuration.
+        composed: whether the function takes what hydra composed, with settings left open, instead of an object of the
+            dataclass whose numbers are within their ranges.
     """
+    SCHEMAS[name] = schema
+    ConfigStore.instance().store(name=f"{name}_schema", node=schema)
     if not (CONFIG_DIR / f"{name}.yaml").is_file():
         ConfigStore.instance().store(name=name, node=schema_alone(name))
 
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
-        main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(function)
+        @functools.wraps(function)
+        def with_typed(config: DictConfig) -> None:
+            function(typed(config))
+
+        task = function if composed else with_typed
+        main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(task)
 
         @functools.wraps(function)
         def start() -> None:
@@ -66,6 +82,14 @@ def recipe(name: str) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
         return start
 
     return decorate
+
+
+def typed(config: DictConfig) -> Any:
+    """Return an object of the dataclass of a configuration; refuse what is missing, and numbers out of their range."""
+    with plain_errors():
+        settings = OmegaConf.to_object(config)
+        check_settings(settings)
+    return settings
 
 
 def schema_alone(name: str) -> dict[str, Any]:

@@ -6,14 +6,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from composing.building import open_session
 from composing.checks import check_overrides, check_read
@@ -26,7 +25,8 @@ from composing.command_line import (
     plain_errors,
     start_logging,
 )
-from composing.saved import begun_with, changed_settings, keep_saved, saved_config
+from composing.resolving import tune
+from composing.saved import SEEN, changed_settings, keep_saved, read_yaml, saved_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from composing.usage import command
 from dreamer_racing import parallel
@@ -42,12 +42,9 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
 from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint
-from dreamer_racing.training.schedule import Ramp, RampClock
 from dreamer_racing.training.session import Session
 
-TRAINED_ON = (
-    "track", "task", "decoys", "env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector",
-)  # fmt: skip
+TRAINED_ON = ("track", "task", "decoys", "init_from", *SEEN)
 """What a run that is resumed cannot change."""
 
 
@@ -55,8 +52,6 @@ def launch(
     config: DictConfig,
     resolve: Callable[[DictConfig], DictConfig],
     train: Callable[[Any, Session], None],
-    tune: Callable[[DictConfig], str] | None = None,
-    *,
     remedy: str,
 ) -> None:
     """Compose the configuration of a recipe, and train in a session.
@@ -65,7 +60,6 @@ def launch(
         config: as hydra composed it.
         resolve: replaces what the configuration leaves open.
         train: the recipe's loop, given configuration and session.
-        tune: says which file of the group ``tuned`` is meant by ``tuned=auto``; None where there is no such group.
         remedy: what to lower once a loss is not finite, e.g. "ppo.learning_rate".
     """
     start_logging()
@@ -76,7 +70,7 @@ def launch(
             parallel.join()
             if not parallel.is_first():
                 follow_quietly()
-            config, overrides = compose_run(config, tune)
+            config, overrides = compose_run(config)
             if config.resume and parallel.largest(int(is_finished(config))):  # all look before the first tidies up
                 print(what_next(cast(RunConfig, config), RunDirectory(Path(config.run_dir))))
                 return
@@ -91,19 +85,19 @@ def launch(
         parallel.leave()
 
 
-def compose_run(config: DictConfig, tune: Callable[[DictConfig], str] | None) -> tuple[DictConfig, list[str]]:
+def compose_run(config: DictConfig) -> tuple[DictConfig, list[str]]:
     """Return the configuration of a run that is begun or continued, and the overrides that it is composed from."""
     overrides = given = list(HydraConfig.get().overrides.task)
     noted = None
     if config.resume:
         config, overrides = resumed_config(config.algorithm, config.resume, overrides)
         noted = config.track_description
-    if tune and config.tuned == "auto":
+    if config.get("tuned") == "auto":
         overrides = merge_overrides(overrides, [f"tuned={tune(config)}"])
         config = hydra.compose(str(HydraConfig.get().job.config_name), overrides)  # --config-name=, if given
         config.track_description = noted
     check_overrides(config, overrides)
-    if config.algorithm in ("dreamer_v3", "latent_ppo"):
+    if "loss" in config:
         check_read(config, given)
     return config, overrides
 
@@ -167,7 +161,7 @@ def keep_batch(error: NonFiniteLossError, path: Path) -> str:
 
 
 def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[DictConfig, list[str]]:
-    """The configuration of the run to continue, as it was trained, with the overrides given now on top.
+    """Return the configuration of the run to continue, as it was trained, with the overrides given now on top.
 
     Raises:
         ValueError: it is no whole run, or another algorithm's, or an override would make another run of it.
@@ -183,20 +177,22 @@ def resumed_config(algorithm: str, resume: str, overrides: list[str]) -> tuple[D
     for file in (directory.config, directory.overrides):
         if not file.exists():
             raise ValueError(f"{run_dir} cannot be continued: it lacks {file.name}, which every run has.")
-    known = saved_config(algorithm, run_dir)
+    known = saved_config(run_dir)
+    if (trained_by := known.algorithm) != algorithm:
+        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
     for override in overrides:
-        name, value = override_key(override), override.partition("=")[2]
+        name = override_key(override)
         if name == "run_dir" and Path(str(override_value(override))).absolute() != run_dir:
             raise ValueError(f"{override}: the run goes on in its own directory, {run_dir}. Leave it out.")
-        if name == "init_from" and override_value(override) != OmegaConf.select(known, name):
-            raise ValueError(f"{override}: the run goes on with its own weights. Leave it out, or begin anew with it.")
-        trained = OmegaConf.select(known, name) if name in TRAINED_ON else None
-        if name in TRAINED_ON and OmegaConf.from_dotlist([f"value={value}"]).value != trained:
+        if name in TRAINED_ON and override_value(override) != (trained := OmegaConf.select(known, name)):
             raise ValueError(
                 f"{run_dir} was trained with {name}={trained}, and goes on with it: {override} would be "
                 "another run. Leave it out, or begin anew."
             )
-    merged = merge_overrides([*begun_with(algorithm, run_dir), as_override("run_dir", run_dir)], overrides)
+    begun_with = [
+        text for text in map(str, read_yaml(directory.overrides, ListConfig)) if override_key(text) != "run_dir"
+    ]
+    merged = merge_overrides([*begun_with, as_override("run_dir", run_dir)], overrides)
     config = hydra.compose(algorithm, merged)
     keep_saved(config, known, {override_key(override) for override in overrides})
     config.track_description = known.track_description  # whatever is taken anew
@@ -229,25 +225,14 @@ def what_next(config: RunConfig, directory: RunDirectory) -> str:
         left |= {"film": directory.videos / f"{evaluation}.mp4", "plot": directory.plots / f"{evaluation}.png"}
     place, longer = from_here(directory.path), 2 * max(config.total_env_steps, directory.finished_env_steps())
     given = {name: shlex.quote(as_override(name, place)) for name in ("checkpoint", "agent", "runs", "resume")}
+    moving = config.schedule.by_length if isinstance(config, WorldModelRunConfig) else []
+    sets_back = f"  # sets back what moves with the share of the run: {', '.join(moving)}" if moving else ""
     noisy = " start_noise=1" if is_race(config) else ""  # else all of the deterministic policy's flights are alike
     commands = {
         "evaluate it": f"{command('evaluate')} {given['checkpoint']} episodes=100{noisy}",
         "watch it fly": f"{command('fly')} {given['agent']}" if is_race(config) else "",
         "draw it": f"{command('plot')} {given['runs']} output=figures",
-        "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{_rising(config)}",
+        "go on": f"{command(config.algorithm)} {given['resume']} total_env_steps={longer}{sets_back}",
     }
     files = {what: from_here(path) for what, path in left.items() if path.exists()}
     return "\n".join(f"{what + ':':<14}{words}" for what, words in {**files, **commands}.items() if words)
-
-
-def _rising(config: RunConfig) -> str:
-    """Return what to know before a run is made longer: what has moved by its share of the run moves back."""
-    if not isinstance(config, WorldModelRunConfig):
-        return ""
-    ramps = {ramp.name: getattr(config.schedule, ramp.name) for ramp in fields(config.schedule)}
-    by_run = [
-        name
-        for name, ramp in ramps.items()
-        if isinstance(ramp, Ramp) and ramp.to is not None and ramp.by is not RampClock.passes
-    ]
-    return f"  # sets back what moves with the share of the run: {', '.join(by_run)}" if by_run else ""

@@ -1,26 +1,29 @@
-"""The learner of a configuration, and what of it a schedule moves."""
+"""The learner of a configuration, and what a run measures of it beside its updates."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import cast
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from composing.arena import Environment
-from composing.saved import read_yaml
+from composing.saved import SEEN, read_yaml
 from composing.schema import (
-    LOSS_RAMPS,
-    DreamerV3RunConfig,
     LatentPPORunConfig,
-    NetworkConfig,
     PPORunConfig,
     RunConfig,
     SACRunConfig,
     WorldModelRunConfig,
 )
+from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
+from dreamer_racing.evaluation.held_out import SEEN as OBSERVED
+from dreamer_racing.evaluation.held_out import held_out_metrics, world_model_metrics
+from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
 from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
@@ -34,41 +37,11 @@ from dreamer_racing.losses import find_targets
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.schedule import Schedule
+from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.session import Session
 
-IN_CHECKPOINTS = ("min_std", "max_std")
-"""Numbers of the losses that the networks hold: what a checkpoint brings of another run gives way to this one's."""
-
-
-def make_schedule(config: WorldModelRunConfig, env: Environment | None = None) -> Schedule:
-    """Make the schedule of what a learner's `adjust` takes, by its names, and of `start_on_line`.
-
-    Args:
-        config: resolved.
-        env: whose gates some ramps go by; None, where what is restored has counted them.
-    """
-    schedule, loss = config.schedule, config.loss
-    ramps = {"rates": (1.0, schedule.learning_rates), "world_model_rate": (1.0, schedule.world_model_rate)}
-    for name in LOSS_RAMPS:
-        ramp = getattr(schedule, name)
-        if ramp.to is not None or name in IN_CHECKPOINTS:
-            ramps[name] = (getattr(loss, name), ramp)
-    if isinstance(config, LatentPPORunConfig) and (kl_target := config.loss.ppo.kl_target) is not None:
-        ramps["kl_target"] = (kl_target, config.schedule.kl_target)
-    if isinstance(config, DreamerV3RunConfig) and config.schedule.imagination_horizon.to is not None:
-        ramps["imagination_horizon"] = (config.model.imagination_horizon, config.schedule.imagination_horizon)
-    if schedule.start_on_line.to is not None:
-        ramps["start_on_line"] = (config.env.start_on_line, schedule.start_on_line)
-    num_gates = env.track.num_gates if isinstance(env, DroneRacingEnv) else 0
-    return Schedule(ramps, config.total_env_steps, num_gates)
-
-
-def move_starts(env: Environment, scheduled: dict[str, float]) -> dict[str, float]:
-    """Set the share of episodes that begin on a line, if it is scheduled; return the other numbers."""
-    numbers = dict(scheduled)
-    if (share := numbers.pop("start_on_line", None)) is not None:
-        cast(DroneRacingEnv, env).worlds.start_on_line = share
-    return numbers
+WINDOWS, RECORDS = 32, 2_000
+"""Windows of records held out that are measured at a time, from the newest records of a world."""
 
 
 def size_of(config: WorldModelRunConfig) -> ModelSize:
@@ -94,7 +67,7 @@ def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Env
     folder = existing_agent_path("init_from", source)
     if not is_agent(folder):
         saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
-        for name in ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector"):
+        for name in SEEN:
             there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
             if there != here:
                 raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
@@ -127,17 +100,38 @@ def make_learner(
         seed: of the initial weights; the run's if None.
     """
     seed = config.seed if seed is None else seed
-    if isinstance(config, DreamerV3RunConfig):
-        return DreamerV3.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
-    if isinstance(config, LatentPPORunConfig):
-        return LatentPPO.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
+    if isinstance(config, WorldModelRunConfig):
+        kind = LatentPPO if isinstance(config, LatentPPORunConfig) else DreamerV3
+        return kind.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
     if isinstance(config, PPORunConfig):
-        return PPOLearner(network_size(config.network), interface, config.ppo, device, seed)
+        return PPOLearner(NetworkSize(config.network.layers, config.network.units), interface, config.ppo, device, seed)
     if isinstance(config, SACRunConfig):
-        return SACLearner(network_size(config.network), interface, config.sac, device, seed)
+        return SACLearner(NetworkSize(config.network.layers, config.network.units), interface, config.sac, device, seed)
     raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
 
 
-def network_size(config: NetworkConfig) -> NetworkSize:
-    """The hidden layers of a resolved configuration."""
-    return NetworkSize(config.layers, config.units)
+def measure(
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
+) -> dict[str, Tensor | float]:
+    """Return hyperparameters as they are now, and what the model makes of the newest records not trained on."""
+    groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
+    numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
+    numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
+    windows = replay.held_out(WINDOWS, OBSERVED + learner.config.imagination_horizon, RECORDS)
+    if windows is None or not session.counters["updates"]:
+        return numbers
+    with session.undisturbed():
+        return numbers | held_out_metrics(learner, windows)
+
+
+def measure_lag(
+    session: Session, config: WorldModelRunConfig, learner: WorldModelLearner, replay: StreamReplay, lag: ModelLag
+) -> dict[str, Tensor | float]:
+    """Measure whether the model knows the records of the newest flights, before they are learned from."""
+    length = config.model.batch_length
+    if config.replay.context:  # begins warm: the newest rollout alone
+        length = min(length, config.rollout_steps)
+    if (windows := replay.newest(length)) is None:
+        return {}
+    with session.undisturbed():
+        return lag.measured(parallel.averaged(world_model_metrics(learner, windows)))

@@ -2,18 +2,22 @@
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from itertools import takewhile
+from pathlib import Path
 from typing import cast
 
+import hydra
 import torch
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import describe_file, scene_name, worlds_device
+from composing.arena import describe_file, worlds_device
 from composing.command_line import new_run_dir
 from composing.options import CONFIG_DIR
-from composing.schema import CollectorKind, RunConfig
-from composing.tuned import changed_from_tuned
-from composing.workers import place_worlds, resolve_workers
+from composing.saved import said, settings_of
+from composing.schema import CollectorKind
+from composing.workers import resolve_workers
 from dreamer_racing import parallel
 from dreamer_racing.devices import choose_device, choose_mixed_precision
 from dreamer_racing.envs.race.race import EPISODE_TIME
@@ -22,33 +26,7 @@ from dreamer_racing.envs.tracks import TrackError
 NUM_ENVS = 32  # of the recipes with a world model
 SHORT_WINDOW = 16  # records, on a CUDA device
 MODEL_OF_BUDGET = {"smoke": "debug", "paper": "paper_large"}
-SETTINGS = {
-    "race": """for {algorithm} on races from images on a CPU:
-  the world model decodes the simulator's state in training; the actor sees images only
-  70 % of training episodes begin in flight on a planned racing line, until every gate is passed; then all come to begin
-  at the start, as a race does; a missed gate ends one; 25 actions a second
-  a KL penalty keeps the model's learning from changing the policy; averaged weights fly evaluations and exports""",
-    "images": """for {algorithm} on Circle from images alone, on a CPU:
-  the world model reconstructs images, at a small weight; no network sees the simulator's state, not even in training
-  half of the training episodes begin at rest, half before a gate; a missed gate ends one; 25 actions a second
-  a KL penalty keeps the model's learning from changing the policy; averaged weights fly evaluations and exports""",
-    "gpu": "those of tuned=race with more worlds and updates, for a GPU, unmeasured",
-    "suite": """which learn a task of the Control Suite from images on a CPU:
-  a small model that trains on 128 records for each action, and averaged weights fly evaluations""",
-}
-"""What the files of the group `tuned` set, by their names; for the algorithm that is trained."""
 NAMES = {"dreamer_v3": "DreamerV3", "latent_ppo": "latent PPO"}
-ACTORS = {
-    "dreamer_v3": (
-        "the actor learns in imagination, from latents of the replay on; docs/learning.md says how far that has come,",
-        "and recipes/latent_ppo.py is the surest way on a CPU",
-    ),
-    "latent_ppo": (
-        "the actor learns by PPO from what was collected, in the model's latents, and so does its critic; nothing is",
-        "imagined; where the model errs twice as much on new records as in training the actor waits for it",
-    ),
-}
-"""What the actor of each algorithm learns from."""
 FEW_WORLDS = 4  # of fewer a world that is held out is too much to do without
 
 
@@ -65,9 +43,11 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     if config.env.episode_steps is None and config.env.suite == "race":
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
-        config.env.device = worlds_device(device, config.env)
-        if device.type != "cpu":
-            print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
+        overlapped = config.get("collector") is CollectorKind.overlapped  # beside the learner
+        config.env.device = "cpu" if overlapped else worlds_device(device, config.env)
+        reason = "collector=overlapped" if overlapped else f"env.device=auto, env.renderer={config.env.renderer}"
+        if overlapped or device.type != "cpu":
+            print(f"worlds: {config.env.device} ({reason})")
     if config.env.suite == "race":
         note_track(config)
     if config.env.reward is not None and config.curriculum.maximum:
@@ -76,7 +56,8 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
             f"return is above curriculum.threshold={config.curriculum.threshold:g} (curriculum=none: without it)"
         )
     if config.run_dir is None:
-        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene_name(cast(RunConfig, config)))))
+        scene = config.track if config.env.suite == "race" else config.task
+        config.run_dir = parallel.agreed(str(new_run_dir(config.algorithm, scene)))
     return device
 
 
@@ -131,7 +112,6 @@ def tune(config: DictConfig) -> str:
 
 def resolve_world_model(config: DictConfig) -> DictConfig:
     """Fill in what a recipe with a world model leaves open, by device, size and budget, and say what was chosen."""
-    place_worlds(config)
     device = resolve_common(config, NUM_ENVS)
     size = config.model.size
     if size == "auto":
@@ -164,15 +144,37 @@ def resolve_world_model(config: DictConfig) -> DictConfig:
 
 def tell_of_tuned(config: DictConfig) -> None:
     """Say what the settings of the group `tuned` mean, and what of them was asked for otherwise."""
-    if config.tuned not in SETTINGS:
-        return
-    files = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have every number"
-    settings = SETTINGS[config.tuned].format(algorithm=NAMES[config.algorithm])
-    said = (f"settings: tuned={config.tuned}, {settings}", *ACTORS[config.algorithm], files)
-    print("\n  ".join(said))
-    if changed := changed_from_tuned(config):
-        print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
-    print(f"length: {config.total_env_steps:,} env_steps; how long they take here is measured, and said in progress")
+    if config.tuned not in ("auto", "none") and (CONFIG_DIR / "tuned" / f"{config.tuned}.yaml").is_file():
+        files = [CONFIG_DIR / "tuned" / folder / f"{config.tuned}.yaml" for folder in ("", config.algorithm)]
+        said_there = [line for file in files if file.exists() for line in head_of(file)]
+        every = f"recipes/config/tuned/{config.tuned}.yaml and tuned/{config.algorithm} have every number"
+        first = f"settings: tuned={config.tuned}, for {NAMES[config.algorithm]} {said_there[0]}"
+        print("\n  ".join((first, *said_there[1:], every)))
+        if changed := changed_from_tuned(config):
+            print(f"settings of tuned={config.tuned}, but as asked for: {', '.join(changed)}")
+        print(
+            f"length: {config.total_env_steps:,} env_steps; how long they take here is measured, and said in progress"
+        )
+
+
+def head_of(file: Path) -> list[str]:
+    """Return the lines of the comment at the head of a file, behind hydra's own, until one that is empty."""
+    lines = file.read_text(encoding="utf-8").splitlines()[1:]
+    return [line[2:] for line in takewhile(lambda line: line.startswith("# "), lines)]
+
+
+def changed_from_tuned(config: DictConfig) -> list[str]:
+    """Return ``setting=value (there)`` of all that the files of `tuned` set, and that is otherwise here."""
+    started = GlobalHydra.instance().is_initialized()  # as by a recipe that runs
+    with nullcontext() if started else hydra.initialize_config_dir(str(CONFIG_DIR), version_base="1.3"):
+        tuned = settings_of(hydra.compose(config.algorithm, [f"tuned={config.tuned}"]))
+        plain = settings_of(hydra.compose(config.algorithm, ["tuned=none", f"model={tuned['model.size']}"]))
+    here = settings_of(config)
+    return [
+        f"{name}={said(here[name])} ({said(value)})"
+        for name, value in tuned.items()
+        if value not in (plain[name], here[name]) and name != "tuned"
+    ]
 
 
 def shorten_windows(config: DictConfig, device: torch.device) -> None:

@@ -1,23 +1,20 @@
 """What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
 
-import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+from omegaconf import MISSING
 
 from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
-from composing.learners import IN_CHECKPOINTS, make_learner, make_schedule
+from composing.learners import make_learner
 from composing.saved import trained_config
-from composing.schema import (
-    EvaluateConfig,
-    PerceptionConfig,
-    RunConfig,
-    WorldModelRunConfig,
-    is_race,
-)
+from composing.schema import RunConfig, WorldModelRunConfig, is_race
+from dreamer_racing.commands import from_here
 from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track
@@ -36,11 +33,31 @@ from dreamer_racing.learners.learner import Evaluable, Learner
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
+from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
 from dreamer_racing.training.directory import RunDirectory, ensure_writable
+from dreamer_racing.training.schedule import Schedule
 
 BEGUN = ".begun"
 """File by which a process claims a folder for what it is about to measure."""
+
+
+@dataclass
+class FlightConfig:
+    """What recipes that fly a trained policy have in common."""
+
+    checkpoint: str = MISSING  # run directory, checkpoint, or agent (docs/agents.md)
+    weights: str = "auto"  # auto | averaged | trained: which to fly; auto takes the averaged where they are kept
+    episodes: int = setting(100, COUNT)  # of each condition
+    # flown side by side; null: every episode has a world of its own, so that every policy meets the same races
+    num_envs: int | None = setting(None, COUNT)
+    track: str | None = None  # null: the track it was trained on
+    decoys: str | None = None  # +decoys=paper | none; null: as it was trained
+    preset: str | None = None  # null: the physics it was trained on
+    run_dir: str | None = None  # null: in the run of the checkpoint
+    device: str = "auto"
+    renderer: str = "auto"
+    seed: int = setting(0, SEED)
 
 
 @dataclass
@@ -67,7 +84,7 @@ class Restored:
             return hash_weights(ActorStep(self.flyer.flying_agent))
         return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
 
-    def provenance(self, config: EvaluateConfig | PerceptionConfig, seconds: float) -> dict[str, Any]:
+    def provenance(self, config: FlightConfig, seconds: float) -> dict[str, Any]:
         """Say how the numbers of an evaluation of so many seconds came about."""
         return {
             "command": command_line(),
@@ -92,7 +109,7 @@ class Restored:
         }
 
 
-def restore(config: EvaluateConfig | PerceptionConfig) -> Restored:
+def restore(config: FlightConfig) -> Restored:
     """Bring back the policy of a checkpoint, for the race that the configuration names.
 
     Raises:
@@ -165,34 +182,24 @@ def results_of(checkpoint: Path) -> Path:
 def fresh_directory(path: str | Path, result: str) -> Path:
     """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
 
-    So nothing is mixed with what an earlier evaluation left, or one that was killed.
+    So nothing is mixed with what an earlier evaluation left, or one that was killed, or another that goes on.
 
     Args:
         path: the folder asked for.
         result: name of the file that is written last.
     """
-    asked = directory = Path(path).expanduser().absolute()
-    number = 1
-    while not _claimed(directory):
-        number += 1
-        directory = asked.with_name(f"{asked.name}_{number}")
-    if number > 1:
+    asked = Path(path).expanduser().absolute()
+    for number in count(1):
+        directory = asked if number == 1 else asked.with_name(f"{asked.name}_{number}")
+        if not (directory.is_dir() and any(directory.iterdir())):
+            ensure_writable(directory)
+            with suppress(FileExistsError):  # another process has just claimed it
+                (directory / BEGUN).touch(exist_ok=False)
+                break
+    if directory != asked:
         held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
-        here, there = (os.path.relpath(one) if one.is_relative_to(Path.cwd()) else one for one in (asked, directory))
-        print(f"{here} holds {held}, which is kept: writing to {there}")
+        print(f"{from_here(asked)} holds {held}, which is kept: writing to {from_here(directory)}")
     return directory
-
-
-def _claimed(directory: Path) -> bool:
-    """Claim a folder that holds nothing, for this process alone; return whether it could."""
-    if directory.is_dir() and any(directory.iterdir()):
-        return False
-    ensure_writable(directory)
-    try:
-        (directory / BEGUN).touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True
 
 
 def heading(title: str, provenance: dict[str, Any]) -> str:
@@ -224,10 +231,10 @@ def restore_learner(
     if not isinstance(config, WorldModelRunConfig):
         load_components(checkpoint, parts, map_location=device)
         return learner, counters
-    schedule = make_schedule(config)  # takes the gates of what is restored
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)  # takes its gates
     load_components(checkpoint, {**parts, "schedule": schedule}, map_location=device)
     # The networks bring theirs, which do not change if the run is made longer.
-    left_out = (*IN_CHECKPOINTS, "start_on_line")
+    left_out = ("min_std", "max_std", "start_on_line")
     numbers = {name: value for name, value in schedule.at(counters["env_steps"]).items() if name not in left_out}
     cast(WorldModelLearner, learner).adjust(**numbers)
     return learner, counters

@@ -1,7 +1,6 @@
 """Configurations of runs, read back: typed as this version knows them, and compared."""
 
 from collections.abc import Collection
-from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -9,8 +8,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from composing.command_line import override_key
-from composing.schema import RECIPES, RunConfig, WorldModelRunConfig
+from composing.schema import RECIPES, RunConfig
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.settings import shortened
 from dreamer_racing.training.directory import RunDirectory
@@ -24,42 +22,32 @@ OF_THIS_MACHINE = (
     "run_dir",
 )
 """What a run that is resumed chooses anew, unless it was begun with a choice."""
+SEEN = ("env.control_rate", "env.camera_rate", "env.camera_tilt", "env.imu", "env.vector")
+"""What an agent sees, and how often: other networks would learn from it."""
 
 Config = TypeVar("Config", DictConfig, ListConfig)
 
 
 def trained_config(run_dir: Path) -> RunConfig:
-    """Read back the configuration that a run was trained with.
+    """Read back the configuration that a run was trained with, as `saved_config` does."""
+    return cast(RunConfig, OmegaConf.to_object(saved_config(run_dir)))
+
+
+def saved_config(run_dir: Path) -> DictConfig:
+    """Read back what a run was last trained with, resolved; what it does not say is at its default.
 
     Raises:
-        ValueError: by an unknown algorithm.
+        ValueError: it is damaged, of an unknown algorithm, or has a setting that this version does not.
     """
     path = RunDirectory(run_dir).config
     saved = read_yaml(path, DictConfig)
-    algorithm = str(saved.get("algorithm", WorldModelRunConfig.algorithm))
-    if algorithm not in RECIPES:
+    if (algorithm := str(saved.get("algorithm"))) not in RECIPES:
         raise ValueError(f"{path}: algorithm={shortened(algorithm)}; there are {', '.join(RECIPES)}.")
-    return cast(RunConfig, OmegaConf.to_object(whole(with_schema(saved, algorithm), path)))
-
-
-def with_schema(saved: DictConfig, algorithm: str) -> DictConfig:
-    """Type a saved configuration: what it does not say is at its default, what is unknown here is left out."""
-    schema = OmegaConf.structured(RECIPES[algorithm])
-    if unknown := drop_unknown(saved, schema):
-        print(f"settings of another version, left out: {', '.join(unknown)}")
     try:
-        return cast(DictConfig, OmegaConf.merge(schema, saved))
+        config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(RECIPES[algorithm]), saved))
     except OmegaConfBaseException as error:
-        reason = str(error).replace("\n", " ")
-        raise ValueError(f"The configuration of a saved run does not fit: {shortened(reason, 300)}") from error
-
-
-def whole(config: DictConfig, path: Path) -> DictConfig:
-    """Return a configuration that was read from a path, if it says all that has no default.
-
-    Raises:
-        ValueError: it does not.
-    """
+        reason = shortened(" ".join(str(error).split()), 300)
+        raise ValueError(f"{path} does not fit: {reason}. The run is of another version: its own reads it.") from error
     if missing := sorted(OmegaConf.missing_keys(config)):
         raise ValueError(f"{path} is damaged: it does not say {shortened(', '.join(missing))}.")
     return config
@@ -69,7 +57,8 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
     """Read a file that a run left.
 
     Raises:
-        ValueError: it is damaged, is not that at all, or refers to what lies outside of it.
+        ValueError: it is damaged, is not that at all, or refers to what lies outside of it, as a run never writes and a
+            stranger might: ``${oc.env:NAME}`` would read this machine's environment.
     """
     try:
         content = OmegaConf.load(path)
@@ -78,44 +67,14 @@ def read_yaml(path: Path, kind: type[Config]) -> Config:
     if not isinstance(content, kind) or (kind is DictConfig and not content):
         raise ValueError(f"{path} is damaged: it holds no {'list' if kind is ListConfig else 'settings'}.")
     if isinstance(content, DictConfig):
-        refuse_references(content, path)
+        for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(content, resolve=False))):
+            if "${" in str(value):
+                said = shortened(f"{name}: {value}")
+                raise ValueError(f"{path}: {said}. A saved configuration says values, it refers to none.")
     return content
 
 
-def refuse_references(saved: DictConfig, path: Path) -> None:
-    """Refuse what a run never writes and a stranger might: ``${oc.env:NAME}`` would read this machine's environment.
-
-    Raises:
-        ValueError: a value refers to another; the message names it.
-    """
-    for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved, resolve=False))):
-        if "${" in str(value):
-            raise ValueError(
-                f"{path}: {shortened(f'{name}: {value}')}. A saved configuration says values, it refers to none."
-            )
-
-
-def is_known(name: str, schema: DictConfig) -> bool:
-    """Whether a schema has a setting or a group of this dotted name."""
-    first, _, rest = name.partition(".")
-    if first not in set(schema.keys()):
-        return False
-    inner = schema._get_node(first)
-    return not rest or (isinstance(inner, DictConfig) and is_known(rest, inner))
-
-
-def drop_unknown(saved: DictConfig, schema: DictConfig, prefix: str = "") -> list[str]:
-    """Remove from a saved configuration what a schema does not have; return `name=value` of each."""
-    unknown = [name for name in map(str, saved) if name not in set(schema.keys())]  # `in` overlooks what is missing
-    dropped = [f"{prefix}{name}={saved.pop(name)}" for name in unknown]
-    for name in map(str, saved):
-        inner, known = saved[name], schema._get_node(name)
-        if isinstance(inner, DictConfig) and isinstance(known, DictConfig):
-            dropped += drop_unknown(inner, known, f"{prefix}{name}.")
-    return dropped
-
-
-def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str], prefix: str = "") -> None:
+def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str]) -> None:
     """Set everything in a composed configuration to what was saved, but for `OF_THIS_MACHINE` and what is given now.
 
     So a run goes on as it was trained, whatever the defaults of a later version.
@@ -124,67 +83,29 @@ def keep_saved(config: DictConfig, saved: DictConfig, given: Collection[str], pr
         config: of the run that goes on, which is changed.
         saved: of the run as it was.
         given: names of settings and groups; `tuned` and `budget` are everything.
-        prefix: of the names in this group.
     """
-    for key, value in saved.items():
-        name = prefix + str(key)
-        parents = {name[:end] for end, letter in enumerate(name) if letter == "."}
-        if not {name, "tuned", "budget", *parents}.isdisjoint(given) or name in OF_THIS_MACHINE:
-            continue
-        if isinstance(value, DictConfig) and isinstance(inner := config[key], DictConfig):
-            keep_saved(inner, value, given, f"{name}.")
-        else:
-            config[key] = value
+    if {"tuned", "budget"}.isdisjoint(given):
+        for name, value in flatten(cast(dict[str, Any], OmegaConf.to_container(saved))):
+            is_given = any(name == other or name.startswith(f"{other}.") for other in given)
+            if not is_given and name not in OF_THIS_MACHINE:
+                OmegaConf.update(config, name, value)
 
 
-def begun_with(algorithm: str, run_dir: Path) -> list[str]:
-    """Overrides that a run was begun with, as this version knows them; what it does not know is left out and named."""
-    schema = OmegaConf.structured(RECIPES[algorithm])
-    overrides = [str(override) for override in read_yaml(RunDirectory(run_dir).overrides, ListConfig)]
-    known = [override for override in overrides if is_known(override_key(override), schema)]
-    if unknown := [override for override in overrides if override not in known]:
-        print(f"overrides of another version, left out: {', '.join(unknown)}")
-    return [override for override in known if override_key(override) != "run_dir"]
+def settings_of(config: DictConfig) -> dict[str, Any]:
+    """Return all settings by their dotted names, with values as files have them."""
+    return dict(flatten(cast(dict[str, Any], OmegaConf.to_container(config, enum_to_str=True))))
 
 
-def saved_config(algorithm: str, run_dir: Path) -> DictConfig:
-    """What a run was last trained with, resolved; what older runs do not say is at its default.
-
-    Raises:
-        ValueError: it is another algorithm's run.
-    """
-    path = RunDirectory(run_dir).config
-    saved = read_yaml(path, DictConfig)
-    trained_by = saved.get("algorithm", algorithm)
-    if trained_by != algorithm:
-        raise ValueError(f"{run_dir} was trained by {trained_by}: continue it with recipes/{trained_by}.py.")
-    config = whole(with_schema(saved, algorithm), path)
-    if "tuned" in config and "tuned" not in saved:
-        config.tuned = "none"  # begun before there was a choice
-    return config
+def said(value: Any) -> str:
+    """Write a value of `settings_of` as the command line takes it."""
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def changed_settings(config: DictConfig) -> list[str]:
     """Every setting in which a resumed run goes on differently: by an override, this machine, or another version."""
-    before = flat_settings(saved_config(config.algorithm, Path(config.run_dir)))
-
-    def word(value: Any) -> str:
-        return "null" if value is None else str(value.value if isinstance(value, Enum) else value)
-
+    before = settings_of(saved_config(Path(config.run_dir)))
     return [
-        f"{name}={word(value)} (was {word(before.get(name))})"
-        for name, value in flat_settings(config).items()
+        f"{name}={said(value)} (was {said(before.get(name))})"
+        for name, value in settings_of(config).items()
         if value != before.get(name) and name not in ("resume", "run_dir", "track_description")
     ]
-
-
-def flat_settings(config: DictConfig) -> dict[str, Any]:
-    """Values by dotted name."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        name = str(key)
-        if isinstance(value, DictConfig):
-            flat |= {f"{name}.{inner}": leaf for inner, leaf in flat_settings(value).items()}
-        else:
-            flat[name] = value
-    return flat

@@ -6,11 +6,11 @@ not depend on how many processes there are, and a run may go on with another num
 
 from __future__ import annotations
 
-import copy
 import os
-from typing import Any
+from typing import cast
 
 import torch
+from omegaconf import OmegaConf
 
 from composing.schema import LatentPPORunConfig, WorldModelRunConfig
 from dreamer_racing import parallel
@@ -34,22 +34,24 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
     if processes == 1:
         return config
     check_devices(config)
-    check_captured(config)
-    own = copy.deepcopy(config)
-    for name in DIVIDED + (OF_PPO if isinstance(config, LatentPPORunConfig) else ()):
-        part, key = _place(own, name)
-        whole = getattr(part, key)
-        if whole is not None:
-            if whole % processes:
-                raise ValueError(
-                    f"{name}={whole} cannot be shared equally by {processes} processes: make it a multiple of "
-                    f"{processes}, e.g. {name}={-(-whole // processes) * processes}, or start another number of them "
-                    "by --nproc-per-node."
-                )
-            setattr(part, key, whole // processes)
-    for name in ROUNDED_DOWN:
-        part, key = _place(own, name)
-        setattr(part, key, getattr(part, key) // processes)
+    if not isinstance(config, LatentPPORunConfig) and config.model.cuda_graph:
+        raise ValueError(
+            f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns of {processes} processes "
+            "in the midst of an update. Set it to false, or use recipes/latent_ppo.py, which imagines nothing."
+        )
+    shared = OmegaConf.structured(config)
+    for name in DIVIDED + (OF_PPO if isinstance(config, LatentPPORunConfig) else ()) + ROUNDED_DOWN:
+        whole = OmegaConf.select(shared, name)
+        if whole is None:
+            continue
+        if whole % processes and name not in ROUNDED_DOWN:
+            raise ValueError(
+                f"{name}={whole} cannot be shared equally by {processes} processes: make it a multiple of "
+                f"{processes}, e.g. {name}={-(-whole // processes) * processes}, or start another number of them "
+                "by --nproc-per-node."
+            )
+        OmegaConf.update(shared, name, whole // processes)
+    own = cast(WorldModelRunConfig, OmegaConf.to_object(shared))
     assert config.replay.held_out is not None, "resolve() says"
     if config.replay.held_out >= own.env.num_envs:
         raise ValueError(
@@ -65,11 +67,7 @@ def share_of(config: WorldModelRunConfig) -> WorldModelRunConfig:
 
 
 def check_devices(config: WorldModelRunConfig) -> None:
-    """Refuse more processes than CUDA devices on this machine, and to have them all on one.
-
-    Raises:
-        ValueError: the message says what there is.
-    """
+    """Refuse more processes than CUDA devices on this machine, and to have them all on one."""
     here, there = parallel.count_here(), torch.cuda.device_count()
     for name, device in (("device", config.device), ("env.device", config.env.device)):
         if not device.startswith("cuda"):
@@ -86,27 +84,6 @@ def check_devices(config: WorldModelRunConfig) -> None:
             )
 
 
-def check_captured(config: WorldModelRunConfig) -> None:
-    """Refuse to capture updates that exchange imagined returns on their way.
-
-    Raises:
-        ValueError: the message names the settings.
-    """
-    if not isinstance(config, LatentPPORunConfig) and config.model.cuda_graph:
-        raise ValueError(
-            f"model.cuda_graph=true: {config.algorithm} exchanges imagined returns of {parallel.count()} processes "
-            "in the midst of an update. Set it to false, or use recipes/latent_ppo.py, which imagines nothing."
-        )
-
-
 def _own_device(device: str) -> str:
     """The device of this process, of a kind."""
     return f"cuda:{os.environ['LOCAL_RANK']}" if device.startswith("cuda") else device
-
-
-def _place(config: Any, name: str) -> tuple[Any, str]:
-    """The group in which a setting of a dotted name is, and its name there."""
-    *groups, key = name.split(".")
-    for group in groups:
-        config = getattr(config, group)
-    return config, key

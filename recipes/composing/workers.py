@@ -11,7 +11,7 @@ from torchrl.envs import TensorDictPrimer, TransformedEnv
 from composing.arena import Environment, make_env, worlds_device
 from composing.building import make_collector
 from composing.learners import make_agent
-from composing.schema import CollectorKind, WorkersConfig, WorldModelRunConfig, is_race
+from composing.schema import CollectorKind, WorldModelRunConfig, is_race
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
 from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
@@ -26,19 +26,12 @@ OF_RACES = ("body_rate_weight", "worlds.start_on_line")
 """What a run changes in its race on the way, by the curriculum and by a schedule."""
 
 
-def place_worlds(config: DictConfig) -> None:
-    """Choose where worlds live that are stepped beside the learner, and say so."""
-    if config.env.device == "auto" and config.collector is CollectorKind.overlapped:
-        config.env.device = "cpu"
-        print("worlds: cpu (collector=overlapped)")
-
-
 def resolve_workers(config: DictConfig) -> None:
     """Say how many workers there are, where that is left open; a run that goes on without any needs no number."""
     if config.collector is CollectorKind.ray:
         config.num_workers = NUM_WORKERS if config.num_workers is None else config.num_workers
     elif config.resume:
-        default = OmegaConf.structured(WorkersConfig)
+        default = OmegaConf.structured(ray_cluster.WorkersConfig)
         left_out = [] if config.num_workers is None else [f"num_workers={config.num_workers}"]
         left_out += [f"workers.{name}={value}" for name, value in config.workers.items() if value != default[name]]
         if left_out:
@@ -83,7 +76,7 @@ def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerP
         partial(make_worker_env, own, flying.make_primer()),
         flying,
         workers=workers,
-        share=ray_cluster.Share(asked.cpus, asked.gpus),
+        share=asked,
         env_device=own.env.device,
         frames=own.env.num_envs * config.rollout_steps,
         seed=config.seed,

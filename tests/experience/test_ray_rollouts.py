@@ -21,7 +21,8 @@ from torch import nn
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.experience.ray_arrays import as_arrays, as_tensors, pack_rollout, unpack_rollout
-from dreamer_racing.experience.ray_cluster import Share, check_resources, check_versions, join, start_workers
+from dreamer_racing.experience.ray_cluster import WorkersConfig as Share
+from dreamer_racing.experience.ray_cluster import check_resources, check_versions, join, start_workers
 from dreamer_racing.experience.ray_rollouts import RayRollouts, WorkerError, check_interval
 from dreamer_racing.experience.ray_worker import RayWorker, Request
 from dreamer_racing.experience.replay import make_replay

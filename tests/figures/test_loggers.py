@@ -12,11 +12,12 @@ import pytest
 from PIL import Image
 
 from dreamer_racing.figures.film import write_video
-from dreamer_racing.figures.loggers import make_loggers, read_film
+from dreamer_racing.figures.loggers import LoggerConfig, Wandb, make_loggers, read_film
 from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog
 
+OFFLINE = LoggerConfig(tensorboard=False, wandb=Wandb.offline)
 SETTINGS = {"seed": 3, "track": "circle", "env.decoys": None, "curriculum.relabel": True, "model.size": "cpu_small"}
 
 
@@ -42,7 +43,7 @@ def events_of(run_dir: Path):
 
 
 def test_tensorboard_shows_configuration_plots_and_films(run_dir):
-    (sink,) = make_loggers(run_dir, tensorboard=True)
+    (sink,) = make_loggers(run_dir, LoggerConfig())
     sink.log_configuration(SETTINGS, "seed: 3\ntrack: circle\n")
     with MetricsLog(run_dir, [sink]) as log:
         log_evaluation(log.loggers, RunDirectory(run_dir), 2000)
@@ -66,7 +67,7 @@ def test_tensorboard_compares_hyperparameters_of_one_run_a_run(run_dir):
     from tensorboard.plugins.hparams import plugin_data_pb2
 
     for resumed in (None, 100):
-        (sink,) = make_loggers(run_dir, tensorboard=True, resume_env_steps=resumed)
+        (sink,) = make_loggers(run_dir, LoggerConfig(), resumed)
         sink.log_configuration(SETTINGS, "")
         sink.experiment.close()
     content = events_of(run_dir).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
@@ -91,19 +92,17 @@ def test_other_loggers_need_not_know_of_films(run_dir, tmp_path):
 
 
 def test_what_is_not_there_is_refused(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="wandb=cloud: there are none, offline, online"):
-        make_loggers(tmp_path, wandb="cloud")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"needs the package wandb: .*pip install .*\[wandb\]'"):
-        make_loggers(tmp_path, wandb="offline")
-    assert make_loggers(tmp_path) == []
+        make_loggers(tmp_path, OFFLINE)
+    assert make_loggers(tmp_path, LoggerConfig(tensorboard=False)) == []
 
 
 def test_wandb_offline_keeps_all_and_a_resumed_run_is_the_same_run(run_dir, monkeypatch):
     pytest.importorskip("wandb", reason="pip install 'dreamer_racing[wandb]'")
     monkeypatch.setenv("WANDB_MODE", "online")  # what the configuration says counts; restored after the test
     for resumed in (None, 1000):
-        (sink,) = make_loggers(run_dir, wandb="offline", resume_env_steps=resumed)
+        (sink,) = make_loggers(run_dir, OFFLINE, resumed)
         assert sink.experiment.settings.mode in ("offline", "dryrun") and sink.experiment.offline
         sink.log_configuration(SETTINGS, "")
         with MetricsLog(run_dir, [sink], resumed) as log:
@@ -117,6 +116,6 @@ def test_wandb_offline_keeps_all_and_a_resumed_run_is_the_same_run(run_dir, monk
     assert len(kept) in (1, 2) and all(list(place.glob("*.wandb")) for place in kept)  # 1: both in one second
     media = [file.suffix for file in (run_dir / "wandb").rglob("files/media/**/*") if file.is_file()]
     assert sorted(media) == [".mp4", ".png", ".png"]
-    (other,) = make_loggers(run_dir, wandb="offline")  # a new run in the same place
+    (other,) = make_loggers(run_dir, OFFLINE)  # a new run in the same place
     assert other.experiment.id != name
     other.experiment.finish()

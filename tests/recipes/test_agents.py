@@ -131,13 +131,13 @@ def test_what_an_agent_cannot_fly_is_refused(
 
 @pytest.mark.slow
 def test_weights_that_an_agent_does_not_hold_are_refused(agent: Path) -> None:
-    settings = recipe_module("composing.schema").EvaluateConfig(checkpoint=str(agent), weights="trained", device="cpu")
+    settings = recipe_module("composing.restoring").FlightConfig(checkpoint=str(agent), weights="trained", device="cpu")
     with pytest.raises(ValueError, match="weights=trained: .*mine holds the averaged weights only"):
         recipe_module("composing.restoring").restore(settings)
 
 
 def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> None:
-    fly, export, schema = (recipe_module(name) for name in ("fly", "export", "composing.schema"))
+    fly, export = map(recipe_module, ("fly", "export"))
     with pytest.raises(ValueError, match="pilot=hover and agent=kidney: give one of them"):
         fly.check(fly.FlyConfig(agent="kidney", pilot="hover"))
     with pytest.raises(ValueError, match="pilot=human: there are scripted, hover, keyboard, gamepad"):
@@ -150,7 +150,7 @@ def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> N
         ({"agent": "new"}, "checkpoint=there is an agent already"),
     ):
         with pytest.raises(ValueError, match=words):
-            export.check_agent(schema.ExportConfig(checkpoint="there", **settings), tmp_path)
+            export.check_agent(export.ExportConfig(checkpoint="there", **settings), tmp_path)
 
 
 def test_an_unknown_agent_gets_the_names_of_those_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

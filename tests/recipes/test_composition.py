@@ -14,7 +14,7 @@ from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.figures.runs import flatten
 from dreamer_racing.modules import Interface
 from dreamer_racing.training.gate_pass_rate import GatePassRate
-from dreamer_racing.training.schedule import RampClock
+from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, RampClock, Schedule
 from tests.running_recipes import CONFIG, EXPERIMENTS, build, compose, prepared, recipe_module
 
 
@@ -33,7 +33,7 @@ def test_every_variant_of_an_experiment_is_a_run_that_differs_from_the_others(ex
     settings = set()
     for changes in variants.values():
         resolved = recipe.resolve(compose(algorithm, "device=cpu", "run_dir=run", *changes, *overrides))
-        checks.check_world_model_run(OmegaConf.to_object(resolved))
+        checks.check(OmegaConf.to_object(resolved))
         settings.add(OmegaConf.to_yaml(resolved))
     assert len(settings) == len(variants)
     swept = OmegaConf.load(CONFIG / f"{experiment}.yaml").hydra.sweeper.params.variant
@@ -137,7 +137,7 @@ def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
     config = resolved_on("cuda", monkeypatch, *overrides)
     model = config.model
     assert (model.size, model.batch_size, model.batch_length, config.replay.context, model.cuda_graph) == expected
-    recipe_module("composing.checks").check_world_model_run(OmegaConf.to_object(config))
+    recipe_module("composing.checks").check(OmegaConf.to_object(config))
 
 
 def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +172,7 @@ def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[
 )
 def test_what_races_goes_with_other_actors(name: str, override: str) -> None:
     config = recipe_module(name).resolve(compose(name, "tuned=race", override))
-    recipe_module("composing.checks").check_world_model_run(OmegaConf.to_object(config))
+    recipe_module("composing.checks").check(OmegaConf.to_object(config))
 
 
 def test_settings_that_race_yield_to_the_command_line() -> None:
@@ -238,7 +238,7 @@ def test_dreamer_as_published_is_one_word_away() -> None:
     ) | {"num_envs": None}
     assert faithful.model.sampled and faithful.model.average_rate is None and not faithful.replay.context
     schedule = OmegaConf.to_container(faithful.schedule)
-    assert schedule == OmegaConf.to_container(OmegaConf.structured(schema.DreamerV3ScheduleConfig))
+    assert schedule == OmegaConf.to_container(OmegaConf.structured(DreamerV3ScheduleConfig))
     assert all(ramp["to"] is None for ramp in schedule.values())
 
 
@@ -260,7 +260,7 @@ def test_dreamer_as_published_is_one_word_away() -> None:
 def test_what_learns_is_chosen_where_it_does(
     overrides: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert recipe_module("dreamer_v3").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
+    assert recipe_module("composing.resolving").tune(compose("dreamer_v3", *overrides, "device=cpu")) == expected
     told = capsys.readouterr().out
     assert ("settings: tuned=none, the algorithm as published: none are chosen for" in told) == (expected == "none")
 
@@ -279,11 +279,10 @@ def test_a_gpu_trains_by_the_settings_that_are_known_and_says_first_what_is_not(
     assert "none are chosen for model=size12m" in capsys.readouterr().out
 
 
-def test_settings_that_another_version_had_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
-    saved = OmegaConf.create({"algorithm": "dreamer_v3", "model": {"size": "debug", "decay_updates": 8}, "old": 1})
-    config = recipe_module("composing.saved").with_schema(saved, "dreamer_v3")
-    assert config.model.size == "debug" and "decay_updates" not in config.model
-    assert "settings of another version, left out: old=1, model.decay_updates=8" in capsys.readouterr().out
+def test_a_run_with_a_setting_of_another_version_is_refused_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("{algorithm: dreamer_v3, model: {size: debug, decay_updates: 8}}")
+    with pytest.raises(ValueError, match=r"does not fit: Key 'decay_updates' .*The run is of another version"):
+        recipe_module("composing.saved").saved_config(tmp_path)
 
 
 def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
@@ -298,8 +297,8 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    recipe_module("composing.checks").check_world_model_run(config)
-    schedule = recipe_module("composing.learners").make_schedule(config)
+    recipe_module("composing.checks").check(config)
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)
     schedule.pass_rate = GatePassRate(num_gates=1)
     assert schedule.at(100_000)["min_std"] == pytest.approx(0.1)
     schedule.pass_rate.best = 0.6
@@ -307,13 +306,13 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
 
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
-    learners, names = recipe_module("composing.learners"), recipe_module("composing.schema").LOSS_RAMPS
-    assert set(names) == {"discount", "entropy_scale", "max_std", "min_std"}
+    learners, names = recipe_module("composing.learners"), ("discount", "entropy_scale", "max_std", "min_std")
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     overrides += ["schedule.imagination_horizon.to=2"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    begin, end = map(learners.make_schedule(config).at, (0, config.total_env_steps))
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)
+    begin, end = map(schedule.at, (0, config.total_env_steps))
     own = {"rates": 1.0, "world_model_rate": 1.0, "imagination_horizon": config.model.imagination_horizon}
     assert begin == own | {name: getattr(config.loss, name) for name in names}
     assert end == dict.fromkeys(("rates", "world_model_rate", *names), 0.5) | {"imagination_horizon": 2}
@@ -329,7 +328,8 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
     found = []
     for name in ("latent_ppo", "dreamer_v3"):
         resolved = recipe_module(name).resolve(compose(name, *overrides))
-        moved = recipe_module("composing.learners").make_schedule(OmegaConf.to_object(resolved)).at(0)
+        config = OmegaConf.to_object(resolved)
+        moved = Schedule(config.schedule, config.scheduled, config.total_env_steps).at(0)
         found.append(set(moved) - {"rates", "world_model_rate", "start_on_line"})
     assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std", "imagination_horizon"}]
 
@@ -338,7 +338,7 @@ def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
-        recipe_module("composing.checks").check_world_model_run(config)
+        recipe_module("composing.checks").check(config)
 
 
 def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:
@@ -415,7 +415,7 @@ def test_what_is_not_as_tuned_is_said_of_a_file_that_takes_another(capsys: pytes
     assert "as asked for" not in told and "length: 2,500,000 env_steps" in told
     recipe.resolve(compose("latent_ppo", "tuned=images", "device=cpu", "env.control_rate=50", "loss.image_scale=1"))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "as asked for" in line)
-    assert "env.control_rate=50" in line and "(25)" in line and "loss.image_scale=1.0 (0.003)" in line
+    assert "env.control_rate=50.0 (25.0)" in line and "loss.image_scale=1.0 (0.003)" in line
 
 
 def test_settings_are_said_of_the_algorithm_that_is_trained(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from hydra.errors import HydraException
 
+from dreamer_racing.figures.plotting import PlotConfig
 from dreamer_racing.training.model_lag import LOOKS
 from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, recipe, recipe_module
 
@@ -125,10 +126,9 @@ def test_what_is_none_is_refused(overrides: list[str], words: str) -> None:
 
 def test_a_recipe_is_still_its_function(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    start = recipe_module("composing.entry").recipe("plot")(lambda config: seen.append(config.window))
+    start = recipe_module("composing.entry").recipe("plot", PlotConfig)(lambda config: seen.append(config.window))
     monkeypatch.setattr(sys, "argv", ["plot.py", "window=1e3"])
     monkeypatch.setattr(sys, "excepthook", recipe_module("composing.messages").end_quietly)
-    recipe_module("composing.schema").register()
     start()
     assert sys.excepthook is sys.__excepthook__, "what ends while packages are loaded is no concern any more"
     assert seen == [1000.0] and Path(CONFIG).is_dir() and not hydra.core.global_hydra.GlobalHydra().is_initialized()
@@ -207,7 +207,7 @@ SETTINGS = [
 def test_the_actor_waits_while_the_newest_records_are_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.measuring")
+    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.learners")
     config, session = open_session(
         *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}", name="latent_ppo"
     )

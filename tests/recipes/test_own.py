@@ -135,13 +135,13 @@ def test_the_control_suite_has_neither() -> None:
 
 
 def test_what_sees_numbers_of_ones_own_is_not_exported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    exporting, schema = map(recipe_module, ("export", "composing.schema"))
+    exporting = recipe_module("export")
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *RUN, *OWN)))
     monkeypatch.setattr(exporting, "find_trained", lambda name: folder)
     monkeypatch.setattr(exporting, "config_folder", lambda path: path)
     monkeypatch.setattr(exporting, "trained_config", lambda path: config)
     with pytest.raises(ValueError, match=r"env\.vector=my_own:action, which computes from the simulator's state"):
-        exporting.export(schema.ExportConfig(checkpoint="run"))
+        exporting.export(exporting.ExportConfig(checkpoint="run"))
 
 
 # A track of the user's own: a run keeps it as it was, and what comes of the run flies it.

@@ -242,7 +242,6 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
     from composing import checks, command_line, entry, options, schema
     from dreamer_v3 import resolve
 
-    schema.register()
     config_dir = str(ROOT / "recipes" / "config")
     names = options.names("dreamer_v3")
     os.chdir(folder)
@@ -263,7 +262,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
                 checks.check_overrides(config, given)
-                checks.check_world_model_run(cast(schema.WorldModelRunConfig, OmegaConf.to_object(resolve(config))))
+                checks.check(cast(schema.WorldModelRunConfig, OmegaConf.to_object(resolve(config))))
         except HydraException as error:
             return not entry.in_plain_words(error, "dreamer_v3", given)
         except SystemExit as refused:

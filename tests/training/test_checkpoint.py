@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import random
@@ -31,7 +30,7 @@ from dreamer_racing.training.checkpoint import (
     load_state,
     newest_sound,
 )
-from dreamer_racing.training.checksums import CHECKSUMS, HAS_CHECKSUMS, write_checksums
+from dreamer_racing.training.checksums import CHECKSUMS, write_checksums
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
 from dreamer_racing.training.signals import GracefulExit
 from tests.forked import SERVER
@@ -426,23 +425,10 @@ def test_a_damaged_checkpoint_asked_for_is_refused_by_name(saved):
     assert load_components(newest, {"counters": {}})["env_steps"] == 30  # what is read of it is sound
 
 
-def forget_checksums(checkpoint: Path) -> None:
-    """Make a checkpoint as those before there were checksums."""
-    (checkpoint / CHECKSUMS).unlink()
-    manifest = json.loads((checkpoint / "manifest.json").read_text())
-    del manifest["metadata"][HAS_CHECKSUMS]
-    (checkpoint / "manifest.json").write_text(json.dumps(manifest))
-
-
-def test_checkpoints_of_before_there_were_checksums_are_read_with_a_warning(saved, caplog):
+def test_a_file_that_is_no_state_is_refused_though_its_checksum_is_right(saved):
     newest = saved / "checkpoints/checkpoint-000000000030"
-    forget_checksums(newest)
-    with caplog.at_level("WARNING"):
-        assert Run(saved).checkpoints.load()["env_steps"] == 30
-        assert newest_sound(saved) == newest
-    assert caplog.text.count(f"{newest} was saved by a version without checksums") == 1
-    file = next(newest.rglob("*-learner/*.pt"))
-    file.write_bytes(b"not a state" * 100)
+    next(newest.rglob("*-learner/*.pt")).write_bytes(b"not a state" * 100)
+    write_checksums(newest)
     with pytest.raises(RunCheckpointError, match="could not be restored") as error:
         Run(saved).checkpoints.load()
     assert "weights_only" not in str(error.value)
@@ -489,15 +475,11 @@ class Payload:
         return (os.system, (f"touch {self._witness}",))
 
 
-@pytest.mark.parametrize("checksums", ["of the lie", "of no version"])
-def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved, checksums):
+def test_a_malicious_state_is_refused_and_nothing_of_it_is_run(saved):
     newest, witness = saved / "checkpoints/checkpoint-000000000030", saved / "witness"
     file = next(newest.rglob("*-learner/*.pt"))
     torch.save({"weight": Payload(witness)}, file)
-    if checksums == "of the lie":  # whoever can write a file can write its sum
-        write_checksums(newest)
-    else:
-        forget_checksums(newest)
+    write_checksums(newest)  # whoever can write a file can write its sum
     for read in (Run(saved).checkpoints.load, lambda: load_state(newest, "learner")):
         with pytest.raises(RunCheckpointError, match="could not be restored. A file of it holds what is no state"):
             read()

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from dreamer_racing.figures.loggers import make_loggers
+from dreamer_racing.figures.loggers import LoggerConfig, make_loggers
 from dreamer_racing.training import metrics as metrics_module
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
@@ -187,7 +187,7 @@ def test_tensorboard_shows_a_resumed_run_once(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     def fly(resume: int | None, value: float, steps: list[int]) -> None:
-        with MetricsLog(tmp_path, make_loggers(tmp_path, tensorboard=True, resume_env_steps=resume), resume) as log:
+        with MetricsLog(tmp_path, make_loggers(tmp_path, LoggerConfig(), resume), resume) as log:
             for step in steps:
                 log.push({"loss": value})
                 log.write(step)
@@ -202,7 +202,7 @@ def test_tensorboard_shows_a_resumed_run_once(tmp_path):
 def test_tensorboard_is_written_row_by_row(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log = MetricsLog(tmp_path, make_loggers(tmp_path, tensorboard=True))
+    log = MetricsLog(tmp_path, make_loggers(tmp_path, LoggerConfig()))
     log.push({"loss": 1.0})
     log.write(100)
     events = EventAccumulator(str(tmp_path / "tensorboard"))
@@ -214,7 +214,7 @@ def test_tensorboard_is_written_row_by_row(tmp_path):
 def test_tensorboard_goes_on_after_a_write_that_failed(tmp_path, monkeypatch):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    (sink,) = loggers = make_loggers(tmp_path, tensorboard=True)
+    (sink,) = loggers = make_loggers(tmp_path, LoggerConfig())
     log = MetricsLog(tmp_path, loggers)
     for env_steps in (10, 20, 30):
         log.push({"loss": 1.0})
@@ -265,7 +265,7 @@ def test_tensorboard_and_other_loggers_get_every_row(tmp_path):
     from torchrl.record.loggers.csv import CSVLogger
 
     other = CSVLogger(exp_name="other", log_dir=str(tmp_path))
-    with MetricsLog(tmp_path, [other, *make_loggers(tmp_path, tensorboard=True)]) as log:
+    with MetricsLog(tmp_path, [other, *make_loggers(tmp_path, LoggerConfig())]) as log:
         for step in (10, 20):
             log.push({"loss/actor": torch.tensor(step / 10)})
             log.write(step)

@@ -26,6 +26,7 @@ class BodyRateSchedule:
         maximum: cap of b₂, 1/(rad/s).
         window: episodes that the mean is over; no growth before there are as many.
         cooldown: least number of episodes between two growths.
+        relabel: whether rewards of replayed steps are recomputed with today's b₂.
     """
 
     threshold: float = 50.0
@@ -33,6 +34,7 @@ class BodyRateSchedule:
     maximum: float = 0.01
     window: int = 100
     cooldown: int = 100
+    relabel: bool = True
 
 
 class BodyRateCurriculum:
@@ -43,6 +45,7 @@ class BodyRateCurriculum:
 
     Args:
         schedule: its numbers.
+        env: whose `body_rate_weight` is b₂; None: there is no race, and nothing to move.
 
     Raises:
         ValueError: a number is out of its range.
@@ -53,8 +56,9 @@ class BodyRateCurriculum:
         0.002
     """
 
-    def __init__(self, schedule: BodyRateSchedule | None = None) -> None:
+    def __init__(self, schedule: BodyRateSchedule | None = None, env: Any = None) -> None:
         self.schedule = schedule = schedule or BodyRateSchedule()
+        self.env = env
         if schedule.window < 1 or schedule.cooldown < 1 or schedule.increment < 0 or schedule.maximum < 0:
             raise ValueError(
                 "The body-rate curriculum needs window >= 1, cooldown >= 1, increment >= 0 and maximum >= 0, got "
@@ -70,6 +74,13 @@ class BodyRateCurriculum:
         """Today's b₂, 1/(rad/s)."""
         # A product, not a sum of increments: ten times 0.001 shall be 0.01.
         return min(self._growths * self.schedule.increment, self.schedule.maximum)
+
+    def adapt(self, episodes: TensorDictBase) -> dict[str, float]:
+        """Set the penalty of what comes, by finished episodes ``[E]`` with a ``return``; return metrics."""
+        if self.env is None:
+            return {}
+        self.env.body_rate_weight = self.update(episodes["return"])
+        return {"curriculum/body_rate_weight": self.body_rate_weight}
 
     def update(self, episode_returns: Tensor | Sequence[float]) -> float:
         """Accounts for finished training episodes, one by one in the given order.
@@ -99,11 +110,13 @@ class BodyRateCurriculum:
         return {"returns": list(self._returns), "growths": self._growths, "since_growth": self._since_growth}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned, also in worlds that begin anew."""
         self._returns.clear()
         self._returns.extend(state_dict["returns"])
         self._growths = state_dict["growths"]
         self._since_growth = state_dict["since_growth"]
+        if self.env is not None:
+            self.env.body_rate_weight = self.body_rate_weight
 
 
 class RelabelReward(Transform):
