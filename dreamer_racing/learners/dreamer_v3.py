@@ -27,6 +27,7 @@ from dreamer_racing.losses import (
     gradient_of_actions,
     imagine,
     lambda_return,
+    open_loop_loss,
     replay_critic_loss,
 )
 from dreamer_racing.modules import Agent
@@ -85,6 +86,8 @@ class DreamerV3(WorldModelLearner):
         with timed("world_model"):
             losses, latents = self.world_model_loss(batch)
             losses |= self.drift_losses(latents, batch)
+            if numbers.open_loop_steps:
+                losses["loss_open_loop"] = open_loop_loss(model, latents, batch, numbers.open_loop_steps)
         self.note_latents(latents)
 
         with timed("imagine"):

@@ -27,7 +27,7 @@ from dreamer_racing.losses.policy import (
 )
 from dreamer_racing.losses.returns import lambda_return, replay_return, rollout_return
 from dreamer_racing.losses.targets import TARGETS, Barlow, Image, State, Target, Vector, find_targets
-from dreamer_racing.losses.world_model import Latents, WorldModelLoss, kl_losses
+from dreamer_racing.losses.world_model import Latents, WorldModelLoss, kl_losses, open_loop_loss
 
 __all__ = [
     "HORIZON",
@@ -59,6 +59,7 @@ __all__ = [
     "kl_losses",
     "lambda_return",
     "normalized",
+    "open_loop_loss",
     "policy_drift",
     "reinforce",
     "replay_critic_loss",

@@ -102,6 +102,8 @@ class DreamerV3Losses(LossConfig):
         actor: Its objective: ``reinforce``, ``dynamics``, or ``module:function`` of your own.
         return_decay: Decay of the moving percentiles of returns.
         continuation: Whether predicted ends of episodes cut imagined returns.
+        open_loop_steps: Steps ahead for which rewards and ends are learned from replayed actions alone, as imagination
+            reads them (`open_loop_loss`); 0, as in the reference: only where latents were observed.
         actor_begin: Updates after which the actor begins to learn. The gradient of the dynamics is followed as surely
             where the model is wrong: an actor that begins with the model is soon saturated. The reference has 0.
     """
@@ -109,6 +111,7 @@ class DreamerV3Losses(LossConfig):
     actor: str = "reinforce"
     return_decay: float = setting(0.99, SHARE)
     continuation: bool = True
+    open_loop_steps: int = setting(0, NOT_NEGATIVE)
     actor_begin: int = setting(0, NOT_NEGATIVE)
 
 

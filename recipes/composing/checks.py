@@ -212,6 +212,10 @@ def check_world_model(config: WorldModelRunConfig) -> None:
             f"and the first update needs windows of model.batch_length={length}: prefill must be at least "
             f"{env.num_envs * length}."
         )
+    if isinstance(config, DreamerV3RunConfig) and (steps := config.loss.open_loop_steps) >= length:
+        raise ValueError(
+            f"loss.open_loop_steps={steps} must be less than the records of a window, model.batch_length={length}."
+        )
 
 
 def check_collector(config: WorldModelRunConfig) -> None:

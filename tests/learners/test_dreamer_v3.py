@@ -392,6 +392,14 @@ def test_what_is_scheduled_reaches_optimiser_and_losses_and_stays():
         learner.adjust(world_model_rate=0.1)
 
 
+def test_rewards_ahead_are_part_of_the_loss_where_they_are_asked_for():
+    metrics = learner_of(seed=0, **CONFIG, open_loop_steps=3).update(make_batch())
+    parts = sum(value for key, value in metrics.items() if key.startswith("loss_"))
+    torch.testing.assert_close(metrics["loss"], parts)
+    assert metrics["loss_open_loop"] > 0
+    assert "loss_open_loop" not in learner_of(seed=0, **CONFIG).update(make_batch())
+
+
 def test_the_horizon_is_moved_from_the_next_update_on():
     learner, lengths = learner_of(seed=0, **CONFIG), []
     objective = learner.objective

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives.dreamer_v3 import categorical_kl_terms
 
-from dreamer_racing.losses import TARGETS, LossConfig, WorldModelLoss, kl_losses
+from dreamer_racing.losses import TARGETS, LossConfig, WorldModelLoss, kl_losses, open_loop_loss
 from dreamer_racing.modules import SIZES, Agent, Interface
 from tests.dreamers import latent_ppo_of, learner_of
 from tests.learners.test_dreamer_v3 import make_batch
@@ -112,6 +112,37 @@ def test_continue_target_is_one_minus_terminated():
     loss = WorldModelLoss(agent, LossConfig())(batch)[0]["loss_continue"]
     expected = -(7 * math.log(0.75) + 1 * math.log(0.25)) / 8
     assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_rewards_and_ends_ahead_are_learned_within_an_episode():
+    agent = Agent(SIZES["debug"], Interface())
+    output = agent.world_model.continue_head.mlp.output
+    with torch.no_grad():
+        output.weight.zero_()
+        output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
+    batch = make_windows()  # an episode begins at the third record of the first window, behind one that ended
+    latents = WorldModelLoss(agent, LossConfig())(batch)[1]
+    loss = open_loop_loss(agent.world_model, latents, batch, steps=2)
+    within = 1 + 4  # from the first window the end of its first episode, from both starts of the second both steps
+    expected = math.log(255) - (4 * math.log(0.75) + 1 * math.log(0.25)) / within
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_dynamics_learn_from_rewards_ahead():
+    agent, batch = Agent(SIZES["debug"], Interface()), make_windows()
+    with torch.no_grad():
+        agent.world_model.reward_head.mlp.output.weight.normal_()  # zero at first, which hides what lies below
+    latents = WorldModelLoss(agent, LossConfig())(batch)[1]
+    open_loop_loss(agent.world_model, latents, batch, steps=3).backward()
+    for network in (agent.world_model.rssm.prior, agent.world_model.rssm.cell, agent.world_model.encoder):
+        assert any(parameter.grad.abs().sum() > 0 for parameter in network.parameters())
+
+
+def test_windows_must_be_longer_than_what_is_predicted_ahead():
+    agent, batch = Agent(SIZES["debug"], Interface()), make_windows()
+    latents = WorldModelLoss(agent, LossConfig())(batch)[1]
+    with pytest.raises(ValueError, match=r"open_loop_steps=4 must be less than the 4 records of a window"):
+        open_loop_loss(agent.world_model, latents, batch, steps=4)
 
 
 @pytest.mark.parametrize("image_size", [32, 64, 96])

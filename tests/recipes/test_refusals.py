@@ -92,6 +92,7 @@ REFUSED = [
     (["env=dmc", "loss.critic=state"], ["loss.critic=state: read", "loss.critic=latent"]),
     (["schedule.world_model_rate.to=0"], ["schedule.world_model_rate.to=0.0: must be above 0"]),
     (["schedule.imagination_horizon.to=0"], ["schedule.imagination_horizon.to=0.0: must be at least 1"]),
+    (["loss.open_loop_steps=16"], ["loss.open_loop_steps=16", "less than", "model.batch_length=16"]),
     (["loss.ppo.steps=0"], ["loss.ppo.steps=0: must be at least 1"]),
     (["loss.ppo.kl_target=0.03"], ["loss.ppo.kl_stop=0.03 ends updates before loss.ppo.kl_target=0.03"]),
     (
