@@ -20,9 +20,8 @@ from dreamer_racing.modules.rssm import mix_uniform
 from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
-
 OPEN_LOOP_STARTS = 64
-"""Records of a batch from which rewards and ends are predicted ahead: with 320 the update takes a tenth longer."""
+"""Records of a batch from which rewards and ends are predicted ahead."""
 
 
 class Latents(NamedTuple):
@@ -165,9 +164,8 @@ def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, s
         features.append(join_features(belief, state))
         weights.append(within)
     predicted, weight = torch.stack(features), torch.stack(weights)  # (K, N, F), (K, N, 1)
-    reward, terminated = (
-        torch.stack([ahead(batch[key].float(), step) for step in range(1, steps + 1)]) for key in ("reward", "terminated")
-    )
+    reward = torch.stack([ahead(batch["reward"], step) for step in range(1, steps + 1)])
+    terminated = torch.stack([ahead(batch["terminated"].float(), step) for step in range(1, steps + 1)])
     head = model.reward_head
     rewards = head.two_hot.cross_entropy(head(predicted).log_softmax(-1), reward).view_as(weight)
     ends = F.binary_cross_entropy_with_logits(model.continue_head(predicted), 1.0 - terminated, reduction="none")
