@@ -17,6 +17,7 @@ from composing.arena import imu_of, track_as_begun
 from composing.command_line import override_key
 from composing.schema import (
     CollectorKind,
+    DreamerV3RunConfig,
     PPORunConfig,
     ReplayRunConfig,
     RunConfig,
