@@ -161,7 +161,7 @@ def test_every_option_takes_a_value_or_refuses_it_in_plain_words(
     options = names(recipe)
 
     @given(st.sampled_from(options), values)
-    @hypothesis_settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+    @hypothesis_settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
     def attempt(name: str, value: str) -> None:
         override = entry.readable(f"{name}={value}")
         capsys.readouterr()
