@@ -56,6 +56,7 @@ LimitsConfig = make_dataclass(
         (name, float | None if kind in (float, int) else list[float] | None, field(default=None))
         for name, kind in get_type_hints(SafetyLimits).items()
     ],
+    namespace={"__module__": __name__},  # so that it can be pickled
 )
 """`SafetyLimits` by their names; null: the default, or what the track says."""
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_racing.evaluation.trajectory import Trajectory, write_flight
+from dreamer_racing.settings import check_settings
 from tests.figures.test_dashboard import circling
 from tests.running_recipes import recipe, recipe_module
 
@@ -75,13 +76,17 @@ def test_agents_that_ship_go_by_their_names(runs: Path) -> None:
         ({}, "neither is given"),
         ({"run": "runs/a", "agent": "kidney"}, "both are given, runs/a and kidney"),
         ({"run": "runs/a", "output": "page.pdf"}, "output=page.pdf: .* ends in .html"),
-        ({"run": "runs/a", "serve": 0}, "serve=0: must be at least 1 and at most 65535"),
     ],
     ids=lambda value: " ".join(value) or "nothing" if isinstance(value, dict) else None,
 )
 def test_it_must_be_clear_what_is_meant(settings: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         recipe_module("dashboard").check(config(**settings))
+
+
+def test_a_port_is_in_its_range() -> None:
+    with pytest.raises(ValueError, match="serve=0: must be at least 1 and at most 65535"):
+        check_settings(config(run="runs/a", serve=0))
 
 
 def test_what_holds_no_flight_is_refused_with_what_would_be_right(runs: Path) -> None:
