@@ -52,19 +52,20 @@ one. All runs were evaluated like this at their end, unless a table says otherwi
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, deterministic |
-| sampled | success of the stochastic policy |
-| seed | the number of a training: two seeds are two trainings |
+| success | share of flights that finish three laps, each from another randomised start, by the policy's mean action |
+| sampled | success with actions drawn from the policy's distribution |
+| seed | the number that a training's random draws follow from: two seeds are two trainings |
 | minutes | of one core of an AMD EPYC or an Intel Xeon, for the whole training |
 | state decoded | in training the world model learns the true state; in flight the agent sees images alone |
-| from state | the agent sees 21 numbers of the true state instead of images |
 | stopped | ended by hand, before the planned number of env_steps |
+| horizon, starts | DreamerV3: how many steps it imagines ahead; from how many stored latents in each update |
+| `schedule.NAME` | a setting that moves to the value `to` in a run, here as gates are passed |
 """
 FOOT = """## Where the numbers come from
 
-Commands on this page start an experiment with today's code, whose defaults may differ. *Commands, commits, machine*
-links to those that made the numbers. Before commit 2c16a57 they call `recipes/latent_ppo.py` by its old name,
-`recipes/dreamer_v3.py`. Files `metrics*.csv` keep all rows with evaluations, and some of the others.
+Commands on this page run with today's code, whose defaults may differ. *Commands, commits, machine* links to those that
+made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. Files `metrics*.csv`
+keep all rows with evaluations, and some of the others.
 
 This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results): change
 those, not the page. Results of earlier defaults are in the tree of commit 3c460b3."""
