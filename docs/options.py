@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
-sys.path.append(str(RECIPES))  # where the next ones are found
+sys.path.append(str(RECIPES))  # where the next ones are found, which therefore come behind it
 
-from composing.entry import SCHEMAS  # noqa: E402
-from composing.options import OPTIONS, Option  # noqa: E402
-from composing.schema import RunConfig  # noqa: E402
+from composing.entry import SCHEMAS  # noqa: E402 - behind the path
+from composing.options import OPTIONS, Option  # noqa: E402 - behind the path
+from composing.schema import RunConfig  # noqa: E402 - behind the path
 
-from dreamer_racing.settings import ALLOWED  # noqa: E402
-from dreamer_racing.training.schedule import Ramp  # noqa: E402
+from dreamer_racing.settings import ALLOWED  # noqa: E402 - behind the path
+from dreamer_racing.training.schedule import Ramp  # noqa: E402 - behind the path
 
 PAGE = Path(__file__).with_name("options.md")
 FIRST = ("dreamer_v3", "latent_ppo", "ppo", "sac", "experiment", "evaluate", "perception", "export", "plot")
