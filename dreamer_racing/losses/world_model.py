@@ -21,7 +21,7 @@ from dreamer_racing.modules.stored_latents import CONTEXT
 from dreamer_racing.modules.world_model import WorldModel, join_features
 
 OPEN_LOOP_STARTS = 64
-"""Records of a batch from which rewards and ends are predicted ahead."""
+"""N, records of a batch from which rewards and ends are predicted ahead: this project's choice, for its time."""
 
 
 class Latents(NamedTuple):
@@ -128,12 +128,12 @@ def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, s
     """Compute the loss of rewards and ends predicted steps ahead, from replayed actions alone.
 
     Imagination reads the heads at latents that no observation has corrected. Heads that are trained at corrected ones
-    alone do not know how unsure the others are, and miss crashes: the actor exploits it.
+    alone do not know how unsure the others are, and underrate crashes (docs/learning.md).
 
     Args:
         model: Whose dynamics and heads learn, and that made the latents.
         latents: Inferred of the batch, with their graph.
-        batch: Records ``[B, T]``.
+        batch: Records ``[B, T]``: ``previous_action``, ``reward``, ``terminated``, ``is_init``.
         steps: K, at least 1 and less than T.
 
     Returns:
@@ -144,32 +144,25 @@ def open_loop_loss(model: WorldModel, latents: Latents, batch: TensorDictBase, s
 
     Reference: Hafner et al. 2019, "Learning latent dynamics for planning from pixels", latent overshooting, of heads.
     """
-    starts = batch.shape[1] - steps
+    starts = batch.shape[1] - steps  # of a window
     if starts < 1:
         raise ValueError(
             f"open_loop_steps={steps} must be less than the {batch.shape[1]} records of a window (batch_length)."
         )
-    chosen = torch.rand(len(batch) * starts, device=latents.belief.device)
-    chosen = chosen.topk(min(OPEN_LOOP_STARTS, len(chosen))).indices
+    device = latents.belief.device
+    chosen = torch.rand(len(batch) * starts, device=device).topk(min(OPEN_LOOP_STARTS, len(batch) * starts)).indices
+    window, first = chosen // starts, chosen % starts  # (N,)
+    following = (window.unsqueeze(1), first.unsqueeze(1) + torch.arange(1, steps + 1, device=device))  # (N, K)
+    action, reward, terminated, is_init = (
+        batch[key][following] for key in ("previous_action", "reward", "terminated", "is_init")
+    )
+    within = (~is_init).float().cumprod(1)  # (N, K, 1): 0 from the next episode's first record on
 
-    def ahead(value: Tensor, step: int) -> Tensor:
-        return value[:, step : step + starts].flatten(0, 1)[chosen]
-
-    belief, state = ahead(latents.belief, 0), ahead(latents.state, 0)
-    within = belief.new_ones(len(chosen), 1)
-    features, weights = [], []
-    for step in range(1, steps + 1):
-        belief, state = model.rssm.imagine_step(belief, state, ahead(batch["previous_action"], step))
-        within = within * ~ahead(batch["is_init"], step)
-        features.append(join_features(belief, state))
-        weights.append(within)
-    predicted, weight = torch.stack(features), torch.stack(weights)  # (K, N, F), (K, N, 1)
-    reward = torch.stack([ahead(batch["reward"], step) for step in range(1, steps + 1)])
-    terminated = torch.stack([ahead(batch["terminated"].float(), step) for step in range(1, steps + 1)])
+    features = join_features(*model.predict(latents.belief[window, first], latents.state[window, first], action))
     head = model.reward_head
-    rewards = head.two_hot.cross_entropy(head(predicted).log_softmax(-1), reward).view_as(weight)
-    ends = F.binary_cross_entropy_with_logits(model.continue_head(predicted), 1.0 - terminated, reduction="none")
-    return (weight * (rewards + ends)).sum() / weight.sum().clamp_min(1.0)
+    rewards = head.two_hot.cross_entropy(head(features).log_softmax(-1), reward).view_as(within)
+    ends = F.binary_cross_entropy_with_logits(model.continue_head(features), 1.0 - terminated.float(), reduction="none")
+    return (within * (rewards + ends)).sum() / within.sum().clamp_min(1.0)
 
 
 def kl_losses(

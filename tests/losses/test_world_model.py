@@ -101,12 +101,18 @@ def test_losses_of_a_new_model(image_size):
     assert latents.belief.shape[:2] == (2, 4) and latents.belief.requires_grad
 
 
-def test_continue_target_is_one_minus_terminated():
+def agent_that_goes_on() -> Agent:
+    """An agent whose model says everywhere that the episode goes on with a probability of 0.75."""
     agent = Agent(SIZES["debug"], Interface())
     output = agent.world_model.continue_head.mlp.output
     with torch.no_grad():
         output.weight.zero_()
-        output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
+        output.bias.fill_(math.log(3.0))
+    return agent
+
+
+def test_continue_target_is_one_minus_terminated():
+    agent = agent_that_goes_on()
     batch = make_windows()
     batch["truncated"][1, 1] = True
     loss = WorldModelLoss(agent, LossConfig())(batch)[0]["loss_continue"]
@@ -115,11 +121,7 @@ def test_continue_target_is_one_minus_terminated():
 
 
 def test_rewards_and_ends_ahead_are_learned_within_an_episode():
-    agent = Agent(SIZES["debug"], Interface())
-    output = agent.world_model.continue_head.mlp.output
-    with torch.no_grad():
-        output.weight.zero_()
-        output.bias.fill_(math.log(3.0))  # says 0.75 everywhere
+    agent = agent_that_goes_on()
     batch = make_windows()  # an episode begins at the third record of the first window, behind one that ended
     latents = WorldModelLoss(agent, LossConfig())(batch)[1]
     loss = open_loop_loss(agent.world_model, latents, batch, steps=2)
