@@ -73,7 +73,8 @@ def test_a_commander_flies_it_over_loopback_until_sigterm() -> None:
     assert poses.rejected == 0 and len(packets) > 100
     assert packets[-1].position == pytest.approx(packets[0].position, abs=0.03)
     took, stamped = received[-1].time - received[0].time, packets[-1].stamp - packets[0].stamp
-    assert stamped == pytest.approx(took, rel=0.1)  # it keeps to the clock
+    late = float(re.search(r"late \d+ times \(by (\d+) ms at most\)", said)[1]) / 1e3 if "late" in said else 0.0
+    assert -0.1 * took < took - stamped < 0.1 * took + late, said  # it keeps to the clock, or says how far it is behind
     assert "the stand let go" in said
     assert "0 gates in order, 0 laps, crash: none, 60 commands (0 lost, 0 stale, 1 malformed), 0 failsafe(s)" in said
 
@@ -81,26 +82,33 @@ def test_a_commander_flies_it_over_loopback_until_sigterm() -> None:
 def test_a_stand_in_for_the_firmware_flies_it_over_loopback_until_sigint() -> None:
     firmware, state = Firmware("2026.6"), bind("127.0.0.1", 0)
     state.settimeout(0.2)
-    over = threading.Event()
+    over, answers = threading.Event(), 0
     options = (
         "betaflight=2026.6", "motor_port=0", f"state_port={state.getsockname()[1]}", "pose_port=9", "track=circle"
     )  # fmt: skip
     with plant(*options) as (port, stop), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
 
         def serve() -> None:
+            nonlocal answers
             while not over.is_set():
                 try:
                     out.sendto(firmware.answer(state.recv(1024)), ("127.0.0.1", port))
+                    answers += 1
                 except TimeoutError:
                     continue
 
+        def wait_for(number: int) -> None:
+            deadline = time.monotonic() + 60.0
+            while answers < number and time.monotonic() < deadline:
+                time.sleep(0.01)
+
         thread = threading.Thread(target=serve)
         thread.start()
-        time.sleep(0.2)
+        wait_for(100)
         firmware.armed = True
-        time.sleep(0.2)
+        wait_for(200)
         firmware.throttle = 0.62
-        time.sleep(0.8)
+        wait_for(700)
         said = stop(signal.SIGINT)
         over.set()
         thread.join(5.0)
