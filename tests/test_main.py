@@ -68,7 +68,8 @@ def test_a_wheel_holds_what_its_recipes_need(installed: Path, tmp_path: Path) ->
     done = start("fly", "--help", path=installed, cwd=tmp_path)
     assert done.stdout.startswith("usage: python -m dreamer_racing fly"), done.stderr
     done = start("fly", "agent=nobody", path=installed, cwd=tmp_path)
-    named = "Agents that ship, to be given by name: circle, circle_betaflight, figure8, kidney"
+    names = ", ".join(sorted(path.parent.name for path in (ROOT / "agents").glob("*/agent.json")))
+    named = f"Agents that ship, to be given by name: {names}"
     assert done.returncode == 2 and named in done.stderr
 
 

@@ -273,15 +273,13 @@ def agents_of_it() -> list[str]:
 
 
 @pytest.mark.slow
-def test_agents_that_were_trained_on_its_rate_loop_race_three_laps(set_up: SetUp) -> None:
-    if not agents_of_it():
-        pytest.skip("no agent that ships was trained on preset=betaflight")
-    for name in agents_of_it():
-        flyer = ActorFlyer(AGENTS / name)
-        firmware = set_up()
-        step = ready(firmware, radio_link(Radio(firmware)), flyer.contract["source"]["track"])
-        chain = chain_of(step, flyer, laps=3)
-        ended = step.fly(chain, flyer.rate, 60.0)
-        chain.close()
-        assert ended == "disarmed: the flight is over", name
-        assert len(step.plant.vehicle.lap_times) == 3, name
+@pytest.mark.parametrize("name", agents_of_it())
+def test_agents_that_were_trained_on_its_rate_loop_race_three_laps(set_up: SetUp, name: str) -> None:
+    flyer = ActorFlyer(AGENTS / name)
+    firmware = set_up()
+    step = ready(firmware, radio_link(Radio(firmware)), flyer.contract["source"]["track"])
+    chain = chain_of(step, flyer, laps=3)
+    ended = step.fly(chain, flyer.rate, 60.0)
+    chain.close()
+    assert ended == "disarmed: the flight is over"
+    assert len(step.plant.vehicle.lap_times) == 3

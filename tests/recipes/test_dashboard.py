@@ -91,7 +91,7 @@ def test_a_port_is_in_its_range() -> None:
 
 def test_what_holds_no_flight_is_refused_with_what_would_be_right(runs: Path) -> None:
     dashboard = recipe_module("dashboard")
-    named = "run=runs/nowhere: there is no such .* circle, circle_betaflight, figure8, kidney"
+    named = "run=runs/nowhere: there is no such .* circle, circle_betaflight, figure8"
     with pytest.raises(FileNotFoundError, match=named):
         dashboard.find(config(run="runs/nowhere"))
     (runs / "young").mkdir()

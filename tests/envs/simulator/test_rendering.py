@@ -179,7 +179,9 @@ def draw(agent: Path, renderer: str) -> np.ndarray:
 
 
 def golden_file(agent: Path, renderer: str) -> Path:
-    return GOLDEN / f"{agent.name}_{renderer}.png"
+    """Agents of one track see the same."""
+    track = yaml.safe_load((agent / "config.yaml").read_text(encoding="utf-8"))["track"]
+    return GOLDEN / f"{track}_{renderer}.png"
 
 
 def golden(agent: Path, renderer: str) -> np.ndarray:
