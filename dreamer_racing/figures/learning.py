@@ -113,7 +113,9 @@ def _draw_panel(axes: Axes, curves: Sequence[Curve], styles: Styles, end: float)
     for curve in sorted(curves, key=lambda curve: _rank(curve.key), reverse=True):  # the reference on top
         line = styles[curve.key._replace(track="")]
         if curve.key.is_reference or not _crowded(curve.key, styles):
-            axes.fill_between(curve.x, curve.low, curve.high, color=line["color"], alpha=0.18, linewidth=0)
+            ends = (0.0, 1.0) if QUANTITIES[curve.quantity].comparable else (-np.inf, np.inf)  # a rate has no more
+            band = (np.clip(side, *ends) for side in (curve.low, curve.high))
+            axes.fill_between(curve.x, *band, color=line["color"], alpha=0.18, linewidth=0)
         axes.plot(curve.x, curve.centre, **line)
         drawn = np.isfinite(curve.centre)
         if drawn.any() and np.ptp(curve.x[drawn]) < SHORTEST_LINE * end:

@@ -144,7 +144,8 @@ def _key_of_table(path: Path) -> CurveKey:
     with path.open(encoding="utf-8", errors="replace") as file:
         columns = file.readline().strip().split(",")
     algorithm = next((name for column, name in LOGGED_BY if column in columns), "")
-    return CurveKey(track, algorithm, " ".join(filter(None, (path.absolute().parent.name, rest))))
+    folder = path.absolute().parent.name
+    return CurveKey(track, algorithm, " ".join(filter(None, ("" if folder == algorithm else folder, rest))))
 
 
 def find_runs(places: Sequence[str | Path]) -> list[Path]:
