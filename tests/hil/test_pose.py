@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 import socket
 import time
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -286,3 +288,13 @@ def test_extrapolation_flies_on():
     assert later.time == 1.5 and later.position == pytest.approx([4.0, 0.0, -0.5])
     assert rotation_matrix(later.attitude)[:, 0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)  # a quarter to the left
     assert extrapolate(pose(1.0, velocity=(8, 0, 0)), 0.9).position.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_program_of_the_page_on_wiring_sends_poses(poses):
+    page = (Path(__file__).parents[2] / "docs" / "hil_wiring.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert "range(2000)" in program and '("127.0.0.1", 9100)' in program
+    exec(program.replace("range(2000)", "range(3)").replace("9100", str(poses.address[1])), {})
+    heard = poses.poll()
+    assert [each.packet.sequence for each in heard] == [0, 1, 2] and poses.rejected == 0
+    assert rotation_matrix(heard[0].packet.attitude)[:, 0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-9)
