@@ -35,40 +35,49 @@ WIDTH = 128
 BRIEF = "Index of further files (rarely needed)"
 COLUMNS = ("value", "seeds", "minutes", "command")
 """Of the second table, behind the result."""
+BELOW = "command below"
+"""A command that is linked, for its length."""
 FEW = 1
 """So many files are linked one by one; more are their folder."""
 NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
-draws the conclusions. To check a number at once, fly the included Kidney agent 100 times, a minute of CPU:
+draws the conclusions. To check a number at once, fly the included Kidney agent twice 100 times, 40 s of CPU:
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-On an AMD EPYC it prints `finished 100 (100%)` for the deterministic policy, then `finished 99 (99%)` for the stochastic
-one. All runs were evaluated like this at their end, unless a table says otherwise, with `checkpoint=runs/RUN`.
+On an AMD EPYC it prints two blocks, of which these are some lines. All runs were evaluated like this at their end,
+unless a table says otherwise, with `checkpoint=runs/RUN`.
+
+```text
+deterministic policy, 100 episodes
+finished           100 (100%); 0 ran out of time
+lap time           best 3.92 s, mean 4.02 s (300 laps)
+stochastic policy, 100 episodes
+finished           99 (99%); 0 ran out of time
+lap time           best 3.96 s, mean 4.06 s (297 laps)
+```
 
 | word | meaning on this page |
 |---|---|
-| success | share of flights that finish three laps, each from another randomised start, by the policy's mean action |
-| sampled | success with actions drawn from the policy's distribution |
-| seed | the number that a training's random draws follow from: two seeds are two trainings |
+| success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
+| sampled | success of the stochastic policy, whose actions are drawn from its distribution |
 | minutes | of one core of an AMD EPYC or an Intel Xeon, for the whole training |
 | state decoded | in training the world model learns the true state; in flight the agent sees images alone |
 | stopped | ended by hand, before the planned number of env_steps |
-| horizon, starts | DreamerV3: how many steps it imagines ahead; from how many stored latents in each update |
+| 16 imagined steps from 128 | DreamerV3: the horizon, and from how many stored latents it imagines in each update |
+| heads that learn ahead | `loss.open_loop_steps`: rewards and ends are learned some steps after the last image, too |
+| a weight on action changes | `env.action_change_weight`: a price on the change of the action |
 | `schedule.NAME` | a setting that moves to the value `to` in a run, here as gates are passed |
 """
 FOOT = """## Where the numbers come from
 
-Commands on this page run with today's code, whose defaults may differ. *Commands, commits, machine* links to those that
-made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. Files `metrics*.csv`
-keep all rows with evaluations, and some of the others.
-
-This page is written by `python docs/results.py` from the `provenance.json` files in [results/](../results): change
-those, not the page. Results of earlier defaults are in the tree of commit 3c460b3."""
+Commands on this page run with today's code, whose defaults may differ. *Commands, commits, machine* links to those
+that made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `python
+docs/results.py` writes this page from the `provenance.json` files in [results/](../results): change those, not it."""
 
 
 @dataclass
@@ -203,12 +212,14 @@ def table_text(table: dict[str, Any], entries: list[Entry]) -> str:
 def headline_text(entries: list[Entry]) -> list[str]:
     """Draw the second table: a result a row, linked to its section; nothing if no entry has one."""
     rows = [
-        f"| [{row['result']}](#{entry.anchor}) | {' | '.join(row[name] for name in COLUMNS)} |"
+        f"| [{row['result']}](#{entry.anchor}) | {' | '.join(row[name] for name in COLUMNS)} |".replace(
+            BELOW, f"[{BELOW}](#{entry.anchor})"
+        )
         for entry in entries
         for row in entry.headline
     ]
     head = "## At a glance\n\nPut `OMP_NUM_THREADS=1 ./dev python recipes/` before a command of the last column.\n"
-    table = "| result | success | seeds | minutes | command |\n|---|---|---|---|---|"
+    table = "| result | success, or as said | seeds | minutes | command |\n|---|---|---|---|---|"
     return [head, table, *rows, ""] if rows else []
 
 
