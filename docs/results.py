@@ -76,8 +76,8 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 FOOT = """## Where the numbers come from
 
 Commands on this page run with today's code, whose defaults may differ. *Commands, commits, machine* links to those
-that made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `python
-docs/results.py` writes this page from the `provenance.json` files in [results/](../results): change those, not it."""
+that made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `./dev
+python docs/results.py` writes this page from the `provenance.json` files in [results/](../results): change those."""
 
 
 @dataclass
