@@ -471,6 +471,8 @@ def test_the_columns_of_a_table_say_who_learned():
     ):
         ((run,), _) = read_runs(find_runs([results / name]), ["episode/return"])
         assert run.key.algorithm == algorithm
+        folder = name.partition("/")[0]
+        assert run.key.variant.split()[:1] == ([] if folder == algorithm else [folder])
 
 
 def test_a_short_run_is_drawn_without_steps():

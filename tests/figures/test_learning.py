@@ -67,6 +67,14 @@ def curve(key: CurveKey, seeds: list[int], quantity: str = "return") -> Curve:
     return Curve(key, quantity, steps, zero, zero - 1, zero + 1, np.array(seeds))
 
 
+def test_the_band_of_a_rate_ends_where_rates_do(tmp_path, figures):
+    key = CurveKey("circle", "ppo", "")
+    curves = [curve(key, [2, 2, 2], quantity) for quantity in ("success_rate", "return")]  # each from −1 to 1
+    plot_learning_curves(LearningCurves(curves, {}, "mean", 0.0, []), tmp_path / "figure.png")
+    heights = [axes.collections[0].get_paths()[0].vertices[:, 1] for axes in figures[0].axes[:2]]
+    assert [(height.min(), height.max()) for height in heights] == [(0.0, 1.0), (-1.0, 1.0)]
+
+
 def test_the_legend_says_where_seeds_are_missing(tmp_path, figures):
     same, ends, differ = (CurveKey("circle", name, "") for name in ("dreamer_v3", "ppo", "sac"))
     curves = [
