@@ -161,7 +161,7 @@ def test_what_pays_becomes_likelier():
     """Rewards that are the first dimension of the action: its mean rises, the others' stay."""
     torch.manual_seed(0)
     learner = make_learner(ppo=replace(PPO, steps=512, minibatch=64, critic_learning_rate=1e-9), discount=0.0)
-    for _ in range(30):
+    for _ in range(10):
         rollout = make_rollout(learner, 64, 8)
         rollout["next", "reward"] = rollout["action"][..., :1].clone()
         learner.collect(rollout)
@@ -211,7 +211,7 @@ def test_the_critic_learns_what_pays(critic, pays):
     """Rewards that what it sees tells: after some updates it explains nearly all of the returns."""
     torch.manual_seed(0)
     learner = make_learner(critic, ppo=PPOUpdateConfig(steps=512, epochs=4, minibatch=64), discount=0.0)
-    for number in range(40):
+    for number in range(12):
         rollout = make_rollout(learner, 64, 8)
         rollout["next", "belief"].normal_()
         rollout["next", "reward"] = 3.0 * rollout[pays][..., :1]
