@@ -80,6 +80,7 @@ def contract_of(step: ActorStep) -> dict:
     return make_contract(step, PRESETS["easy"], Camera(), checkpoint="checkpoint-1", track="circle", preset="easy")
 
 
+@functools.cache
 def make_flight(agent: Agent, steps: int = MIN_STEPS) -> RecordedFlight:
     """Random observations, with a reset in every 40 steps and two next to each other, and the policy's answers."""
     random = np.random.default_rng(0)
@@ -198,18 +199,32 @@ def test_every_architecture_flies_alike(
 
 
 def test_what_flies_otherwise_than_the_policy_did_is_refused(agent: Agent, tmp_path: Path) -> None:
-    flight, step = make_flight(agent), ActorStep(agent)
+    flight, step = copy.deepcopy(make_flight(agent)), ActorStep(agent)
     flight.actions[150, 0] += 1e-3
     with pytest.raises(ParityError, match=r"^torch does not fly as the policy does: at step 150 of 200 .* 1 steps are"):
         export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
     assert not list(tmp_path.iterdir())
 
 
-def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(agent: Agent, tmp_path: Path) -> None:
-    step, flight = make_step(agent, "mode"), make_flight(agent)
+def copies(onnx: Path, program: Path) -> Callable[[ActorStep, Path, Path], None]:
+    """In place of `write_step`: copies files that it has written."""
+
+    def write(step: ActorStep, onnx_output: Path, program_output: Path) -> None:
+        shutil.copy(onnx, onnx_output)
+        shutil.copy(program, program_output)
+
+    return write
+
+
+def test_an_export_of_another_kind_leaves_nothing_of_an_earlier_one(
+    agent: Agent, exports: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, flight, earlier = make_step(agent, "mode"), make_flight(agent), exports("mode")
     other = tmp_path / "weights.safetensors"  # where no export has been
     other.write_text("mine", encoding="utf-8")
-    export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "write_step", copies(earlier, earlier.with_suffix(".pt2")))
+        export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx")
     assert other.read_text(encoding="utf-8") == "mine"
     other.unlink()
     export_actor(step, contract_of(step), flight, tmp_path / "actor.onnx", shared_weights=True)
@@ -266,7 +281,13 @@ def test_a_step_in_two_parts_is_the_whole_one(kind: str, in_parts: Callable[[str
         whole.prepare()  # nothing
 
 
-def test_parts_of_another_export_are_refused(in_parts: Callable[[str], InParts], agent: Agent, tmp_path: Path) -> None:
+def test_parts_of_another_export_are_refused(
+    in_parts: Callable[[str], InParts],
+    agent: Agent,
+    exports: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     shutil.copytree(in_parts("state space").output.parent, tmp_path, dirs_exist_ok=True)  # with shared weights
     output = tmp_path / "actor.onnx"
     contract = json.loads((tmp_path / "contract.json").read_text())
@@ -278,7 +299,8 @@ def test_parts_of_another_export_are_refused(in_parts: Callable[[str], InParts],
     (tmp_path / "actor_act.onnx").unlink()
     with pytest.raises(FileNotFoundError, match="actor_act.onnx: it belongs beside actor.onnx"):
         onnx_actor.OnnxActor(output)
-    step = ActorStep(agent)
+    step, whole = ActorStep(agent), exports("mode")
+    monkeypatch.setattr(export, "write_step", copies(whole, whole.with_suffix(".pt2")))
     export_actor(step, contract_of(step), make_flight(agent), output)
     assert {path.name for path in tmp_path.iterdir()} == {"actor.onnx", "actor.pt2", "contract.json"}, "what is left?"
 
@@ -336,32 +358,31 @@ def test_the_files_hold_no_paths_of_this_machine(exported: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def written(agent: Agent, exports: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both files of the agent's step, and of one with an altered weight."""
-    folder, altered = tmp_path_factory.mktemp("written"), ActorStep(copy.deepcopy(agent))
-    next(altered.rssm.cell.parameters()).add_(0.5)
-    export.write_step(altered, folder / "altered.onnx", folder / "altered.pt2")
-    for suffix in (".onnx", ".pt2"):
-        shutil.copy(exports("mode").with_suffix(suffix), folder / f"own{suffix}")
+def altered(agent: Agent, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both files of a step with an altered weight."""
+    folder, step = tmp_path_factory.mktemp("altered"), ActorStep(copy.deepcopy(agent))
+    next(step.rssm.cell.parameters()).add_(0.5)
+    export.write_step(step, folder / "actor.onnx", folder / "actor.pt2")
     return folder
 
 
 @pytest.mark.parametrize(("kind", "name"), [("onnx", "onnxruntime"), ("program", "torch.export")])
 def test_an_altered_weight_is_refused(
-    kind: str, name: str, agent: Agent, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str,
+    name: str,
+    agent: Agent,
+    altered: Path,
+    exports: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    weights = {"onnx": "own", "program": "own"}
-
-    def write(step: ActorStep, onnx: Path, program: Path) -> None:
-        shutil.copy(written / f"{weights['onnx']}.onnx", onnx)
-        shutil.copy(written / f"{weights['program']}.pt2", program)
-
-    monkeypatch.setattr(export, "write_step", write)
+    files = {"onnx": exports("mode"), "program": exports("mode").with_suffix(".pt2")}
+    shutil.copytree(exports("mode").parent, tmp_path, dirs_exist_ok=True)
     step = ActorStep(agent)
     output = tmp_path / "actor.onnx"
-    export_actor(step, contract_of(step), make_flight(agent), output)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    weights[kind] = "altered"
+    files[kind] = altered / files[kind].name
+    monkeypatch.setattr(export, "write_step", copies(**files))
     with pytest.raises(ParityError, match=rf"^{name} does not fly as torch does: at step \d+ of 200 .* deviates by \d"):
         export_actor(step, contract_of(step), make_flight(agent), output)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before, "the earlier export stays"
