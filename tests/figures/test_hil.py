@@ -12,6 +12,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from dreamer_racing.envs.tracks import describe_track, load_track
@@ -122,13 +123,26 @@ def flown(tmp_path_factory) -> Path:
     return Flown(tmp_path_factory.mktemp("flight")).fly()
 
 
+def draw_nothing(patch: pytest.MonkeyPatch) -> None:
+    """Make figures, but do not draw them: that takes most of a report's time."""
+    patch.setattr(Figure, "savefig", lambda self, path, **_: Path(path).touch())
+
+
+@pytest.fixture
+def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that look at no figure."""
+    draw_nothing(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def report(flown) -> dict[str, Any]:
-    write_report(flown)
+    with pytest.MonkeyPatch.context() as patch:
+        draw_nothing(patch)
+        write_report(flown)
     return json.loads((flown / REPORT).read_text(encoding="utf-8"))
 
 
-def test_a_report_is_of_the_track_that_was_flown(tmp_path):
+def test_a_report_is_of_the_track_that_was_flown(tmp_path, unseen):
     """Its name is that of another now; without the track in the file, as in old ones, the report says what it took."""
     for name, kept in (("kept", {TRACK: describe_track(CIRCLE)}), ("old", {})):
         Flown(tmp_path / name, about={"track": "kidney", **kept}).fly()
@@ -165,7 +179,7 @@ def test_latencies_are_those_put_in(report):
 
 
 @pytest.mark.parametrize("offset", [-5e4, 7e8])
-def test_the_age_of_poses_stamped_by_their_sender(tmp_path, offset):
+def test_the_age_of_poses_stamped_by_their_sender(tmp_path, offset, unseen):
     write_report(Flown(tmp_path, stamping=Stamping.sender, offset=offset).fly(60))
     stages = json.loads((tmp_path / REPORT).read_text())["latency"]["stages"]
     assert list(stages["pose_age"].values()) == pytest.approx(3 * [1e3 * AGE], abs=1e-3)
@@ -358,7 +372,7 @@ def test_an_unknown_track_is_said(tmp_path, flown):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.95])
-def test_a_flight_whose_loop_was_killed(tmp_path, flown, share):
+def test_a_flight_whose_loop_was_killed(tmp_path, flown, share, unseen):
     data = (flown / FILE).read_bytes()
     (tmp_path / FILE).write_bytes(data[: int(share * len(data))])
     lines = write_report(tmp_path)
