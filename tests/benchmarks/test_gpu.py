@@ -15,21 +15,20 @@ SCRIPT = ROOT / "benchmarks" / "gpu.py"
 gpu = module_of("benchmarks", "gpu")
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPT), "--device", "cpu", "--tiny", "--json", str(folder / "results.jsonl")]
-    return subprocess.run(
-        [*command, "--caches", str(folder / "caches"), *arguments], capture_output=True, text=True, check=True
-    )
-
-
 @pytest.mark.slow
-def test_a_stage_runs_on_a_cpu_and_once(tmp_path: Path) -> None:
+def test_a_stage_runs_on_a_cpu_and_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """The shortest; all of them run by `python benchmarks/gpu.py --device cpu --tiny --json FILE`."""
-    said = run(tmp_path, "--stages", "probe").stdout
+    command = [str(SCRIPT), "--device", "cpu", "--tiny", "--stages", "probe", "--json", str(tmp_path / "results.jsonl")]
+    command += ["--caches", str(tmp_path / "caches")]
+    said = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True).stdout
     records = gpu.read(tmp_path / "results.jsonl")
     assert [(record["name"], record["state"]) for record in records] == [("machine", "done")], said
     assert records[0]["tiny"] and records[0]["copy_gb_per_s"] > 0.0
-    assert run(tmp_path, "--stages", "probe").stdout == "", "all was done"
+    monkeypatch.setattr(sys, "argv", command)
+    gpu.main()
+    assert capsys.readouterr().out == "", "all was done"
     assert gpu.read(tmp_path / "results.jsonl") == records
     assert gpu.identity(records[0]) != gpu.identity(records[0] | {"device": "cuda", "tiny": False})
 
