@@ -30,9 +30,7 @@ from omegaconf import OmegaConf
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 import latent_ppo
-from composing.arena import make_env
-from composing.building import make_collector
-from composing.learners import make_learner
+from composing.building import make_collector, make_env, make_learner
 from composing.options import CONFIG_DIR
 from composing.schema import CollectorKind, WorldModelRunConfig
 from composing.workers import make_own_env, make_rollouts

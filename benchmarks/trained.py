@@ -10,9 +10,7 @@ from tensordict import TensorDict
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
-from composing.arena import Environment, make_env, worlds_of
-from composing.building import make_curriculum, make_run_replay
-from composing.learners import size_of
+from composing.building import Environment, make_curriculum, make_env, make_run_replay, size_of, worlds_of
 from composing.restoring import restore_learner
 from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig

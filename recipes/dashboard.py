@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from composing.arena import worlds_of
-from composing.command_line import plain_errors, start_logging
-from composing.entry import recipe
+from composing.building import worlds_of
+from composing.entry import plain_errors, recipe, start_logging
 from composing.restoring import FlightConfig, restore
 
 from dreamer_racing.commands import from_here

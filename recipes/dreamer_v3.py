@@ -12,20 +12,21 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 from typing import cast
 
 from composing.building import (
+    begin_with,
     make_curriculum,
+    make_learner,
     make_run_evaluator,
     make_run_replay,
     make_tracker,
+    measure,
     num_gates,
     seed_generators,
 )
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, make_learner, measure
 from composing.resolving import resolve_world_model as resolve
 from composing.schema import DreamerV3RunConfig
-from composing.sharing import share_of
-from composing.workers import make_own_env, make_rollouts
+from composing.workers import make_own_env, make_rollouts, share_of
 from omegaconf import DictConfig
 
 from dreamer_racing.envs import DroneRacingEnv

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from composing.callbacks import FAILURES
-from composing.command_line import as_override, merge_overrides, override_key
-from composing.entry import in_plain_words, recipe
+from composing.entry import as_override, in_plain_words, merge_overrides, override_key, recipe
 from composing.saved import read_yaml
 from composing.schema import RECIPES, RunConfig
 from hydra import compose

@@ -21,13 +21,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from composing.arena import describe_file, track_as_begun, worlds_of
-from composing.command_line import as_override, override_key, override_value, plain_errors, start_logging
-from composing.entry import recipe
+from composing.building import describe_file, track_as_begun, worlds_of
+from composing.entry import as_override, override_key, override_value, plain_errors, recipe, start_logging
+from composing.options import command
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import read_yaml, trained_config
 from composing.schema import WorldModelRunConfig, is_race
-from composing.usage import command
 from omegaconf import MISSING, ListConfig, OmegaConf
 from torch import set_num_threads
 

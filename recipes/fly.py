@@ -24,9 +24,8 @@ from typing import Any
 
 import composing  # noqa: F401 - first: says how to run this where packages are missing
 import numpy as np
-from composing.arena import worlds_of
-from composing.command_line import plain_errors, start_logging
-from composing.entry import recipe
+from composing.building import worlds_of
+from composing.entry import plain_errors, recipe, start_logging
 from composing.restoring import FlightConfig, restore
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule

@@ -21,9 +21,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from composing.command_line import new_run_dir, plain_errors, start_logging
-from composing.entry import recipe
-from composing.usage import command
+from composing.entry import new_run_dir, plain_errors, recipe, start_logging
+from composing.options import command
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 

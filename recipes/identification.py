@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from composing.command_line import plain_errors, start_logging
-from composing.entry import recipe
+from composing.entry import plain_errors, recipe, start_logging
 
 from dreamer_racing.envs.drone.variations import SUFFIXES
 

@@ -12,20 +12,22 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from typing import Any, cast
 
 from composing.building import (
+    begin_with,
     make_curriculum,
+    make_learner,
     make_run_evaluator,
     make_run_replay,
     make_tracker,
+    measure,
+    measure_lag,
     num_gates,
     seed_generators,
 )
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import begin_with, make_learner, measure, measure_lag
 from composing.resolving import resolve_world_model as resolve
 from composing.schema import LatentPPORunConfig
-from composing.sharing import share_of
-from composing.workers import make_own_env, make_rollouts
+from composing.workers import make_own_env, make_rollouts, share_of
 from omegaconf import DictConfig
 
 from dreamer_racing import parallel

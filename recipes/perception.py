@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from composing.arena import track_as_begun, worlds_of
-from composing.command_line import plain_disk_errors, plain_errors, start_logging
-from composing.entry import recipe
+from composing.building import track_as_begun, worlds_of
+from composing.entry import plain_disk_errors, plain_errors, recipe, start_logging
 from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 from composing.schema import RunConfig
 

@@ -15,8 +15,7 @@ sitl. With betaflight= one does that runs already.
 
 from dataclasses import dataclass
 
-from composing.command_line import plain_errors, start_logging
-from composing.entry import recipe
+from composing.entry import plain_errors, recipe, start_logging
 
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import read_contract

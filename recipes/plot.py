@@ -10,8 +10,7 @@ named, and does not cost the others. `learning_curves.csv` beside a figure holds
 `runs=learning_curves.csv` draws it again.
 """
 
-from composing.command_line import plain_errors, start_logging
-from composing.entry import recipe
+from composing.entry import plain_errors, recipe, start_logging
 
 from dreamer_racing.figures.plotting import PlotConfig, draw
 

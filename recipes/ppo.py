@@ -10,17 +10,17 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from functools import partial
 from typing import cast
 
-from composing.arena import make_env
 from composing.building import (
     make_collector,
     make_curriculum,
+    make_env,
+    make_learner,
     make_run_evaluator,
     make_tracker,
     seed_generators,
 )
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import make_learner
 from composing.resolving import resolve_baseline
 from composing.schema import PPORunConfig
 from omegaconf import DictConfig

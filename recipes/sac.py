@@ -10,10 +10,11 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from functools import partial
 from typing import cast
 
-from composing.arena import make_env
 from composing.building import (
     make_collector,
     make_curriculum,
+    make_env,
+    make_learner,
     make_run_evaluator,
     make_run_replay,
     make_tracker,
@@ -21,7 +22,6 @@ from composing.building import (
 )
 from composing.entry import recipe
 from composing.launching import launch
-from composing.learners import make_learner
 from composing.resolving import resolve_baseline
 from composing.schema import SACRunConfig
 from omegaconf import DictConfig

@@ -16,8 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from composing.command_line import new_run_dir, plain_errors, start_logging
-from composing.entry import recipe
+from composing.entry import new_run_dir, plain_errors, recipe, start_logging
 
 from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import Track, load_track

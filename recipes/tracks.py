@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from composing.command_line import plain_errors
-from composing.entry import recipe
+from composing.entry import plain_errors, recipe
 
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, load_track
 

@@ -73,7 +73,7 @@ def compose(recipe_name: str, *overrides: str) -> DictConfig:
 def open_session(*overrides: str, name: str = "dreamer_v3") -> tuple[Any, Session]:
     """The configuration of a run as its recipe resolves it, and a session for it."""
     config = OmegaConf.to_object(recipe_module(name).resolve(compose(name, *overrides)))
-    return config, recipe_module("composing.building").open_session(config, list(overrides))
+    return config, recipe_module("composing.launching").open_session(config, list(overrides))
 
 
 def prepared(*overrides: str, name: str = "dreamer_v3") -> Session:
@@ -91,7 +91,7 @@ def prepared(*overrides: str, name: str = "dreamer_v3") -> Session:
 
 def build(*overrides: str, name: str = "dreamer_v3") -> None:
     """Resolve a configuration and make all parts of a run, as a recipe does, in this process."""
-    with recipe_module("composing.command_line").plain_errors():
+    with recipe_module("composing.entry").plain_errors():
         prepared("model=debug", "env.from_pixels=false", *overrides, name=name).close()
 
 

@@ -76,7 +76,7 @@ def test_a_wheel_holds_what_its_recipes_need(installed: Path, tmp_path: Path) ->
 # Commands that messages name work where the person stands.
 
 
-usage = recipe_module("composing.usage")
+usage = recipe_module("composing.options")
 
 
 @pytest.mark.parametrize("folder", ["", "docs", "elsewhere"])

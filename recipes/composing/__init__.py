@@ -6,7 +6,7 @@ from composing.messages import end_quietly, refuse_without_packages
 
 refuse_without_packages()  # before anything needs them
 
-from composing.usage import answer_early  # noqa: E402
+from composing.options import answer_early  # noqa: E402
 from dreamer_racing.caches import CacheError, ensure_caches  # noqa: E402
 from dreamer_racing.terminal import take_any_terminal  # noqa: E402
 

@@ -1,41 +1,281 @@
-"""The parts of a training run: what the configuration leaves open, then one part after the other, then the run."""
+"""The parts of a training run, made of its configuration: environment, learner, collector, replay, evaluation."""
 
+from __future__ import annotations
+
+import json
 import random
 import shutil
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 from torchrl.collectors import Collector
 
-from composing.arena import Environment, make_evaluator
-from composing.checks import check
-from composing.saved import settings_of
-from composing.schema import ReplayRunConfig, RunConfig, is_race
+from composing.saved import SEEN, read_yaml
+from composing.schema import (
+    EnvConfig,
+    LatentPPORunConfig,
+    PPORunConfig,
+    ReplayRunConfig,
+    RunConfig,
+    SACRunConfig,
+    WorldModelRunConfig,
+    is_race,
+)
 from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.gates import CrashCause
+from dreamer_racing.envs.simulator.scene import Camera
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
+from dreamer_racing.evaluation.held_out import SEEN as OBSERVED
+from dreamer_racing.evaluation.held_out import held_out_metrics, world_model_metrics
 from dreamer_racing.experience.replay import SequenceReplayConfig, Storage, StreamReplay, make_replay, replay_bytes
-from dreamer_racing.figures.loggers import RunLogger, make_loggers
-from dreamer_racing.learners.learner import Learner, Policy
+from dreamer_racing.export.agents import existing_agent_path
+from dreamer_racing.export.onnx_actor import CONTRACT, read_contract
+from dreamer_racing.export.shipped_agent import check_env, is_agent, load_networks
+from dreamer_racing.figures.report import EvaluationReport, ReturnReport
+from dreamer_racing.learners import NetworkSize, PPOLearner, SACLearner
+from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.learners.latent_ppo import LatentPPO
+from dreamer_racing.learners.learner import Evaluable, Learner, Policy
+from dreamer_racing.learners.saved import check_size
+from dreamer_racing.learners.update import WorldModelLearner
+from dreamer_racing.losses import find_targets
 from dreamer_racing.machine import (
     available_memory,
     check_fits,
     check_space,
-    git_commit,
 )
-from dreamer_racing.modules import Interface
+from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
+from dreamer_racing.modules.interface import PRIVILEGED
 from dreamer_racing.modules.stored_latents import LatentFormat
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint, replace_text
+from dreamer_racing.training.checkpoint import load_state
+from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.following import LockHeldByFirst, NoReport
+from dreamer_racing.training.following import NoReport
+from dreamer_racing.training.model_lag import ModelLag
 from dreamer_racing.training.session import Evaluator, Session
+
+if TYPE_CHECKING:
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv
+
+
+Environment: TypeAlias = "DroneRacingEnv | ControlSuiteEnv"
+
+
+def describe_file(track: str) -> str | None:
+    """Return what a run notes of its track: of a file all that it says, as JSON; None of a built-in one."""
+    if track in BUILTIN_TRACKS:
+        return None
+    return json.dumps(describe_track(load_track(track))).replace("$", "\\u0024")  # which OmegaConf would read
+
+
+def track_as_begun(config: RunConfig) -> Track:
+    """Return the track of a run: of a file as it was when the run was begun, whatever became of that."""
+    noted = config.track_description
+    track = config.track if noted is None else read_track(json.loads(noted), f"track_description of {config.track}")
+    return with_decoys(track, config.decoys)
+
+
+def worlds_device(device: torch.device, env: EnvConfig) -> str:
+    """The device for worlds: the learner's, where they have a simulator and the renderer asked for, else the CPU."""
+    fits = env.suite == "race" and env.renderer in ("auto", "warp")
+    return str(device) if device.type == "cuda" and fits else "cpu"
+
+
+def imu_of(config: RunConfig) -> str | None:
+    """The inertial measurements that the agent sees, as `DroneRacingEnv` takes them."""
+    return None if config.env.imu == "none" else config.env.imu
+
+
+def worlds_of(config: RunConfig) -> dict[str, Any]:
+    """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
+    env = config.env
+    same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
+    return {
+        "track": track_as_begun(config),
+        "camera": Camera(env.image_size, env.image_size, tilt=env.camera_tilt, rate=env.camera_rate),
+        "imu": imu_of(config),
+        **{name: getattr(env, name) for name in same},
+    }
+
+
+def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
+    """Make the environment to train in, with `env.num_envs` worlds or another number.
+
+    Args:
+        config: resolved.
+        num_envs: worlds; those of the configuration if None.
+        num_threads: that step and draw a race's worlds on a CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
+    """
+    env = config.env
+    num_envs = num_envs or env.num_envs
+    readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
+    if is_race(config):
+        training = (
+            "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius",
+            "action_change_weight", "looks",
+        )  # fmt: skip
+        return DroneRacingEnv(
+            num_envs=num_envs,
+            privileged=bool(readers),
+            seed=config.seed,
+            num_threads=num_threads,
+            **{name: getattr(env, name) for name in training},
+            **worlds_of(config),
+        )
+    if readers:
+        raise ValueError(
+            f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
+            "losses, e.g. loss=reconstruction, and of recipes/latent_ppo.py loss.critic=latent."
+        )
+    return make_suite(config, num_envs, config.seed, env.episode_steps)
+
+
+def privileged_losses(config: WorldModelRunConfig) -> list[str]:
+    """Return what of a run reads the simulator's state in training, as on the command line."""
+    model = config.loss.world_model
+    readers = {f"loss.world_model={model}": any(PRIVILEGED in target.reads for target in find_targets(model))}
+    if isinstance(config, LatentPPORunConfig):
+        readers[f"loss.critic={config.loss.critic}"] = config.loss.critic == "state"
+    return [words for words, reads in readers.items() if reads]
+
+
+def make_suite(config: RunConfig, num_envs: int, seed: int, episode_steps: int | None = None) -> ControlSuiteEnv:
+    """Make worlds of the Control Suite: to evaluate, or to train in episodes of so many control steps."""
+    from dreamer_racing.envs.control_suite import ControlSuiteEnv  # opens a display where it is imported
+
+    env = config.env
+    return ControlSuiteEnv(
+        config.task,
+        num_envs,
+        from_pixels=env.from_pixels,
+        image_size=env.image_size,
+        seed=seed,
+        episode_steps=episode_steps,
+    )
+
+
+def make_evaluator(
+    config: RunConfig,
+    directory: Path,
+    learner: Evaluable,
+    episodes: int,
+    video_steps: int,
+    start_noise: float = 0.0,
+    **options: Any,
+) -> Evaluator:
+    """Make the evaluation that fits the environment; options are those of `EvaluationReport`."""
+    if is_race(config):
+        worlds = {**worlds_of(config), "start_noise": start_noise}
+        return EvaluationReport(directory, learner, worlds, episodes, video_steps, **options)
+    seed = config.seed + 1
+    env = make_suite(config, min(8, episodes), seed)
+    return ReturnReport(directory, learner, env, episodes, video_steps, seed)
+
+
+WINDOWS, RECORDS = 32, 2_000
+"""Windows of records held out that are measured at a time, from the newest records of a world."""
+
+
+def size_of(config: WorldModelRunConfig) -> ModelSize:
+    """The networks' size, and what their states are."""
+    return replace(get_size(config.model.size), sampled=config.model.sampled, state_std=config.model.state_std)
+
+
+def make_agent(config: WorldModelRunConfig, interface: Interface) -> Agent:
+    """Make the networks of a resolved configuration, with initial weights from torch's generator."""
+    decodes = any(target.decodes for target in find_targets(config.loss.world_model))
+    return Agent(size_of(config), interface, decodes, config.loss.min_std, config.loss.max_std).to(config.device)
+
+
+def begin_with(learner: WorldModelLearner, config: WorldModelRunConfig, env: Environment) -> str:
+    """Give a new learner the weights that ``init_from`` names; return a line on what that was.
+
+    Raises:
+        FileNotFoundError: there is no such run, checkpoint or agent.
+        ValueError: its networks are of another size, or were trained with another camera, control rate or loss; or its
+            configuration is damaged.
+    """
+    source = str(config.init_from)
+    folder = existing_agent_path("init_from", source)
+    if not is_agent(folder):
+        saved = read_yaml(RunDirectory.of(latest_checkpoint(folder)).config, DictConfig)
+        for name in SEEN:
+            there, here = OmegaConf.select(saved, name), OmegaConf.select(OmegaConf.structured(config), name)
+            if there != here:
+                raise ValueError(f"{name}={here}: init_from={source} was trained with {name}={there}; give that.")
+        state, metadata = load_state(folder, "learner")
+        unmatched = learner.adopt(state)
+        kind = "the averaged ones" if "averaged" in state else "all those"
+        line = f"weights: {kind} of {folder} at {metadata['env_steps']:,} env_steps (init_from=), heads and critic, too"
+        if unmatched.anew:
+            line += f"; {' and '.join(unmatched.anew)}, which that run had not, begins anew"
+        return line + (f"; left behind: {' and '.join(unmatched.left)}" if unmatched.left else "")
+    contract = read_contract(folder / CONTRACT)
+    check_size(contract["model"], learner.size)
+    if not isinstance(env, DroneRacingEnv):
+        raise ValueError(f"init_from={source}: this agent races; there is no race here.")
+    check_env(folder, contract, env)
+    for agent in filter(None, (learner.agent, learner.averaged)):
+        load_networks(folder, agent)
+    return f"weights: encoder, RSSM and actor of {folder} (init_from=); heads and critic begin anew"
+
+
+def make_learner(
+    config: RunConfig, interface: Interface, device: torch.device | str, seed: int | None = None
+) -> Learner:
+    """Make the learner of a recipe's configuration, to train or to be restored.
+
+    Args:
+        config: resolved.
+        interface: what is seen and done.
+        device: where it computes.
+        seed: of the initial weights; the run's if None.
+    """
+    seed = config.seed if seed is None else seed
+    if isinstance(config, WorldModelRunConfig):
+        kind = LatentPPO if isinstance(config, LatentPPORunConfig) else DreamerV3
+        return kind.make(size_of(config), interface, config.loss, config.model, device=device, seed=seed)
+    if isinstance(config, PPORunConfig):
+        return PPOLearner(NetworkSize(config.network.layers, config.network.units), interface, config.ppo, device, seed)
+    if isinstance(config, SACRunConfig):
+        return SACLearner(NetworkSize(config.network.layers, config.network.units), interface, config.sac, device, seed)
+    raise NotImplementedError(f"make_learner() knows no learner of a {type(config).__name__}: add a branch for it.")
+
+
+def measure(
+    session: Session, learner: WorldModelLearner, replay: StreamReplay, scheduled: Mapping[str, float]
+) -> dict[str, Tensor | float]:
+    """Return hyperparameters as they are now, and what the model makes of the newest records not trained on."""
+    groups = zip(("world_model", "behavior"), learner.optimizer.param_groups, strict=True)
+    numbers: dict[str, Any] = {f"schedule/{name}": value for name, value in scheduled.items()}
+    numbers |= {f"learning_rate/{name}": group["lr"] for name, group in groups}
+    windows = replay.held_out(WINDOWS, OBSERVED + learner.config.imagination_horizon, RECORDS)
+    if windows is None or not session.counters["updates"]:
+        return numbers
+    with session.undisturbed():
+        return numbers | held_out_metrics(learner, windows)
+
+
+def measure_lag(
+    session: Session, config: WorldModelRunConfig, learner: WorldModelLearner, replay: StreamReplay, lag: ModelLag
+) -> dict[str, Tensor | float]:
+    """Measure whether the model knows the records of the newest flights, before they are learned from."""
+    length = config.model.batch_length
+    if config.replay.context:  # begins warm: the newest rollout alone
+        length = min(length, config.rollout_steps)
+    if (windows := replay.newest(length)) is None:
+        return {}
+    with session.undisturbed():
+        return lag.measured(parallel.averaged(world_model_metrics(learner, windows)))
 
 
 def seed_generators(seed: int) -> None:
@@ -150,15 +390,6 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
 
 
-def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
-    """Keep what a run is started with, beside it and beside its best checkpoint."""
-    for place in (directory, directory.best):
-        replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
-    kept = [override for override in overrides if not override.startswith("resume=")]
-    replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
-    directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
-
-
 def run_directory(config: RunConfig) -> RunDirectory:
     """Return that of a resolved configuration."""
     assert config.run_dir is not None, "resolve_common() names it"
@@ -176,37 +407,3 @@ def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> 
 def make_tracker(config: RunConfig) -> EpisodeTracker:
     """Make what finds the finished episodes of this process's worlds."""
     return EpisodeTracker(config.env.num_envs // parallel.count(), CrashCause if is_race(config) else None)
-
-
-def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
-    """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
-    loggers = make_loggers(directory.path, config.logger, resumed)
-    plain = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True)))
-    for sink in loggers:
-        sink.log_configuration(settings_of(plain), OmegaConf.to_yaml(plain))
-    return loggers
-
-
-def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
-    """Take a run directory for a session in it, if the run can work at all.
-
-    Raises:
-        ValueError: it cannot; or the directory holds another run, or is in use by a live one.
-    """
-    check(config)
-    directory = run_directory(config)
-    lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
-    if parallel.is_first() and not config.resume:
-        with suppress(FileNotFoundError):
-            newest = latest_checkpoint(directory.checkpoints)
-            lock.abandon()
-            raise ValueError(
-                f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with "
-                f"resume={config.run_dir}, or choose another run_dir."
-            )
-    return Session(
-        config,
-        lock,
-        lambda env_steps: write_configuration(directory, config, overrides, env_steps),
-        lambda resumed: make_run_loggers(config, directory, resumed),
-    )

@@ -28,7 +28,7 @@ class DrawFigures(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Draw everything for which there is something to draw; end with status 1 if a run has failed."""
         # Here, because hydra makes this object at the start of every job, and drawing is for the end.
-        from composing.command_line import start_logging
+        from composing.entry import start_logging
         from dreamer_racing.figures.plotting import PlotConfig, draw
 
         start_logging()

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import imu_of, track_as_begun
-from composing.command_line import override_key
+from composing.building import imu_of, track_as_begun
+from composing.entry import override_key
 from composing.schema import (
     CollectorKind,
     DreamerV3RunConfig,

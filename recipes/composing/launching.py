@@ -4,8 +4,8 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,9 +14,9 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from composing.building import open_session
-from composing.checks import check_overrides, check_read
-from composing.command_line import (
+from composing.building import run_directory
+from composing.checks import check, check_overrides, check_read
+from composing.entry import (
     as_override,
     follow_quietly,
     merge_overrides,
@@ -25,23 +25,26 @@ from composing.command_line import (
     plain_errors,
     start_logging,
 )
+from composing.options import command
 from composing.resolving import tune
-from composing.saved import SEEN, changed_settings, keep_saved, read_yaml, saved_config
+from composing.saved import SEEN, changed_settings, keep_saved, read_yaml, saved_config, settings_of
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
-from composing.usage import command
 from dreamer_racing import parallel
 from dreamer_racing.commands import from_here
 from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
+from dreamer_racing.figures.loggers import RunLogger, make_loggers
 from dreamer_racing.learners.finite_guard import NonFiniteLossError
 from dreamer_racing.machine import (
+    git_commit,
     is_out_of_memory,
     keep_freed_memory,
     out_of_memory_advice,
 )
 from dreamer_racing.training.checkpoint import RunCheckpointError, newest_sound
-from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint
+from dreamer_racing.training.directory import PREFIX, RunDirectory, env_steps_of, latest_checkpoint, replace_text
+from dreamer_racing.training.following import LockHeldByFirst
 from dreamer_racing.training.session import Session
 
 TRAINED_ON = ("track", "task", "decoys", "init_from", *SEEN)
@@ -141,6 +144,49 @@ def training_session(config: RunConfig, overrides: list[str], remedy: str) -> It
         raise SystemExit(f"error: {out_of_memory_advice(error)} {session.last_good}.") from error
     finally:
         session.close()
+
+
+def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
+    """Take a run directory for a session in it, if the run can work at all.
+
+    Raises:
+        ValueError: it cannot; or the directory holds another run, or is in use by a live one.
+    """
+    check(config)
+    directory = run_directory(config)
+    lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
+    if parallel.is_first() and not config.resume:
+        with suppress(FileNotFoundError):
+            newest = latest_checkpoint(directory.checkpoints)
+            lock.abandon()
+            raise ValueError(
+                f"run_dir={config.run_dir} holds a run already, with {newest.name}: continue it with "
+                f"resume={config.run_dir}, or choose another run_dir."
+            )
+    return Session(
+        config,
+        lock,
+        lambda env_steps: write_configuration(directory, config, overrides, env_steps),
+        lambda resumed: make_run_loggers(config, directory, resumed),
+    )
+
+
+def write_configuration(directory: RunDirectory, config: RunConfig, overrides: Sequence[str], env_steps: int) -> None:
+    """Keep what a run is started with, beside it and beside its best checkpoint."""
+    for place in (directory, directory.best):
+        replace_text(place.config, OmegaConf.to_yaml(OmegaConf.structured(config)))
+    kept = [override for override in overrides if not override.startswith("resume=")]
+    replace_text(directory.overrides, OmegaConf.to_yaml(OmegaConf.create(kept)))
+    directory.note_start(env_steps, kept, git_commit(Path(__file__).parent))
+
+
+def make_run_loggers(config: RunConfig, directory: RunDirectory, resumed: int | None) -> list[RunLogger]:
+    """Make the loggers of a run, resumed behind its row at so many env_steps, and give them its configuration."""
+    loggers = make_loggers(directory.path, config.logger, resumed)
+    plain = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(config), enum_to_str=True)))
+    for sink in loggers:
+        sink.log_configuration(settings_of(plain), OmegaConf.to_yaml(plain))
+    return loggers
 
 
 def tell_of_thread(failure: threading.ExceptHookArgs) -> None:

@@ -12,8 +12,8 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from composing.arena import describe_file, worlds_device
-from composing.command_line import new_run_dir
+from composing.building import describe_file, worlds_device
+from composing.entry import new_run_dir
 from composing.options import CONFIG_DIR
 from composing.saved import said, settings_of
 from composing.schema import CollectorKind

@@ -10,8 +10,7 @@ from typing import Any, cast
 import torch
 from omegaconf import MISSING
 
-from composing.arena import Environment, describe_file, make_env, track_as_begun, worlds_device
-from composing.learners import make_learner
+from composing.building import Environment, describe_file, make_env, make_learner, track_as_begun, worlds_device
 from composing.saved import trained_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing.commands import from_here

@@ -57,7 +57,7 @@ def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> 
         ratio = config.make_replay_ratio()
         assert ratio.updates(config.total_env_steps) > 0
     interface = Interface(pixels=False, vector_dim=21)
-    learner = recipe_module("composing.learners").make_learner(config, interface, "cpu")
+    learner = recipe_module("composing.building").make_learner(config, interface, "cpu")
     assert (learner.updates, learner.device) == (0, torch.device("cpu"))
     for policy in (learner.policy(), learner.evaluation_policy()):
         assert policy.deterministic is False and isinstance(policy.make_primer(), Transform)
@@ -68,11 +68,11 @@ def test_every_algorithm_has_its_recipe_its_files_and_its_learner(name: str) -> 
 def test_an_algorithm_without_a_learner_is_a_defect_that_says_so() -> None:
     config = recipe_module("composing.schema").RunConfig()
     with pytest.raises(NotImplementedError, match=r"make_learner\(\) knows no learner of a RunConfig"):
-        recipe_module("composing.learners").make_learner(config, Interface(), "cpu")
+        recipe_module("composing.building").make_learner(config, Interface(), "cpu")
 
 
 def test_decoys_are_a_config_group() -> None:
-    arena, dreamer = recipe_module("composing.arena"), recipe_module("dreamer_v3")
+    arena, dreamer = recipe_module("composing.building"), recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=figure8", "+decoys=paper")))
     assert arena.worlds_of(config)["track"] == load_track("figure8_decoys")
     config.track = "circle"
@@ -99,7 +99,7 @@ def test_worlds_to_train_and_to_be_evaluated_in_are_where_the_learner_is(
     monkeypatch: pytest.MonkeyPatch, device: str, overrides: list[str], expected: str
 ) -> None:
     """Where they can be; the device is asked for, not looked for."""
-    arena, config = recipe_module("composing.arena"), resolved_on(device, monkeypatch, *overrides)
+    arena, config = recipe_module("composing.building"), resolved_on(device, monkeypatch, *overrides)
     assert config.env.device == expected
     if config.env.suite == "race":
         made = []
@@ -192,7 +192,7 @@ def test_what_races_from_images_alone_sees_no_state_in_training() -> None:
     images, race = (compose("latent_ppo", f"tuned={name}") for name in ("images", "race"))
     assert (images.loss.world_model, images.loss.critic) == ("reconstruction", "latent")
     assert (images.env.start_on_line, images.env.start_at_gate, images.schedule.start_on_line.to) == (0, 0.5, None)
-    arena = recipe_module("composing.arena")
+    arena = recipe_module("composing.building")
     recipe = recipe_module("latent_ppo")
     resolved = [recipe.resolve(compose("latent_ppo", f"tuned={name}", "device=cpu")) for name in ("images", "race")]
     readers = [arena.privileged_losses(OmegaConf.to_object(config)) for config in resolved]
@@ -288,7 +288,7 @@ def test_a_run_with_a_setting_of_another_version_is_refused_by_its_name(tmp_path
 def test_the_control_suite_is_evaluated_in_images_of_the_size_trained_on():
     overrides = ["env=dmc", "task=cartpole_swingup", "env.image_size=96", "model=debug", "device=cpu", "seed=3"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    evaluated = recipe_module("composing.arena").make_suite(config, 1, 4)
+    evaluated = recipe_module("composing.building").make_suite(config, 1, 4)
     assert evaluated.observation_spec["pixels"].shape == (1, 96, 96, 3)
     evaluated.close()
 
@@ -306,7 +306,7 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
 
 
 def test_a_ramp_with_the_name_of_a_number_of_the_losses_moves_it():
-    learners, names = recipe_module("composing.learners"), ("discount", "entropy_scale", "max_std", "min_std")
+    learners, names = recipe_module("composing.building"), ("discount", "entropy_scale", "max_std", "min_std")
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false"]
     overrides += [f"schedule.{name}.to=0.5" for name in (*names, "learning_rates", "world_model_rate")]
     overrides += ["schedule.imagination_horizon.to=2"]
@@ -345,7 +345,7 @@ def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(
     """What trains and what restores a learner make it alike."""
     overrides = ["tuned=none", "model=debug", "device=cpu", "env.from_pixels=false", "loss=informed", "seed=7"]
     overrides += ["loss.critic=state", "loss.min_std=0.2", "env.num_envs=2", f"run_dir={tmp_path / 'run'}"]
-    recipe, learners = recipe_module("latent_ppo"), recipe_module("composing.learners")
+    recipe, learners = recipe_module("latent_ppo"), recipe_module("composing.building")
     config = OmegaConf.to_object(recipe.resolve(compose("latent_ppo", *overrides)))
     run = prepared(*overrides, name="latent_ppo")
     made = learners.make_learner(config, Interface.of(run.env), config.device).state_dict()

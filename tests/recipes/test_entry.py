@@ -54,7 +54,7 @@ def test_a_setting_of_other_recipes_is_said_to_be_theirs() -> None:
 
 @pytest.mark.parametrize("text", ["runs/a-b_1.2", "läufe/k1", "a,b", "it's", "a\\'b\\", "(x)[y]{z}=1#&", "null", "1e3"])
 def test_any_text_can_be_said_to_hydra(text: str) -> None:
-    command_line = recipe_module("composing.command_line")
+    command_line = recipe_module("composing.entry")
     override = command_line.as_override("run_dir", text)
     assert command_line.override_value(override) == text
     assert (override == f"run_dir={text}") is (text == "runs/a-b_1.2")
@@ -207,7 +207,7 @@ SETTINGS = [
 def test_the_actor_waits_while_the_newest_records_are_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.learners")
+    latent_ppo, measuring = recipe_module("latent_ppo"), recipe_module("composing.building")
     config, session = open_session(
         *SETTINGS, f"run_dir={tmp_path}", f"total_env_steps={32 * (12 + LOOKS)}", name="latent_ppo"
     )

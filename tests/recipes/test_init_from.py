@@ -84,7 +84,7 @@ def test_the_networks_of_an_agent_that_ships(tmp_path: Path, capsys: pytest.Capt
 def test_what_does_not_fit_is_refused(
     overrides: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit), recipe_module("composing.command_line").plain_errors():
+    with pytest.raises(SystemExit), recipe_module("composing.entry").plain_errors():
         prepared(*overrides, f"run_dir={tmp_path / 'run'}")
     said = capsys.readouterr().err
     assert all(word in said for word in words), said

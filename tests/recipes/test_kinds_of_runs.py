@@ -285,11 +285,11 @@ def test_control_rate_line_starts_and_noise_reach_training_and_evaluation(tmp_pa
     options.append("evaluation.episodes=3")
     resolved = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *TINY, *options, "env.episode_steps=null"))
     assert resolved.env.episode_steps == 500
-    config, arena = OmegaConf.to_object(resolved), recipe_module("composing.arena")
+    config, arena = OmegaConf.to_object(resolved), recipe_module("composing.building")
     env = arena.make_env(config)
     assert (env.worlds.parameters.control_dt, env.worlds.race.episode_steps) == (0.04, 500)
     assert (env.worlds._starts._on_line, env.worlds.race._sweep._miss_radius) == (0.5, 2)
-    learner = recipe_module("composing.learners").make_learner(config, Interface.of(env), "cpu")
+    learner = recipe_module("composing.building").make_learner(config, Interface.of(env), "cpu")
     env.close()
     report = arena.make_evaluator(config, tmp_path, learner, 3, 20, config.evaluation.start_noise)
     assert report._course.base.worlds.parameters.control_dt == 0.04

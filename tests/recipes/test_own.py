@@ -95,7 +95,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -> None:
-    dreamer, arena, saved = map(recipe_module, ("dreamer_v3", "composing.arena", "composing.saved"))
+    dreamer, arena, saved = map(recipe_module, ("dreamer_v3", "composing.building", "composing.saved"))
     resolved = dreamer.resolve(compose("dreamer_v3", *RUN, *OWN))
     OmegaConf.save(resolved, folder / "config.yaml")
     config = saved.trained_config(folder)
@@ -195,7 +195,7 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     write(track, file)
-    dreamer, arena = recipe_module("dreamer_v3"), recipe_module("composing.arena")
+    dreamer, arena = recipe_module("dreamer_v3"), recipe_module("composing.building")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
     assert arena.track_as_begun(config) == track
     file.write_text("gates: []", encoding="utf-8")

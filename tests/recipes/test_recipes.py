@@ -298,7 +298,7 @@ def test_a_kill_while_a_run_is_continued_leaves_its_configuration_whole(
     saved = recipe_module("composing.launching").saved_config(copied.path)
     saved.seed = 7
     config = OmegaConf.to_object(saved)
-    write, sync = recipe_module("composing.building").write_configuration, os.fsync
+    write, sync = recipe_module("composing.launching").write_configuration, os.fsync
 
     def killed(descriptor: int) -> None:
         if not left[0]:

@@ -23,14 +23,14 @@ from dreamer_racing import commands
 from dreamer_racing.settings import check_settings, shortened
 from tests.running_recipes import CONFIG, ROOT, recipe, recipe_module
 
-options, usage = recipe_module("composing.options"), recipe_module("composing.usage")
+options = recipe_module("composing.options")
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py"))
 
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_help_has_what_it_does_and_every_option_with_a_meaning(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "dev", lambda: "")  # which makes lines longer
-    text = "\n".join(usage.usage(name))
+    text = "\n".join(options.usage(name))
     said = (ROOT / "recipes" / f"{name}.py").read_text(encoding="utf-8").splitlines()[0].lstrip('r"').rstrip('"')
     assert said in text and f"python recipes/{name}.py" in text
     assert options.options(name) and all(option.name.split(",")[0] in text for option in options.options(name))
@@ -103,7 +103,7 @@ def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
 
 def test_other_programs_keep_their_help(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/somewhere/export.py", "--help"])
-    usage.answer_early()
+    options.answer_early()
 
 
 # Every option of every recipe takes a value or refuses it in plain words, whatever the value.
@@ -157,7 +157,7 @@ def check(recipe: str, config: DictConfig) -> None:
 def test_every_option_takes_a_value_or_refuses_it_in_plain_words(
     recipe: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    entry, plain_errors = recipe_module("composing.entry"), recipe_module("composing.command_line").plain_errors
+    entry, plain_errors = recipe_module("composing.entry"), recipe_module("composing.entry").plain_errors
     options = names(recipe)
 
     @given(st.sampled_from(options), values)
@@ -183,7 +183,7 @@ def test_no_option_lets_a_value_of_another_kind_or_size_through_to_a_traceback(
     recipe: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every option in turn, with odd values that its type takes, before the recipe's own check."""
-    plain_errors, options = recipe_module("composing.command_line").plain_errors, names(recipe)
+    plain_errors, options = recipe_module("composing.entry").plain_errors, names(recipe)
     whole = compose(recipe)
     check(recipe, copy.deepcopy(whole))  # as it is, it is taken
     state = pickle.dumps(whole)  # quicker copied by this than by deepcopy

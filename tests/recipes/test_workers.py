@@ -152,7 +152,7 @@ def share(monkeypatch: pytest.MonkeyPatch, *overrides: str, rank: int = 0, proce
     for name, value in OmegaConf.load(ROOT / "recipes/config/model/debug.yaml").items():
         if OmegaConf.is_missing(config.model, name):
             config.model[name] = value
-    return recipe_module("composing.sharing").share_of(OmegaConf.to_object(config))
+    return recipe_module("composing.workers").share_of(OmegaConf.to_object(config))
 
 
 def test_shares_add_up_to_the_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -239,7 +239,7 @@ def contracts(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
 def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]:
     """Yield cases that compose, resolve and check a configuration."""
     sys.path.insert(0, str(ROOT / "recipes"))
-    from composing import checks, command_line, entry, options, schema
+    from composing import checks, entry, options, schema
     from dreamer_v3 import resolve
 
     config_dir = str(ROOT / "recipes" / "config")
@@ -257,7 +257,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
         given = ["device=cpu", *(entry.readable(override) for override in given)]
         quiet = io.StringIO()
         try:
-            with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), command_line.plain_errors():
+            with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet), entry.plain_errors():
                 options.refuse_slips("dreamer_v3", given)
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
