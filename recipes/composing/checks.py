@@ -222,22 +222,6 @@ def check_world_model(config: WorldModelRunConfig) -> None:
 def check_collector(config: WorldModelRunConfig) -> None:
     """Refuse workers beside other ways to collect, and worlds or weights that cannot be shared out among them."""
     workers, num_envs, asked = config.num_workers, config.env.num_envs, config.workers
-    if config.collector is CollectorKind.overlapped:
-        if not is_race(config):
-            raise ValueError(
-                f"collector=overlapped is for the race: the OpenGL contexts of env.suite={config.env.suite} belong to "
-                "the thread that made them. Use collector=local."
-            )
-        if config.env.device != "cpu":
-            raise ValueError(
-                "collector=overlapped steps worlds in a thread, and evaluation steps others meanwhile, which warp can "
-                "do on a CPU only: use env.device=cpu, or collector=local."
-            )
-        if config.model.cuda_graph:
-            raise ValueError(
-                "collector=overlapped acts on the device while model.cuda_graph=true captures updates there, which "
-                "CUDA refuses: choose one of them."
-            )
     if config.collector is not CollectorKind.ray:
         default = vars(WorkersConfig())
         given = [] if workers is None else [f"num_workers={workers}"]

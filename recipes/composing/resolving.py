@@ -16,7 +16,6 @@ from composing.building import describe_file, worlds_device
 from composing.entry import new_run_dir
 from composing.options import CONFIG_DIR
 from composing.saved import said, settings_of
-from composing.schema import CollectorKind
 from composing.workers import resolve_workers
 from dreamer_racing import parallel
 from dreamer_racing.devices import choose_device, choose_mixed_precision
@@ -43,11 +42,9 @@ def resolve_common(config: DictConfig, num_envs: int) -> torch.device:
     if config.env.episode_steps is None and config.env.suite == "race":
         config.env.episode_steps = round(EPISODE_TIME * config.env.control_rate)
     if config.env.device == "auto":
-        overlapped = config.get("collector") is CollectorKind.overlapped  # beside the learner
-        config.env.device = "cpu" if overlapped else worlds_device(device, config.env)
-        reason = "collector=overlapped" if overlapped else f"env.device=auto, env.renderer={config.env.renderer}"
-        if overlapped or device.type != "cpu":
-            print(f"worlds: {config.env.device} ({reason})")
+        config.env.device = worlds_device(device, config.env)
+        if device.type != "cpu":
+            print(f"worlds: {config.env.device} (env.device=auto, env.renderer={config.env.renderer})")
     if config.env.suite == "race":
         note_track(config)
     if config.env.reward is not None and config.curriculum.maximum:
@@ -208,6 +205,5 @@ def let_drift(config: DictConfig) -> None:
 
 
 def captures(config: DictConfig, device: torch.device) -> bool:
-    """Whether updates can be captured as a CUDA graph: not beside what acts meanwhile, or exchanges on the way."""
-    alone = parallel.asked_for() == 1 or config.algorithm == "latent_ppo"
-    return device.type == "cuda" and config.collector is not CollectorKind.overlapped and alone
+    """Whether updates can be captured as a CUDA graph: not those that exchange something on the way."""
+    return device.type == "cuda" and (parallel.asked_for() == 1 or config.algorithm == "latent_ppo")

@@ -81,7 +81,6 @@ class CollectorKind(Enum):
     """Who flies to learn, and when."""
 
     local = "local"
-    overlapped = "overlapped"
     ray = "ray"
 
 
@@ -133,8 +132,7 @@ class WorldModelRunConfig(ReplayRunConfig):
     tuned: str = "auto"
     prefill: int = setting(4_000, NOT_NEGATIVE)
     rollout_steps: int = setting(8, COUNT)
-    # local: fly in turns with updates; overlapped: in a thread during them, with the weights before them; ray: workers
-    # on a Ray cluster fly, also during updates
+    # local: fly in turns with updates; ray: workers on a Ray cluster fly, also during updates
     collector: CollectorKind = CollectorKind.local
     num_workers: int | None = setting(None, COUNT)  # with collector=ray; null: 2
     workers: WorkersConfig = field(default_factory=WorkersConfig)

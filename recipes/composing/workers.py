@@ -1,4 +1,4 @@
-"""Who flies to learn: the share of each process that torchrun started, in turns with learning, beside it, or on Ray."""
+"""Who flies to learn: the share of each process that torchrun started, in turns with learning, or on Ray."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from composing.schema import CollectorKind, LatentPPORunConfig, WorldModelRunCon
 from dreamer_racing import parallel
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience import ray_cluster
-from dreamer_racing.experience.overlapped import OverlappedRollouts, acting_copy
 from dreamer_racing.experience.ray_rollouts import RayRollouts
 from dreamer_racing.experience.rollouts import Rollouts
 from dreamer_racing.learners.learner import seeded
@@ -129,10 +128,7 @@ def make_rollouts(config: WorldModelRunConfig, env: Environment, learner: WorldM
     policy = learner.policy()
     if config.collector is CollectorKind.ray:
         return make_workers(config, env, policy)
-    if config.collector is CollectorKind.local:
-        return Rollouts(make_collector(config, env, policy))
-    acting = acting_copy(policy)
-    return OverlappedRollouts(make_collector(config, env, acting), acting, policy)
+    return Rollouts(make_collector(config, env, policy))
 
 
 def make_workers(config: WorldModelRunConfig, env: Environment, policy: DreamerPolicy) -> RayRollouts:

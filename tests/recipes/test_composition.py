@@ -90,7 +90,6 @@ def test_decoys_are_a_config_group() -> None:
         ("cuda", ["env.renderer=egl"], "cpu"),
         ("cuda", ["env=dmc"], "cpu"),
         ("cuda", ["env.device=cpu"], "cpu"),
-        ("cuda", ["collector=overlapped"], "cpu"),
         ("cpu", ["collector=ray", "workers.gpus=0.5"], "cpu"),  # the learner's own
         ("cuda", ["collector=ray"], "cuda"),
     ],
@@ -126,7 +125,6 @@ def resolved_on(device: str, monkeypatch: pytest.MonkeyPatch, *overrides: str, n
         (["model.batch_length=64"], ("size12m", 16, 64, False, True)),
         (["replay.context=false"], ("size12m", 16, 64, False, True)),
         (["model.cuda_graph=false"], ("size12m", 64, 16, True, False)),
-        (["collector=overlapped"], ("size12m", 64, 16, True, False)),
         (["tuned=race"], ("cpu_small", 32, 16, True, True)),
         (["tuned=suite", "env=dmc"], ("cpu_small", 16, 32, True, True)),
     ],

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from dreamer_racing.envs.control_suite import ControlSuiteEnv
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.checkpoint import load_components, newest_sound
+from dreamer_racing.training.checkpoint import newest_sound
 from dreamer_racing.training.directory import env_steps_of, latest_checkpoint
 from tests.running_recipes import (
     AT_THE_END,
@@ -24,7 +24,6 @@ from tests.running_recipes import (
     UNDRAWN,
     build,
     compose,
-    open_session,
     recipe,
     recipe_module,
     rows,
@@ -188,34 +187,6 @@ def test_a_run_in_the_control_suite(tmp_path: Path) -> None:
         assert "cartpole_swingup" in refused.stderr and "race" in refused.stderr
     resumed = recipe("dreamer_v3", "resume=run", "task=walker_walk", cwd=tmp_path)
     assert resumed.returncode == 2 and "Traceback" not in resumed.stderr, resumed.stderr
-
-
-@pytest.mark.slow
-def test_an_overlapped_run(tmp_path: Path) -> None:
-    done = recipe("dreamer_v3", *TINY, "collector=overlapped", AT_THE_END, "run_dir=run", cwd=tmp_path, before=UNDRAWN)
-    assert done.returncode == 0, done.stderr
-    table = rows(tmp_path / "run")
-    # The rollout that was under way at the end is kept too, and evaluated after what was learned from it.
-    assert [int(row["env_steps"]) for row in table] == [128, 256]
-    assert table[-1]["evaluation/return_mean"]
-    assert any(float(row["loss_image"] or "nan") > 0 for row in table)
-    assert latest_checkpoint(tmp_path / "run").name.endswith("256")
-
-
-@pytest.mark.slow
-def test_what_is_learned_ahead_of_a_checkpoint_is_in_it(tmp_path: Path) -> None:
-    """Also of the rollout that was under way when the run ended: nothing is learned after the last checkpoint."""
-    dreamer = recipe_module("dreamer_v3")
-    overrides = [*TINY, "env.from_pixels=false", "collector=overlapped", "total_env_steps=192", "checkpoint.every=96",
-                 f"run_dir={tmp_path}"]  # fmt: skip
-    config, session = open_session(*overrides)
-    dreamer.train(config, session)
-    session.close()
-    counters: dict[str, int] = {}
-    load_components(tmp_path, {"counters": counters})
-    assert counters == session.counters
-    assert session.parts["ratio"].updates_due(session.env_steps, session.parts["learner"].updates) == 0
-    assert env_steps_of(latest_checkpoint(tmp_path)) == 192 + 32
 
 
 @pytest.mark.slow

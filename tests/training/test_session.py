@@ -24,7 +24,7 @@ from dreamer_racing.training.signals import GracefulExit
 
 
 class OneAhead(Rollouts):
-    """Collects one rollout ahead, as `collector=overlapped` does, of worlds that are not saved."""
+    """Collects one rollout ahead, as workers on Ray do, of worlds that are not saved."""
 
     has_worlds = False
 
