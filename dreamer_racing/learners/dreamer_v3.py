@@ -131,6 +131,9 @@ class DreamerV3(WorldModelLearner):
                 scale=scale,
             )
             objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
+            if numbers.action_change_scale:
+                metrics["action_change"] = trajectory.action_change()
+                objective = objective + numbers.action_change_scale * metrics["action_change"]
             losses |= metrics | {"loss_actor": self._actor_learns * objective}
 
             # Critic: two-hot regression of the λ-returns that were replayed, and of those imagined (Eq. 10). If every

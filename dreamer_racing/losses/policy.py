@@ -57,6 +57,17 @@ class Trajectory:
         """Return the mean over the steps ``(H, N, 1)``, by what they count for, a scalar."""
         return (self.weight * values).mean()
 
+    def action_change(self) -> Tensor:
+        """Return the mean square ‖μₜ − μₜ₋₁‖² by which the policy's mean changes from step to step, a scalar.
+
+        For steps in order, ``(H, N, ...)`` with H ≥ 2. It is of means, not of samples: noise shall not be held on to.
+
+        Reference: Mysore et al. 2021, "Regularizing action policies for smooth control with reinforcement learning",
+        Eq. 2, temporal smoothness; squared here, as in the paper's reward (b₃).
+        """
+        change = (self.policy.mean[1:] - self.policy.mean[:-1]).square().sum(-1, keepdim=True)
+        return (self.weight[1:] * change).mean()
+
 
 Objective = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 """What a policy minimises: ``(trajectory, **numbers)`` to a loss and metrics of it, scalars."""
