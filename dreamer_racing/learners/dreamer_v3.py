@@ -62,6 +62,7 @@ class DreamerV3(WorldModelLearner):
         self.return_range = PercentileValueNorm(quantiles=(0.05, 0.95), rate=1 - losses.return_decay, min_scale=1.0).to(
             device
         )
+        self.action_change_scale = torch.tensor(float(losses.action_change_scale), device=device)
         self._actor_learns = torch.ones((), device=device)  # 0 or 1, read by a captured graph too
         super().__init__(agent, losses, config)
 
@@ -131,10 +132,9 @@ class DreamerV3(WorldModelLearner):
                 scale=scale,
             )
             objective, metrics = self.objective(trajectory, entropy_scale=self.entropy_scale)
-            if numbers.action_change_scale:
-                metrics["action_change"] = trajectory.action_change()
-                objective = objective + numbers.action_change_scale * metrics["action_change"]
-            losses |= metrics | {"loss_actor": self._actor_learns * objective}
+            change = trajectory.action_change()
+            objective = objective + self.action_change_scale * change
+            losses |= metrics | {"loss_actor": self._actor_learns * objective, "action_change": change.detach()}
 
             # Critic: two-hot regression of the λ-returns that were replayed, and of those imagined (Eq. 10). If every
             # record was a start, its first imagined return is a better value than the critic's.
@@ -158,14 +158,19 @@ class DreamerV3(WorldModelLearner):
                 "value_error": (expected - returns).abs().mean(),
             }
 
-    def adjust(self, *, imagination_horizon: float | None = None, **numbers: Any) -> None:
+    def adjust(
+        self, *, imagination_horizon: float | None = None, action_change_scale: float | None = None, **numbers: Any
+    ) -> None:
         """Change what a run may have on a schedule, from the next update on; as `WorldModelLearner.adjust`.
 
         Args:
             imagination_horizon: H, rounded; a CUDA graph is captured again where it changes.
+            action_change_scale: Weight of the policy's changes from step to step.
             numbers: Others.
         """
         super().adjust(**numbers)
+        if action_change_scale is not None:
+            self.action_change_scale.fill_(action_change_scale)
         if imagination_horizon is not None and round(imagination_horizon) != self.horizon:
             self.horizon = round(imagination_horizon)
             if self._graph is not None:

@@ -60,13 +60,15 @@ class Trajectory:
     def action_change(self) -> Tensor:
         """Return the mean square ‖μₜ − μₜ₋₁‖² by which the policy's mean changes from step to step, a scalar.
 
-        For steps in order, ``(H, N, ...)`` with H ≥ 2. It is of means, not of samples: noise shall not be held on to.
+        For steps in order, ``(H, N, ...)``; the first, which follows none here, counts 0. It is of means, not of
+        samples: noise shall not be held on to.
 
         Reference: Mysore et al. 2021, "Regularizing action policies for smooth control with reinforcement learning",
-        Eq. 2, temporal smoothness; squared here, as in the paper's reward (b₃).
+        temporal smoothness; squared here, as changes of action are in the reward (b₃).
         """
-        change = (self.policy.mean[1:] - self.policy.mean[:-1]).square().sum(-1, keepdim=True)
-        return (self.weight[1:] * change).mean()
+        mean, weight = self.policy.mean, self.weight
+        change = (mean[1:] - mean[:-1]).square().sum(-1, keepdim=True)
+        return (weight[1:] * change).sum() / weight.numel()
 
 
 Objective = Callable[..., tuple[Tensor, dict[str, Tensor]]]

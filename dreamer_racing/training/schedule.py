@@ -152,6 +152,7 @@ class DreamerV3ScheduleConfig(ScheduleConfig):
     """And of what is imagined."""
 
     imagination_horizon: Ramp = field(default_factory=Ramp)  # model.imagination_horizon, rounded
+    action_change_scale: Ramp = field(default_factory=Ramp)  # loss.action_change_scale
 
 
 @dataclass
