@@ -682,3 +682,16 @@ def test_a_seed_means_the_weights_that_it_has_always_meant():
     }
     expected = {"world_model": 2380.58803, "actor": 103.634042, "critic": 223.145986, "decoder": 126.838377}
     assert sums == pytest.approx(expected, rel=1e-6)
+
+
+def test_changes_of_the_policy_are_measured_and_cost_what_is_set():
+    def first_update(scale: float, adjusted: float | None = None) -> dict[str, torch.Tensor]:
+        learner = learner_of(seed=0, **CONFIG, action_change_scale=scale)
+        learner.adjust(action_change_scale=adjusted)
+        torch.manual_seed(0)
+        return learner.update(make_batch())
+
+    free, dear, dearer = first_update(0.0), first_update(100.0), first_update(0.0, adjusted=100.0)
+    assert free["action_change"] == dear["action_change"] > 0
+    torch.testing.assert_close(dear["loss_actor"], free["loss_actor"] + 100.0 * free["action_change"])
+    assert dearer["loss_actor"] == dear["loss_actor"]

@@ -66,6 +66,19 @@ def entropy_of(policy: ActionDistribution) -> Tensor:
     return torch.distributions.Normal(policy.mean, policy.std).entropy().sum(-1, keepdim=True)
 
 
+def test_action_change_by_hand_pulls_neighbouring_means_together():
+    trajectory = make_trajectory()
+    mean, weight = trajectory.policy.mean, trajectory.weight
+    change = trajectory.action_change()
+    expected = sum(weight[t] * (mean[t] - mean[t - 1]).square().sum(-1, keepdim=True) for t in range(1, H)).sum()
+    torch.testing.assert_close(change, expected / (H * N))
+    change.backward()
+    nearer = mean.detach() - 0.1 * mean.grad
+    assert (nearer[1:] - nearer[:-1]).norm() < (mean[1:] - mean[:-1]).norm()
+    first = make_trajectory(policy=ActionDistribution(mean[:1], mean[:1]), weight=weight[:1])
+    assert first.action_change() == 0.0, "one step follows none"
+
+
 def test_reinforce_by_hand():
     trajectory = make_trajectory()
     loss, metrics = reinforce(trajectory, entropy_scale=torch.tensor(0.3))
