@@ -104,8 +104,8 @@ class DreamerV3Losses(LossConfig):
         continuation: Whether predicted ends of episodes cut imagined returns.
         open_loop_steps: Steps ahead for which rewards and ends are learned from replayed actions alone, as imagination
             reads them (`open_loop_loss`); 0, as in the reference: only where latents were observed.
-        action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next, in the
-            actor's loss (`Trajectory.action_change`); 0, as in the reference, turns it off.
+        action_change_scale: Weight of the squared change of the policy's mean from one imagined step to the next
+            (`Trajectory.action_change`) in the actor's loss; the reference has none.
         actor_begin: Updates after which the actor begins to learn. The gradient of the dynamics is followed as surely
             where the model is wrong: an actor that begins with the model is soon saturated. The reference has 0.
     """
