@@ -12,12 +12,12 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
 Read docs/hil_safety.md before anything with propellers. Only actor=pilot and report= need torch.
 """
 
+import itertools
 import json
 import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -200,7 +200,7 @@ def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) 
 def lap_times(chain: FlightChain) -> list[float]:
     """Return the times of whole laps from the first gate on, s."""
     firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
-    return [later - earlier for earlier, later in pairwise(firsts)]
+    return [later - earlier for earlier, later in itertools.pairwise(firsts)]
 
 
 def as_json(config: HilConfig) -> dict[str, Any]:

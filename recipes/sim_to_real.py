@@ -9,9 +9,9 @@ a clock: commands 0 to 100 ms late, mass and thrust 20 % off, noisy poses, few p
 """
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ def fly(actor: str, make_flyer: Callable[[], Flyer], track: Track, config: SimTo
         lap = "–" if flight.lap_time is None else f"{flight.lap_time:.2f} s"
         words = f"{flight.sweep} {flight.value:g}: {flight.gates} gates, laps of {lap}, {flight.ended}"
         say(f"{actor}: {words}")
-    made = {**provenance(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "actor": actor, "track": track.name}
+    made = {**provenance(), "date": time.strftime("%Y-%m-%d", time.gmtime()), "actor": actor, "track": track.name}
     return {"provenance": {**made, "preset": config.preset, "flights": config.flights}, "flights": flown}
 
 

@@ -1,5 +1,6 @@
 """The agent's networks; plain tensors inside, TensorDict only in ``DreamerPolicy``."""
 
+import dreamer_racing.envs  # noqa: F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo
 from dreamer_racing.modules.actor import ActionDistribution, Actor
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.critic import Critic

@@ -17,3 +17,5 @@ try:
 except CacheError as error:
     sys.exit(f"error: {error}")
 sys.excepthook = end_quietly
+
+import dreamer_racing.envs  # noqa: E402, F401 - heeds MUJOCO_GL before TorchRL imports MuJoCo

@@ -1,5 +1,7 @@
 """What a recipe says when it does not begin: what packages it lacks, errors, and Ctrl-C; by the standard library."""
 
+from __future__ import annotations  # an older Python gets to the words, too
+
 import importlib.util
 import os
 import signal

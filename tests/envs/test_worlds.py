@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import importlib
 import inspect
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -29,6 +31,7 @@ from dreamer_racing.envs.simulator.opengl import loads
 from dreamer_racing.envs.worlds import RaceWorlds, WorldOptions
 from tests.running_recipes import ROOT
 
+IMPORTS = (ast.Import, ast.ImportFrom)
 OF_ADAPTERS = {"self", "track", "num_envs", "preset", "from_pixels"}
 
 
@@ -149,6 +152,24 @@ def test_images_are_drawn_whatever_mujoco_gl_says(tmp_path: Path, value: str) ->
     done = run(["-c", program], tmp_path, MUJOCO_GL=value)
     assert done.returncode == 0 and "64" in done.stdout, done.stderr
     assert done.stderr.count(f"MUJOCO_GL={value} is left out of account") == 1
+
+
+def test_a_training_begins_whatever_mujoco_gl_says(tmp_path: Path) -> None:
+    """TorchRL imports MuJoCo, too. What is refused here is refused once all is imported."""
+    program = [str(ROOT / "recipes" / "dreamer_v3.py"), "model=debug", "total_env_steps=1"]
+    done = run(program, tmp_path, MUJOCO_GL="no_such_thing")
+    assert done.returncode == 2 and "Traceback" not in done.stderr and "prefill" in done.stderr, done.stderr
+    assert done.stderr.count("MUJOCO_GL=no_such_thing is left out of account") == 1
+
+
+def test_whatever_imports_torchrl_has_heeded_the_variable_before() -> None:
+    package = ROOT / "dreamer_racing"
+    users = {path for path in package.rglob("*.py") if re.search(r"^(from|import) torchrl", path.read_text(), re.M)}
+    folders = {package / path.relative_to(package).parts[0] for path in users} - {package / "envs"}
+    assert package / "learners" in folders
+    for folder in folders:
+        first = next(node for node in ast.parse((folder / "__init__.py").read_text()).body if isinstance(node, IMPORTS))
+        assert ast.unparse(first) == "import dreamer_racing.envs", folder
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import signal
 import subprocess
 import sys
@@ -186,9 +187,21 @@ def test_a_race_does_without_dm_control_which_opens_a_display(tmp_path: Path) ->
 # A recipe that is started by a Python without the project's packages.
 
 
+OLDER = """
+import datetime, enum, itertools, runpy, sys, typing
+del datetime.UTC, enum.StrEnum, itertools.pairwise, typing.Self  # as in Python 3.9
+sys.argv.pop(0)
+sys.path.insert(0, sys.argv[0].rpartition("/")[0])
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.py")), ids=lambda path: path.stem)
-def test_every_recipe_says_how_to_run_it(tmp_path: Path, path: Path) -> None:
-    command = [sys.executable, "-S", "-E", str(path)]  # no packages
+def test_every_recipe_says_how_to_run_it_to_an_older_python_too(tmp_path: Path, path: Path) -> None:
+    messages = (path.parent / "composing" / "messages.py").read_text(encoding="utf-8")
+    assert "from __future__ import annotations" in messages, "its hints are of newer Pythons"
+    ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 9))
+    command = [sys.executable, "-S", "-E", "-c", OLDER, str(path)]  # no packages
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "has no dreamer_racing" in done.stderr and f"{ROOT}/dev python {path}" in done.stderr
