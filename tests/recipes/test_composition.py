@@ -329,7 +329,10 @@ def test_what_the_chosen_losses_do_not_have_moves_only_if_it_is_asked_for():
         config = OmegaConf.to_object(resolved)
         moved = Schedule(config.schedule, config.scheduled, config.total_env_steps).at(0)
         found.append(set(moved) - {"rates", "world_model_rate", "start_on_line"})
-    assert found == [{"min_std", "max_std", "kl_target"}, {"min_std", "max_std", "imagination_horizon"}]
+    assert found == [
+        {"min_std", "max_std", "kl_target"},
+        {"min_std", "max_std", "imagination_horizon", "action_change_scale"},
+    ]
 
 
 def test_nothing_goes_by_gates_where_there_are_none():

@@ -35,7 +35,6 @@ REFUSED = [
     (["device=cuda:7"], ["cuda:7", "cpu"]),
     (["env.device=gpu"], ["env.device=gpu", "cpu", "cuda"]),
     (["env.device=cuda:7"], ["cuda:7", "finds no CUDA device", "cpu"]),
-    (["collector=overlapped"], ["overlapped", "local", "ray"]),
     (["num_workers=4"], ["num_workers=4 is for collector=ray"]),
     (["workers.cpus=2"], ["workers.cpus=2", "is for collector=ray"]),
     (["collector=ray", "num_workers=3"], ["env.num_envs=32", "num_workers=3", "env.num_envs=33"]),
