@@ -313,6 +313,10 @@ def test_a_restored_learner_goes_on_as_the_one_that_was_saved(
         metrics.append(each.update(make_batch()))
     assert metrics[0].keys() == metrics[1].keys()
     assert all(torch.equal(metrics[0][name], metrics[1][name]) for name in metrics[0])
+    seen = make_batch().select("vector")
+    actions = [each.policy(deterministic=True)(seen.clone())["action"] for each in (learner, other)]
+    assert torch.equal(*actions)
+    assert other.updates == learner.updates
 
 
 def test_a_reward_that_is_not_finite_changes_no_network() -> None:

@@ -11,7 +11,7 @@ import pytest
 from dreamer_racing.evaluation.trajectory import Trajectory, write_flight
 from dreamer_racing.settings import check_settings
 from tests.figures.test_dashboard import circling
-from tests.running_recipes import recipe, recipe_module
+from tests.running_recipes import ROOT, recipe, recipe_module
 
 
 def store(stem: Path, flight: Trajectory | None = None, track: str = "circle") -> None:
@@ -91,7 +91,8 @@ def test_a_port_is_in_its_range() -> None:
 
 def test_what_holds_no_flight_is_refused_with_what_would_be_right(runs: Path) -> None:
     dashboard = recipe_module("dashboard")
-    named = "run=runs/nowhere: there is no such .* circle, circle_betaflight, figure8"
+    agents = ", ".join(sorted(path.parent.name for path in (ROOT / "agents").glob("*/agent.json")))
+    named = f"run=runs/nowhere: there is no such .* {agents}"
     with pytest.raises(FileNotFoundError, match=named):
         dashboard.find(config(run="runs/nowhere"))
     (runs / "young").mkdir()

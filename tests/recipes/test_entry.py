@@ -85,6 +85,7 @@ def test_any_text_can_be_said_to_hydra(text: str) -> None:
             "schedule.max_std.by=gates",
             "schedule.max_std.by=gates: Invalid value 'gates', expected one of [run, passes, known].",
         ),
+        ("collector=overlapped", "collector=overlapped: Invalid value 'overlapped', expected one of [local, ray]."),
         ("kidney", "kidney: an override is written name=value"),
         ("run_dir=[a", "run_dir=[a: overrides are written name=value, and a value with brackets"),
     ],

@@ -20,8 +20,7 @@ def test_input_that_nobody_means_is_taken_or_refused(kind: str) -> None:
 def test_a_run_does_not_care_what_time_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kills, signals, damage and full disks have tests of their own in tests/recipes and tests/training."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    # a checkpoint and an evaluation on the way; images know of no clock
-    short = ["env.from_pixels=false", "evaluation.every=200", "total_env_steps=400"]
+    short = ["evaluation.every=200", "total_env_steps=400"]  # a checkpoint and an evaluation on the way
     monkeypatch.setattr(faults, "SETTINGS", [*faults.SETTINGS, *short])
     cases = list(faults.Arena(tmp_path).clocks())
     assert len(cases) == 2 and all(case["survived"] for case in cases), cases
