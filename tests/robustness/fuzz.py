@@ -45,6 +45,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from dreamer_racing.envs import DroneRacingEnv  # noqa: E402
+from dreamer_racing.envs.drone.parameters import PRESETS  # noqa: E402
 from dreamer_racing.envs.race.gates import CrashCause  # noqa: E402
 from dreamer_racing.envs.tracks import Track, TrackError, load_track  # noqa: E402
 from dreamer_racing.envs.worlds import RaceWorlds  # noqa: E402
@@ -242,6 +243,8 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
     from composing import checks, entry, options, schema
     from dreamer_v3 import resolve
 
+    for preset in PRESETS:  # one's own reward is tried in such worlds, whose kernels are compiled once
+        RaceWorlds("circle", 2, preset, from_pixels=False).close()
     config_dir = str(ROOT / "recipes" / "config")
     names = options.names("dreamer_v3")
     os.chdir(folder)
