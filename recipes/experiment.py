@@ -192,10 +192,8 @@ def run(command: list[str], run_dir: Path) -> int:
         del before[signal.SIGHUP]
     for number in before.keys() & {signal.SIGUSR1, signal.SIGUSR2}:
         signal.signal(number, signal.SIG_IGN)  # inherited by the recipe, for Slurm sends them to every process
-    with (
-        (run_dir / LOG).open("a", encoding="utf-8") as log,
-        subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process,
-    ):
+    log = (run_dir / LOG).open("a", encoding="utf-8")
+    with log, subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True) as process:
 
         def pass_on(number: int, frame: object) -> None:
             received.append(signal.Signals(number))

@@ -15,7 +15,7 @@ def choose_backend() -> None:
     dm_control decides when it is imported, and takes GLFW even where GLFW cannot open a window. A `MUJOCO_GL` that
     is set already is left alone.
     """
-    if "MUJOCO_GL" in os.environ or not sys.platform.startswith("linux"):
+    if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
         return
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         return
@@ -25,7 +25,7 @@ def choose_backend() -> None:
 
 def import_dm_control() -> None:
     """Import dm_control with the OpenGL that the user names, else with one that is there, else without any."""
-    for _ in range(2):  # the user's, and one of those that are there
+    for _ in range(3):  # what the user set, without one of two variables, and one of those that are there
         choose_backend()
         if imports_with_variable(RENDERING):
             return

@@ -20,10 +20,12 @@ refused: dict[str, str] = {}
 
 
 def imports_with_variable(name: str) -> bool:
-    """Import a package that reads `MUJOCO_GL`; if that fails, take the variable away and say so.
+    """Import a package that reads `MUJOCO_GL`; if that fails, take the variable that is in the way away and say so.
+
+    `PYOPENGL_PLATFORM` is in the way where it is set to anything but `MUJOCO_GL`, which MuJoCo and dm_control refuse.
 
     Raises:
-        Exception: what the package raises, where the variable is not set.
+        Exception: what the package raises, where neither is set.
     """
     value, platform = os.environ.get("MUJOCO_GL"), os.environ.get("PYOPENGL_PLATFORM")
     loaded = set(sys.modules)
@@ -35,13 +37,14 @@ def imports_with_variable(name: str) -> bool:
         reason = f"{type(error).__name__}: {error}"
     else:
         return True
-    del os.environ["MUJOCO_GL"]
+    variable, refusal = ("PYOPENGL_PLATFORM", platform) if platform not in (None, value) else ("MUJOCO_GL", value)
+    del os.environ[variable]
     if platform is None:
         os.environ.pop("PYOPENGL_PLATFORM", None)  # set by what failed
     for module in set(sys.modules) - loaded:
         if module.partition(".")[0] == "OpenGL":  # is bound to the platform that it was first imported for
             del sys.modules[module]
-    setting = f"MUJOCO_GL={value}"
+    setting = f"{variable}={refusal}"
     if setting not in refused:
         package = name.partition(".")[0]
         logger.warning("%s is left out of account: %s cannot be imported with it (%s).", setting, package, reason)
@@ -51,8 +54,8 @@ def imports_with_variable(name: str) -> bool:
 
 def heed_variables() -> None:
     """Import MuJoCo now if `MUJOCO_GL` is set, so that those who import it later are not failed by it."""
-    if "MUJOCO_GL" in os.environ and "mujoco" not in sys.modules:
-        imports_with_variable("mujoco")
+    while "MUJOCO_GL" in os.environ and "mujoco" not in sys.modules:
+        imports_with_variable("mujoco")  # or one variable less is set
 
 
 def in_the_way(backend: str) -> str:

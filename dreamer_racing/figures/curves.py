@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics
+from dreamer_racing.figures.runs import AXES, CurveKey, RunData, along, axis_of, group_runs, is_metrics, runs_below
 
+CURVES = "learning_curves.csv"  # the file beside the figure, which draws it again
 POINTS = 240  # P
 WINDOW_SHARE = 0.02  # of the longest run: the running mean's window, unless it is given
 GAPS = "where an evaluation left no value, mean of the seeds that have one, and nothing where fewer than half do"
@@ -363,10 +364,13 @@ def write_curves(path: str | Path, curves: LearningCurves) -> None:
             writer.writerows((_RAISE, *key, f"{x:{form}}", "", "", "", "") for x in raises)
 
 
-def holds_curves(path: str | Path) -> bool:
-    """Whether a file is named like one of `write_curves`, and is no run's `metrics*.csv`."""
+def curves_file(path: str | Path) -> Path | None:
+    """Find what `write_curves` wrote: a file that is no `metrics*.csv` of a run, or that of a folder without runs."""
     path = Path(path).expanduser()
-    return path.suffix == ".csv" and path.is_file() and not is_metrics(path)
+    if path.is_dir():
+        file = path / CURVES
+        return file if file.is_file() and next(runs_below(path), None) is None else None
+    return path if path.suffix == ".csv" and path.is_file() and not is_metrics(path) else None
 
 
 def read_curves(path: str | Path) -> LearningCurves:

@@ -13,8 +13,9 @@ from dreamer_racing.evaluation.dreams import Dream
 from dreamer_racing.evaluation.trajectory import read_trajectory
 from dreamer_racing.figures.comparison import COLUMNS, compare_variants, comparison_table
 from dreamer_racing.figures.curves import (
+    CURVES,
     LearningCurves,
-    holds_curves,
+    curves_file,
     learning_curves,
     read_curves,
     wanted_columns,
@@ -48,7 +49,7 @@ class Aggregate(Enum):
 class PlotConfig:
     """`recipes/plot.py`."""
 
-    # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv
+    # run directory, folder of some, table metrics*.csv, pattern or list [a,b]; or a learning_curves.csv, or its folder
     runs: Any = "runs"
     figure: str = "all"  # learning_curves | imagined | trajectories | comparison | all
     output: str = "figures"  # folder
@@ -89,9 +90,9 @@ def draw(config: PlotConfig) -> None:
     check_plot(config)
     output = ensure_writable(config.output, "output")
     places = as_list(config.runs)
-    if len(places) == 1 and holds_curves(places[0]):
+    if len(places) == 1 and (file := curves_file(places[0])):
         refuse_for_curves(config)
-        draw_curves(read_curves(places[0]), output)
+        draw_curves(read_curves(file), output)
         logger.info("learning_curves:  learning_curves.png, of the quantities and statistics that the file holds")
         return
     named = [name for name, files in (("trajectories", config.flights), ("imagined", config.dreams)) if files]
@@ -189,9 +190,9 @@ def warn(problems: list[str]) -> None:
 def draw_learning_curves(config: PlotConfig, output: Path, runs: list[RunData], problems: list[str]) -> Drawn:
     """Make `learning_curves.png` and `.csv`."""
     curves = learning_curves(runs, config.quantities, config.aggregate.value, config.window, problems, config.axis)
-    write_curves(output / "learning_curves.csv", curves)
+    write_curves(output / CURVES, curves)
     draw_curves(curves, output)
-    return Drawn(["learning_curves.png", "learning_curves.csv"], curves.problems)
+    return Drawn(["learning_curves.png", CURVES], curves.problems)
 
 
 def draw_curves(curves: LearningCurves, output: Path) -> None:

@@ -163,7 +163,7 @@ def find_runs(places: Sequence[str | Path]) -> list[Path]:
     found = set()
     for place in places:
         folders = sorted(glob.glob(os.path.expanduser(str(place)), recursive=True))
-        inside = {run for folder in folders for run in _runs_below(Path(folder))}
+        inside = {run for folder in folders for run in runs_below(Path(folder))}
         if not inside:
             raise ValueError(
                 f"runs={place}: there is no run directory (a folder with config.yaml or metrics.csv) "
@@ -173,7 +173,8 @@ def find_runs(places: Sequence[str | Path]) -> list[Path]:
     return sorted(found)
 
 
-def _runs_below(folder: Path) -> Iterator[Path]:
+def runs_below(folder: Path) -> Iterator[Path]:
+    """Walk through the run directories and tables of a folder, at any depth."""
     if is_metrics(folder):
         yield folder
     for path, folders, files in os.walk(folder):

@@ -183,6 +183,17 @@ def test_the_doctor_names_the_variable_and_no_package_that_is_there(tmp_path: Pa
     assert "Traceback" not in done.stderr and "apt-get install libegl1" not in done.stdout
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("word", ["", "egl", "no_such_thing"])
+def test_dm_control_draws_whatever_pyopengl_platform_says(tmp_path: Path, word: str) -> None:
+    if not loads("libEGL.so.1"):
+        pytest.skip("EGL is not installed here")
+    program = "from dreamer_racing.envs import load; print(load('circle', from_pixels=True).reset().observation.keys())"
+    done = run(["-c", program], tmp_path, MUJOCO_GL=word, PYOPENGL_PLATFORM="glx")
+    assert done.returncode == 0 and "pixels" in done.stdout, done.stderr
+    assert done.stderr.count("PYOPENGL_PLATFORM=glx is left out of account") == 1
+
+
 def test_dm_control_does_without_opengl_where_none_of_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr(dm_control_gl, "imports_with_variable", lambda name: False)

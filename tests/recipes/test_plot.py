@@ -59,6 +59,8 @@ def test_all_figures_and_the_curves_again_from_their_csv(runs):
     assert done.returncode == 0, done.stderr
     made = {path.name for path in (runs / "again").iterdir()}
     assert made == {"learning_curves.png", "learning_curves_left_out.txt"}
+    done = plot("runs=figures", "output=once_more", cwd=runs)
+    assert done.returncode == 0 and (runs / "once_more" / "learning_curves.png").is_file(), done.stderr
     done = plot("runs=figures/learning_curves.csv", "figure=comparison", "quantities=[gates]", cwd=runs)
     assert done.returncode == 2 and "quantities=, figure=: runs=figures/learning_curves.csv is a file" in done.stderr
 
