@@ -19,20 +19,20 @@ PAGE = ROOT / "docs" / "reliability.md"
 HEADING = "last attack"
 NOT_MEASURED, NO_ATTACK = "not measured", "–"
 ATTACKS = {
-    "the process is killed, whenever": (
+    "the process is killed, at any time": (
         "kill", "kill early", "kill at open", "kill at rename", "kill at fsync",
     ),
     "Ctrl-C, SIGTERM": ("SIGTERM",),
-    "the machine goes away without a word": ("kill by the clock",),
+    "power loss, or the machine is taken away": ("kill by the clock",),
     "a file of a checkpoint is damaged or missing": ("damage", "checkpoints"),
     "the disk fills up": ("full disk",),
     "a loss or gradient that is not finite": ("not finite",),
-    "an action that is not finite, a world that explodes": ("actions",),
-    "the wall clock stops or goes back": ("clock",),
-    "a slip of the pen": ("overrides",),
-    "a track file from elsewhere": ("tracks",),
-    "a contract or an actor from elsewhere": ("contracts",),
-    "a checkpoint from elsewhere": ("checkpoints",),
+    "an action or a world that is not finite": ("actions",),
+    "the system clock changes": ("clock",),
+    "a wrong option": ("overrides",),
+    "an untrusted track file": ("tracks",),
+    "an untrusted export": ("contracts",),
+    "an untrusted checkpoint": ("checkpoints",),
 }  # fmt: skip
 """Kinds of attacks by the fault that a row is about."""
 CALLS = re.compile(r"(?:call|after opening) \d+ of (\d+)")
