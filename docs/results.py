@@ -43,14 +43,14 @@ NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
-draws the conclusions. To check a number at once, fly the included Kidney agent twice 100 times, 40 s of CPU:
+draws the conclusions. To check a number at once, fly the included Kidney agent 200 times, 40 s of CPU:
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-On an AMD EPYC it prints two blocks, of which these are some lines. All runs were evaluated like this at their end,
-unless a table says otherwise, with `checkpoint=runs/RUN`.
+You should see two blocks with these lines; processors differ a little. Files go to `runs/agent_kidney/evaluation`.
+Unless a table says otherwise, all runs were evaluated like this at their end (`checkpoint=runs/RUN`).
 
 ```text
 deterministic policy, 100 episodes
@@ -64,20 +64,21 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | word | meaning on this page |
 |---|---|
 | success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
-| sampled | success of the stochastic policy, whose actions are drawn from its distribution |
+| sampled | success of the stochastic policy, whose actions are samples from its distribution |
 | minutes | of one core of an AMD EPYC or an Intel Xeon, for the whole training |
-| state decoded | in training the world model learns the true state; in flight the agent sees images alone |
+| state decoded | in training the world model learns the true state; in flight the agent sees only images |
+| images alone | without the true state, also in training |
 | stopped | ended by hand, before the planned number of env_steps |
 | 16 imagined steps from 128 | DreamerV3: the horizon, and from how many stored latents it imagines in each update |
-| heads that learn ahead | `loss.open_loop_steps`: rewards and ends are learned some steps after the last image, too |
-| a weight on action changes | `env.action_change_weight`: a price on the change of the action |
-| `schedule.NAME` | a setting that moves to the value `to` in a run, here as gates are passed |
+| heads that learn ahead | `loss.open_loop_steps`: rewards and ends are also learned some steps after the last image |
+| a weight on action changes | `env.action_change_weight`: a penalty on the change of the action |
+| `schedule.NAME` | a setting that moves to the value `to`, as gates are passed ([`by: known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 
-Commands on this page run with today's code, whose defaults may differ. *Commands, commits, machine* links to those
-that made the numbers; before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `./dev
-python docs/results.py` writes this page from the `provenance.json` files in [results/](../results): change those."""
+The commands on this page use today's defaults. The numbers were made by those behind *Commands, commits, machine*.
+Before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `./dev python docs/results.py`
+writes this page from the `provenance.json` files in [results/](../results): change those."""
 
 
 @dataclass
