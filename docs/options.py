@@ -124,7 +124,7 @@ def read_meanings(config: type) -> dict[str, str]:
 
 def section(title: str, found: Sequence[Option]) -> str:
     """Return a heading and a table."""
-    lines = [f"## {title}", "", "| option | default | may be | |", "|---|---|---|---|"]
+    lines = [f"## {title}", "", "| option | default | may be | meaning |", "|---|---|---|---|"]
     for option in found:
         cells = (f"`{option.name}=`", option.default, option.allowed, option.meaning.replace("|", "\\|"))
         lines.append(f"| {' | '.join(cells)} |")
