@@ -69,9 +69,6 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
 | images alone | without the true state, also in training |
 | stopped | ended by hand, before the planned number of env_steps |
-| 16 imagined steps from 128 | DreamerV3: the horizon, and from how many stored latents it imagines in each update |
-| heads that learn ahead | `loss.open_loop_steps`: rewards and ends are also learned some steps after the last image |
-| a weight on action changes | `env.action_change_weight`: a penalty on the change of the action |
 | `schedule.NAME` | a setting that moves to the value `to`, as gates are passed ([`by: known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
