@@ -11,7 +11,6 @@ export stays in a folder of its size's name, and flies like any other, if badly:
 and sends at each tick, and never arms.
 """
 
-import argparse
 import logging
 import tempfile
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, report
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track, load_track
@@ -39,7 +38,7 @@ COLUMNS = (
 
 def main() -> None:
     """Measure every actor asked for, one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--actors", nargs="*", default=[], help="agents that ship by their names, or .onnx files")
     parser.add_argument("--sizes", nargs="*", default=[], choices=SIZES, metavar="SIZE", help=f"of {', '.join(SIZES)}")
     parser.add_argument("--track", default="circle", help="that contracts of sizes name")
@@ -47,7 +46,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000, help="timed")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--keep", help="folder in which exports of sizes stay")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     if not arguments.actors and not arguments.sizes:
         parser.error("nothing to measure: give --actors or --sizes")
@@ -59,8 +57,7 @@ def main() -> None:
         for size in arguments.sizes:
             paths[size] = export_initial(size, arguments.track, arguments.rate, Path(arguments.keep or folder) / size)
         records = [measure(name, path, arguments.steps, arguments.threads) for name, path in paths.items()]
-    print_table(records, COLUMNS)
-    write_json(records, arguments.json)
+    report(records, COLUMNS, arguments.json)
 
 
 def export_initial(size: str, track: str, rate: float, folder: Path) -> Path:

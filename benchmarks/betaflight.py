@@ -2,7 +2,6 @@
 
     python benchmarks/betaflight.py --recording tests/envs/drone/betaflight_firmware.csv.gz
     python benchmarks/betaflight.py --recording steps_seed0.csv.gz --json results/betaflight.json
-    python benchmarks/betaflight.py --speed  # CPU seconds of collected steps beside those of `faithful`, in one run
 
 A recording has a row for each ms: `phase`; `t` s; channels `A E T R` in µs, AETR; body rates `wx wy wz` in rad/s, FLU;
 motor commands `M1..M4` in [0, 1]; commanded rates `wx_cmd wy_cmd wz_cmd` in rad/s. Phases `random_<Hz>hz_<scale>` are
@@ -17,10 +16,8 @@ Columns: `x`, `y`, `z` are the RMS errors of body rates relative to the RMS of t
 RMS error of motor commands; `thrust` the error of mean thrust in %.
 """
 
-import argparse
 import csv
 import gzip
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,10 +25,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, report
 from torch import Tensor
 
-from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.drone.parameters import PRESETS, ROTOR_SPINS, QuadrotorParameters
 from dreamer_racing.envs.drone.rate_loop import RateLoop, Row
 
@@ -226,40 +222,12 @@ def compare(flights: Flights, drone: QuadrotorParameters = DRONE, kinds: Sequenc
     return records
 
 
-def measure_speed(num_envs: int, steps: int, from_pixels: bool) -> dict[str, Any]:
-    """Return the CPU time of an env_step, µs, with each preset: medians of five turns, one after the other."""
-    presets = ("faithful", "betaflight")
-    envs = [
-        DroneRacingEnv("kidney", num_envs, from_pixels=from_pixels, preset=p, seed=0, num_threads=1) for p in presets
-    ]
-    spent: list[list[float]] = [[], []]
-    for _ in range(6):
-        for env, times in zip(envs, spent, strict=True):
-            tensordict, began = env.reset(), time.process_time()
-            for _ in range(steps):
-                tensordict["action"] = 0.3 * env.action_spec.rand()
-                _, tensordict = env.step_and_maybe_reset(tensordict)
-            times.append(1e6 * (time.process_time() - began) / steps / num_envs)
-    medians = [float(np.median(times[1:])) for times in spent]  # the first turn compiles
-    return {"images": from_pixels, **dict(zip(presets, medians, strict=True)), "ratio": medians[1] / medians[0]}
-
-
 def main() -> None:
     """Compare, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--recording", help="CSV, may be compressed")
-    what.add_argument("--speed", action="store_true", help="of collection instead")
-    parser.add_argument("--json")
+    parser = make_parser(__doc__)
+    parser.add_argument("--recording", required=True, help="CSV, may be compressed")
     arguments = parser.parse_args()
-    if arguments.speed:
-        records = [measure_speed(64, 60, from_pixels=False), measure_speed(32, 25, from_pixels=True)]
-        print_table(records, ("images", "faithful", "betaflight", "ratio"))
-        write_json(records, arguments.json)
-        return
-    records = compare(cut(read_recording(arguments.recording)))
-    print_table(records, COLUMNS)
-    write_json(records, arguments.json)
+    report(compare(cut(read_recording(arguments.recording))), COLUMNS, arguments.json)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ was flown with them, at most, and `stated` what workers.weight_interval promises
 workers than cores gain nothing.
 """
 
-import argparse
 import os
 import statistics
 import sys
@@ -24,13 +23,13 @@ from typing import Any, NamedTuple, cast
 
 import hydra
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, report
 from omegaconf import OmegaConf
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 
 import latent_ppo
-from composing.building import make_collector, make_env, make_learner
+from composing.building import make_env, make_learner
 from composing.options import CONFIG_DIR
 from composing.schema import CollectorKind, WorldModelRunConfig
 from composing.workers import make_own_env, make_rollouts
@@ -66,11 +65,10 @@ class Way(NamedTuple):
 
 def main() -> None:
     """Measure every way."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--workers", nargs="+", type=int, default=[1, 2, 4])
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json")
     parser.add_argument("overrides", nargs="*", help="further settings of the recipe")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -94,8 +92,7 @@ def main() -> None:
         record |= {name: max(each[name] for each in measured) for name in ("weights_age", "stated", "rollout_steps")}
         names = {"way": way.name, **{name: getattr(way, name) for name in ("worlds", "processes", "workers")}}
         records.append({"benchmark": "collection_on_ray", **names, "cores": available_cpus(), **record})
-    print_table(records, COLUMNS)
-    write_json(records, arguments.json)
+    report(records, COLUMNS, arguments.json)
 
 
 def ways_of(num_envs: int, workers: Sequence[int]) -> list[Way]:
@@ -130,7 +127,7 @@ def measure(way: Way, overrides: Sequence[str], seconds: float) -> dict[str, flo
         return collect(config, seconds)
     context = get_context("spawn")
     with context.Pool(way.processes, begin_together, (context.Barrier(way.processes),)) as pool:
-        each = pool.starmap(collect_alone, [(config, seconds)] * way.processes, chunksize=1)
+        each = pool.starmap(collect, [(config, seconds, True)] * way.processes, chunksize=1)
     return {**each[0], "env_steps_per_s": sum(one["env_steps_per_s"] for one in each)}
 
 
@@ -142,31 +139,15 @@ def begin_together(barrier: Any) -> None:
     keep_freed_memory()
 
 
-def collect_alone(config: WorldModelRunConfig, seconds: float) -> dict[str, float]:
-    """Collect with one thread, at the same time as the other processes."""
-    env = make_env(config, num_threads=1)
-    learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
-    collector = make_collector(config, env, learner.policy())
-    rollouts = iter(collector)
-    for _ in range(WARM_UP):
-        next(rollouts)
-    together.wait(timeout=TOGETHER)
-    rounds, taken = 0, 0.0
-    start = time.perf_counter()
-    while taken < seconds:
-        next(rollouts)
-        rounds, taken = rounds + 1, time.perf_counter() - start
-    collector.shutdown()
-    return found(config, rounds, taken)
-
-
-def collect(config: WorldModelRunConfig, seconds: float) -> dict[str, float]:
-    """Collect as the recipe does, with or without workers."""
-    env = make_own_env(config)
+def collect(config: WorldModelRunConfig, seconds: float, alone: bool = False) -> dict[str, float]:
+    """Collect as the recipe does, with or without workers; or with one thread, at the same time as other processes."""
+    env = make_env(config, num_threads=1) if alone else make_own_env(config)
     learner = cast(WorldModelLearner, make_learner(config, Interface.of(env), torch.device(config.device)))
     rollouts = make_rollouts(config, env, learner)
     for _ in range(WARM_UP):
         next(rollouts)
+    if alone:
+        together.wait(timeout=TOGETHER)
     flown, age, rounds, taken = 0.0, 0, 0, 0.0
     start = time.perf_counter()
     while taken < seconds:
@@ -177,20 +158,12 @@ def collect(config: WorldModelRunConfig, seconds: float) -> dict[str, float]:
     rollouts.close()
     rollouts.collector.shutdown()
     env.close(raise_if_closed=False)
-    if config.collector is not CollectorKind.ray:
-        return found(config, rounds, taken)
-    of_workers = {"overhead": max(0.0, 1.0 - flown / taken), "weights_age": age, "stated": config.weight_interval}
-    return found(config, rounds, taken) | of_workers
-
-
-def found(config: WorldModelRunConfig, rounds: int, taken: float) -> dict[str, float]:
-    """What so many rounds say, where they are flown by this process with weights of the last update."""
-    frames = config.env.num_envs * config.rollout_steps
+    frames, on_ray = config.env.num_envs * config.rollout_steps, config.collector is CollectorKind.ray
     return {
         "env_steps_per_s": rounds * frames / taken,
-        "overhead": 0.0,
-        "weights_age": frames,
-        "stated": frames,
+        "overhead": max(0.0, 1.0 - flown / taken) if on_ray else 0.0,
+        "weights_age": age if on_ray else frames,  # in this process they are of the last update
+        "stated": config.weight_interval if on_ray else frames,
         "rollout_steps": config.rollout_steps,
     }
 

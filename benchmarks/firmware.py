@@ -10,13 +10,12 @@ the mean lap of as many flights in which the rate loop of ``preset=betaflight`` 
 `lap` over that, less 1.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import print_table, write_json
+from measuring import make_parser, print_table, write_json
 
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.hil.betaflight import print_settings, rate_map
@@ -40,15 +39,10 @@ LAPS, PATIENCE = 3, 60.0  # s
 
 def main() -> None:
     """Fly all that is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--flyers",
-        nargs="+",
-        default=["circle_betaflight", "kidney_betaflight", "pilot"],
-        help="agents of agents/, or pilot",
-    )
+    parser = make_parser(__doc__)
+    flyers = ["circle_betaflight", "kidney_betaflight", "pilot"]
+    parser.add_argument("--flyers", nargs="+", default=flyers, help="agents of agents/, or pilot")
     parser.add_argument("--flights", type=int, default=10)
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     contract = read_contract(AGENTS / "circle" / "contract.json")  # what all are flown with is the same
     records = []

@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from measuring import print_table, write_json
+from measuring import make_parser, print_table, write_json
 
 from dreamer_racing.export.onnx_actor import read_contract
 
@@ -33,14 +33,13 @@ LONGEST = 120  # s that a flight may take, start of both programs included
 
 def main() -> None:
     """Fly every actor so often, one flight after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--actors", nargs="+", required=True, help="agents that ship, paths of exports, or pilot")
     parser.add_argument("--flights", type=int, default=1, help="of each, with seeds from 1 on")
     parser.add_argument("--laps", type=int, default=3)
     parser.add_argument("--disarmed", type=float, metavar="SECONDS", help="never arm, and end after so long")
     parser.add_argument("--plant", nargs="*", default=PLANT, help="options of recipes/plant.py")
     parser.add_argument("--hil", nargs="*", default=[], help="further options of recipes/hil.py")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for actor in arguments.actors:

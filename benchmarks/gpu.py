@@ -18,6 +18,7 @@ one. `train`: Kidney by imagination, `tuned=gpu`, until the budget is spent.
 """
 
 import argparse
+import copy
 import json
 import os
 import shutil
@@ -28,6 +29,18 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import torch
+from learner import Setting, filled_replay, make_learner
+from measuring import as_text, fill_page, make_parser, matmul_speed, seconds
+from torch.profiler import DeviceType, ProfilerActivity, profile
+
+from dreamer_racing.envs.simulator.warp_device import load_warp
+from dreamer_racing.envs.worlds import RaceWorlds
+from dreamer_racing.evaluation.course import Course
+from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
+from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.machine import provenance
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -62,8 +75,7 @@ class Job(NamedTuple):
 
 def main() -> None:
     """Run the jobs that are asked for and not done yet, one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="file of results, a line each, which is continued")
+    parser = make_parser(__doc__)
     parser.add_argument("--stages", nargs="*", default=list(STAGES), choices=STAGES)
     parser.add_argument("--jobs", nargs="*", help="names of jobs, if not all of a stage")
     parser.add_argument("--budget", type=float, default=1800.0, help="s for all of it")
@@ -87,8 +99,6 @@ def main() -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run jobs until the budget is spent."""
-    from dreamer_racing.machine import provenance
-
     results, ends = Path(arguments.json), time.monotonic() + arguments.budget
     where = {**provenance(), "device": arguments.device, "tiny": arguments.tiny}
     done = {identity(record) for record in read(results) if record["state"] == "done"}
@@ -255,11 +265,6 @@ STAGES: dict[str, Callable[[str, bool, Path], Commands]] = {
 
 def measure_probe(device: str, tiny: bool) -> dict[str, Any]:
     """Measure what the device could reach."""
-    import torch
-    from learner import matmul_speed, seconds, synchronize
-
-    from dreamer_racing.envs.simulator.warp_device import load_warp
-
     found: dict[str, Any] = {"torch": torch.__version__, "cuda": torch.version.cuda, "warp": load_warp().__version__}
     if device != "cpu":
         found |= {"gpu": torch.cuda.get_device_name(), "capability": torch.cuda.get_device_capability()}
@@ -267,21 +272,12 @@ def measure_probe(device: str, tiny: bool) -> dict[str, Any]:
         found["matmul_tflops"] = matmul_speed(device, torch.bfloat16) / 1e12
     source = torch.empty(2**20 if tiny else 2**30, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
-    target.copy_(source)
-    synchronize(device)
-    found["copy_gb_per_s"] = (
-        2e-9 * source.numel() / min(seconds(lambda: target.copy_(source), device) for _ in range(5))
-    )
-    return found
+    fastest = min(seconds(lambda: target.copy_(source), device) for _ in range(6))
+    return found | {"copy_gb_per_s": 2e-9 * source.numel() / fastest}
 
 
 def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) -> dict[str, Any]:
     """Step worlds eager and as they step by themselves; both must come to the same."""
-    import torch
-    from learner import seconds
-
-    from dreamer_racing.envs.worlds import RaceWorlds
-
     looks = "randomised" if images == "looks" else "nominal"
     worlds = RaceWorlds(
         "kidney", int(number), preset, from_pixels=images != "state", device=device, seed=0, looks=looks,
@@ -317,15 +313,6 @@ def measure_env(device: str, tiny: bool, number: str, preset: str, images: str) 
 
 def measure_learner(device: str, tiny: bool, size: str) -> dict[str, Any]:
     """Learn with captured updates; then measure, save, restore and fly."""
-    import copy
-
-    import torch
-    from learner import filled_replay, make_learner
-
-    from dreamer_racing.evaluation.course import Course
-    from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-    from dreamer_racing.learners.config import LearnerConfig
-
     config = LearnerConfig(cuda_graph=device != "cpu", learning_rate=1e-3, warmup_updates=0, mixed_precision=True)
     config.imagination_horizon = 3
     learner, other = (make_learner(size, "reconstruction", "reinforce", config, device=device) for _ in range(2))
@@ -360,8 +347,6 @@ def measure_smoke(device: str, tiny: bool, place: str) -> dict[str, Any]:
 
 def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str, kernels: str = "few") -> dict[str, Any]:
     """Time updates."""
-    from learner import seconds
-
     update = update_of(device, tiny, size, way, batch, few_kernels=kernels == "few")
     first = seconds(update, device)
     times = [seconds(update, device) for _ in range(2 if tiny else 23)]
@@ -370,9 +355,6 @@ def measure_speed(device: str, tiny: bool, size: str, way: str, batch: str, kern
 
 def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) -> dict[str, Any]:
     """Profile updates: the kernels that take most time, in ms of an update, and how many are launched in one."""
-    from learner import seconds
-    from torch.profiler import DeviceType, ProfilerActivity, profile
-
     update = update_of(device, tiny, size, way, batch)
     for _ in range(3):
         seconds(update, device)  # captures
@@ -397,8 +379,6 @@ def measure_kernels(device: str, tiny: bool, size: str, way: str, batch: str) ->
 
 def update_of(device: str, tiny: bool, size: str, way: str, batch: str, few_kernels: bool = True) -> Callable[[], Any]:
     """An update of a learner on one batch of the replay, ready to be called."""
-    from learner import Setting, filled_replay
-
     windows, length = map(int, batch.split("x"))
     setting = Setting(
         "reconstruction", "reinforce", True, 64, (windows, length), 3 if tiny else 16, device, 1, 20, few_kernels
@@ -422,16 +402,11 @@ MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def write_page(results: Path, page: Path) -> None:
-    """Put the table of all jobs of a GPU into the page; what was not run says so."""
-    text = page.read_text(encoding="utf-8")
-    head, found, rest = text.partition(BEGIN)
-    _, closed, tail = rest.partition(END)
-    if not found or not closed:
-        raise SystemExit(f"{page} lacks the lines {BEGIN} and {END}, between which the table goes.")
-    page.write_text(f"{head}{BEGIN}\n{table(read(results))}\n{END}{tail}", encoding="utf-8")
+    """Put the table of all jobs of a GPU into the page."""
+    fill_page(page, BEGIN, END, table(read(results)))
 
 
-def table(records: list[dict[str, Any]]) -> str:
+def table(records: list[dict[str, Any]]) -> list[str]:
     """A row for each job, of its latest attempt on a GPU; one for those of a stage that were not run."""
     latest = {(r["stage"], r["name"]): r for r in records if not r["tiny"] and r["device"] != "cpu"}
     places = sorted({f"{r.get('gpu')} at {r['commit']}" for r in latest.values()})
@@ -443,7 +418,7 @@ def table(records: list[dict[str, Any]]) -> str:
         lines += [f"| {stage} | `{name}` | {in_words(latest[stage, name])} |" for name in run]
         if left := len(names) - len(run):
             lines.append(f"| {stage} | {left} {'other ' * bool(run)}{'job' if left == 1 else 'jobs'} | not run |")
-    return "\n".join(lines)
+    return lines
 
 
 def in_words(record: dict[str, Any]) -> str:
@@ -451,11 +426,7 @@ def in_words(record: dict[str, Any]) -> str:
     if record["state"] != "done":
         return f"{record['state']}: {record.get('why', '')}"
     shown = {"ms": "ms", "steps_per_s": "steps/s", "matmul_tflops": "TFLOP/s", "copy_gb_per_s": "GB/s"}
-    numbers = [
-        f"{record[key]:,.0f} {unit}" if record[key] >= 100 else f"{record[key]:.3g} {unit}"
-        for key, unit in shown.items()
-        if key in record
-    ]
+    numbers = [f"{as_text(record[key])} {unit}" for key, unit in shown.items() if key in record]
     return ", ".join(numbers) or f"done in {record['seconds']} s"
 
 

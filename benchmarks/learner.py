@@ -22,7 +22,6 @@ CPU takes apart, count once as on CUDA. `casts` are those of them that change a 
 import argparse
 import resource
 import statistics
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, matmul_speed, print_table, report, seconds, write_json
 from tensordict import TensorDict
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
@@ -60,7 +59,7 @@ NARROW: dict[str, Any] = {"belief": 32, "hidden": 16, "latents": 4, "classes": 4
 
 def main() -> None:
     """Measure every combination asked for, each in a process of its own."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--sizes", nargs="*", default=["cpu_small"], help=f"of {', '.join(SIZES)}")
     parser.add_argument("--losses", nargs="*", default=["reconstruction"])
     parser.add_argument("--actor-losses", nargs="*", default=["reinforce"])
@@ -77,7 +76,6 @@ def main() -> None:
     parser.add_argument("--few-kernels", action="store_true", help="as on a CUDA device by default")
     parser.add_argument("--launches", action="store_true", help="count what a CUDA device would launch instead")
     parser.add_argument("--table", help="write the table of sizes to this Markdown file instead")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     if arguments.table:
         write_size_table(Path(arguments.table))
@@ -126,8 +124,7 @@ def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespac
         for actor in arguments.actor_losses
         for few in (False, True)
     ]
-    print_table(counted, LAUNCHES)
-    write_json(counted, arguments.json)
+    report(counted, LAUNCHES, arguments.json)
 
 
 @dataclass(frozen=True)
@@ -177,22 +174,52 @@ def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
     replay = filled_replay(setting.batch, device, setting.image_size)
     samples = [seconds(replay.sample, device) for _ in range(5)]
     data = replay.sample()
-    first = seconds(lambda: learner.update(data), device)
-    for _ in range(WARM_UP - 1):
-        learner.update(data)
-    times = [seconds(lambda: learner.update(data), device) for _ in range(setting.updates)]
-    median = statistics.median(times)
-    memory = peak_memory(device)
-    limit = matmul_speed(device, torch.bfloat16 if setting.mixed_precision else torch.float32)
-    flops = dry_update(size, setting.loss, setting.actor, setting.batch, setting.horizon, setting.image_size)[0]
+    timed = time_updates(
+        lambda: learner.update(data),
+        setting.updates,
+        device,
+        setting.mixed_precision,
+        lambda: dry_update(size, setting.loss, setting.actor, setting.batch, setting.horizon, setting.image_size)[0],
+        count=backend == "eager",
+    )
     return {
         "benchmark": "learner", "size": size, "loss": setting.loss, "actor": setting.actor,
         "backend": backend + ("+bf16" if setting.mixed_precision else ""), "batch": "x".join(map(str, setting.batch)),
         "horizon": setting.horizon, "image_size": setting.image_size, "parameters": parameters(learner),
-        "s": median, "s_min": min(times), "s_first": first,
-        "calls": count_calls(lambda: learner.update(data)) if backend == "eager" else None, "GFLOP": flops / 1e9,
-        "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
-        "sample_share": statistics.median(samples) / median, "memory": memory,
+        **timed, "sample_share": statistics.median(samples) / timed["s"],
+    }  # fmt: skip
+
+
+def time_updates(
+    update: Callable[[], Any],
+    number: int,
+    device: str,
+    mixed_precision: bool,
+    count_flops: Callable[[], int],
+    count: bool,
+    first: Callable[[], Any] | None = None,
+) -> dict[str, Any]:
+    """Time updates of ours or of a peer; return the columns of a record that say how fast they are.
+
+    Args:
+        update: one of them.
+        number: how many to time, after `WARM_UP`.
+        device: of the learner.
+        mixed_precision: whether it computes in bfloat16.
+        count_flops: counts the FLOPs of one, once all are timed.
+        count: whether ATen calls are counted.
+        first: what is done at the first one.
+    """
+    s_first = seconds(first or update, device)
+    for _ in range(WARM_UP - 1):
+        update()
+    times = [seconds(update, device) for _ in range(number)]
+    median, memory = statistics.median(times), peak_memory(device)
+    limit, flops = matmul_speed(device, torch.bfloat16 if mixed_precision else torch.float32), count_flops()
+    return {
+        "s": median, "s_min": min(times), "s_first": s_first, "calls": count_calls(update) if count else None,
+        "GFLOP": flops / 1e9, "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9,
+        "share": flops / median / limit, "memory": memory,
     }  # fmt: skip
 
 
@@ -229,21 +256,6 @@ def random_rollout(streams: int, steps: int, image_size: int = 64) -> TensorDict
     )  # fmt: skip
     root = {"pixels": image(), ("privileged", "vector"): normal(PRIVILEGED_DIM), "action": normal(4).clamp(-1, 1)}
     return TensorDict({**root, "is_init": done.roll(1, 1), "next": arrived}, shape)
-
-
-def seconds(function: Callable[[], Any], device: str) -> float:
-    """Time one call, with what it left running on the device."""
-    synchronize(device)
-    start = time.perf_counter()
-    function()
-    synchronize(device)
-    return time.perf_counter() - start
-
-
-def synchronize(device: str) -> None:
-    """Wait for a CUDA device."""
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
 
 
 def peak_memory(device: str) -> float:
@@ -313,14 +325,6 @@ fused_rms_norm.register_autograd(
     lambda ctx, gradient: (*fused_rms_norm_backward(gradient, *ctx.saved_tensors, ctx.eps), None),
     setup_context=_keep_for_backward,
 )
-
-
-def matmul_speed(device: str, dtype: torch.dtype) -> float:
-    """Return the FLOP/s of a large matrix product: what this machine can reach."""
-    side = 8192 if device.startswith("cuda") else 2048
-    left, right = (torch.randn(side, side, device=device, dtype=dtype) for _ in range(2))
-    left @ right
-    return 2 * side**3 / min(seconds(lambda: left @ right, device) for _ in range(5))
 
 
 def dry_update(

@@ -21,14 +21,13 @@ H is the learner's horizon, or that of ``--horizon``. The trained weights are me
 checkpoint holds no replay, as `best/`, say ``--only returns``.
 """
 
-import argparse
 import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
-from measuring import print_table, write_json
+from measuring import make_parser, print_table, write_json
 from tensordict import TensorDict
 from torch import Tensor
 from trained import Trained, fly, make_env, restore, restore_replay
@@ -49,13 +48,12 @@ BATCHES, QUANTILES = 12, (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)  # of the drift
 
 def main() -> None:
     """Measure every checkpoint."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--num-envs", type=int, default=64, help="N")
     parser.add_argument("--steps", type=int, default=320, help="K")
     parser.add_argument("--horizon", type=int, help="H; without: the learner's")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:

@@ -1,9 +1,13 @@
-"""What every benchmark does: say where it was measured, print a table, write flat JSON."""
+"""What every benchmark does: take arguments, time calls, say where it was measured, print a table, write flat JSON."""
 
+import argparse
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from dreamer_racing.machine import provenance
 
@@ -11,15 +15,29 @@ COMMIT = provenance()["commit"]
 """When the benchmark began, which is what it measures: others may come before it writes."""
 
 
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """Make the parser of a benchmark's arguments, whose help is its docstring."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", help="file of the results")
+    return parser
+
+
+def report(records: Sequence[dict[str, Any]], columns: Sequence[str], path: str | None) -> None:
+    """Print some columns of the records as a table, and write all, if a path is given."""
+    print_table(records, columns)
+    write_json(records, path)
+
+
 def print_table(records: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     """Print some columns of the records as a Markdown table."""
     print("| " + " | ".join(columns) + " |")
     print("|" + "---|" * len(columns))
     for record in records:
-        print("| " + " | ".join(_text(record.get(column, "")) for column in columns) + " |")
+        print("| " + " | ".join(as_text(record.get(column, "")) for column in columns) + " |")
 
 
-def _text(value: Any) -> str:
+def as_text(value: Any) -> str:
+    """Write a value as tables have it."""
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
     return str(value)
@@ -31,3 +49,38 @@ def write_json(records: Sequence[dict[str, Any]], path: str | None) -> None:
         where = {**provenance(), "commit": COMMIT}
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps([{**record, **where} for record in records], indent=1) + "\n")
+
+
+def fill_page(page: Path, begin: str, end: str, lines: Iterable[str]) -> None:
+    """Replace what stands between two lines of a page.
+
+    Raises:
+        SystemExit: the page lacks one of them.
+    """
+    head, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not found or not closed:
+        raise SystemExit(f"{page} lacks the lines {begin} and {end}, between which the table goes.")
+    page.write_text("\n".join((head + begin, *lines, end + tail)), encoding="utf-8")
+
+
+def seconds(function: Callable[[], Any], device: str) -> float:
+    """Time one call, with what it left running on the device."""
+    start = now(device)
+    function()
+    return now(device) - start
+
+
+def now(device: torch.device | str) -> float:
+    """Return the time, s, when a device has done all it was given."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def matmul_speed(device: str, dtype: torch.dtype) -> float:
+    """Return the FLOP/s of a large matrix product: what this machine can reach."""
+    side = 8192 if device.startswith("cuda") else 2048
+    left, right = (torch.randn(side, side, device=device, dtype=dtype) for _ in range(2))
+    left @ right
+    return 2 * side**3 / min(seconds(lambda: left @ right, device) for _ in range(5))

@@ -10,13 +10,12 @@ the device. `mm_1s` and `mm_2s` are the distances after so long. Then both draw 
 `RENDERERS`, to OpenGL. `--images` writes some pairs for a person to look at.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, report
 from PIL import Image
 from torch import Tensor
 
@@ -37,11 +36,10 @@ COLUMNS = ("track", "preset", "device", "mm_1s", "mm_2s", "image_difference", "i
 
 def main() -> None:
     """Compare on every track."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--device", default="cpu", help="of mujoco_warp")
     parser.add_argument("--renderer", default="warp", choices=RENDERERS, help="to compare with OpenGL too")
     parser.add_argument("--images", help="PNG of image pairs: above OpenGL, below mujoco_warp")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     records, pairs = [], []
     for preset in ("easy", "faithful"):
@@ -49,8 +47,7 @@ def main() -> None:
             record, pair = compare(track, preset, arguments.device, arguments.renderer)
             records.append(record)
             pairs.append(pair)
-    print_table(records, COLUMNS)
-    write_json(records, arguments.json)
+    report(records, COLUMNS, arguments.json)
     if arguments.images:
         sheet = np.concatenate(pairs[: len(PLAIN_TRACKS)], axis=1)
         Path(arguments.images).parent.mkdir(parents=True, exist_ok=True)

@@ -10,12 +10,11 @@ run. Columns: `clean` runs without a crash and with all laps of N; `line` is the
 the centre of the target gate.
 """
 
-import argparse
 from collections import Counter
 from typing import Any
 
 import torch
-from measuring import print_table, write_json
+from measuring import make_parser, report
 
 from dreamer_racing.envs.race.flown_laps import FlownLaps, fly_laps
 from dreamer_racing.envs.race.gates import CrashCause
@@ -28,13 +27,12 @@ COLUMNS = ("clean", "line", "lap_first", "lap_mean", "lap_best", "speed_mean", "
 
 def main() -> None:
     """Fly every track in every preset."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--tracks", nargs="*", default=PLAIN_TRACKS)
     parser.add_argument("--presets", nargs="*", default=("easy", "faithful"))
     parser.add_argument("--speed", type=float, default=LineLimits().speed, help="fraction of the thrust limit")
     parser.add_argument("--num-envs", type=int, default=32, help="runs of a randomised preset")
     parser.add_argument("--random-starts", action="store_true", help="start as training does")
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     records = []
     for track in arguments.tracks:
@@ -50,8 +48,7 @@ def main() -> None:
             )
             record = {"track": track, "preset": preset, "speed": arguments.speed, "line": pilot.line.lap_time}
             records.append({**record, "random_starts": arguments.random_starts, **summary(flight)})
-    print_table(records, ("track", "preset", "speed", *COLUMNS))
-    write_json(records, arguments.json)
+    report(records, ("track", "preset", "speed", *COLUMNS), arguments.json)
 
 
 def summary(flight: FlownLaps) -> dict[str, Any]:

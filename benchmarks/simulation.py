@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from measuring import print_table, write_json
+from measuring import fill_page, make_parser, now, report
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -63,7 +63,7 @@ NAMES = {
 
 def main() -> None:
     """Measure every combination asked for, or write the table of the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--track", default="kidney")
     parser.add_argument("--preset", default="easy")
@@ -78,7 +78,6 @@ def main() -> None:
     parser.add_argument(
         "--page", nargs="*", metavar="JSON", help="write the table of docs/benchmarks.md from these results"
     )
-    parser.add_argument("--json")
     arguments = parser.parse_args()
     arguments.seconds = arguments.seconds or (0.5 if arguments.device == "cuda" else 1.5)
     if arguments.page is not None:
@@ -92,8 +91,7 @@ def main() -> None:
                 records.append(process.submit(job, *details).result())
             except (RendererUnavailableError, ImportError) as error:
                 print(f"{details[0]}: not here ({error})")
-    print_table(records, COLUMNS)
-    write_json(records, arguments.json)
+    report(records, COLUMNS, arguments.json)
 
 
 def jobs(arguments: argparse.Namespace) -> Iterator[tuple[Any, ...]]:
@@ -204,7 +202,7 @@ def acting(policy: DreamerPolicy, beginning: TensorDictBase) -> Callable[[dict[s
     return act
 
 
-def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.device | None = None) -> float:
+def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.device) -> float:
     """Steps per second of a job of so many, run for some seconds after once."""
     job()
     done, start = 0, now(device)
@@ -212,13 +210,6 @@ def speed(job: Callable[[], Any], steps: int, seconds: float, device: torch.devi
         job()
         done += steps
     return done / elapsed
-
-
-def now(device: torch.device | None) -> float:
-    """The time, s, when the device has done all it was given."""
-    if device is not None and device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 def parts_of(env: DroneRacingEnv, job: Callable[[], Any], seconds: float) -> dict[str, float]:
@@ -265,9 +256,9 @@ def watched(env: DroneRacingEnv, spent: dict[str, float]) -> Iterator[None]:
             delattr(owner, name)
 
 
-def peak_gib(device: torch.device | None) -> float:
+def peak_gib(device: torch.device) -> float:
     """Peak resident memory of this process, or what is in use on a CUDA device now (warp's too), GiB."""
-    if device is not None and device.type == "cuda":
+    if device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         return (total - free) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -297,9 +288,7 @@ def write_page(paths: list[str]) -> None:
         speeds = f"**{record['collector']:,.0f}** | {record['worlds']:,.0f} | {record['actor']:,.0f}"
         name = NAMES.get(images, images) + (", CUDA" if images == "none" and device == "cuda" else "")
         lines.append(f"| {name} | {record['num_envs']} | {speeds} | {parts} |")
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    PAGE.write_text("\n".join((before + BEGIN, *lines, END + after)))
+    fill_page(PAGE, BEGIN, END, lines)
 
 
 if __name__ == "__main__":

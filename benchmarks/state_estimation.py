@@ -19,7 +19,6 @@ still, the mean square of symlogs; `share` is that by their variance, `linear` t
 not tell.
 """
 
-import argparse
 import gc
 import time
 from collections.abc import Iterator
@@ -28,7 +27,7 @@ from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
-from measuring import print_table, write_json
+from measuring import make_parser, print_table, write_json
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -51,12 +50,11 @@ COLUMNS = ["variant", "updates", "seconds", "probe", "share", "linear", "error",
 
 def main() -> None:
     """Measure every checkpoint, or every variant on it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("checkpoints", nargs="+", help="run directories or checkpoints of dreamer_v3 races")
     parser.add_argument("--variant", nargs="+", help="overrides of a fresh model, each in quotes")
     parser.add_argument("--updates", type=int, default=600, help="of a fresh model")
     parser.add_argument("--every", type=int, default=150, help="updates between two measurements")
-    parser.add_argument("--json", help="file that all rows are written to")
     arguments = parser.parse_args()
     records = []
     for path in arguments.checkpoints:

@@ -22,12 +22,11 @@ Shape legend: B batch, T time, H horizon.
 Reference: TorchRL 0.14, ``sota-implementations/dreamer_v3``.
 """
 
-import statistics
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from learner import count_calls, matmul_speed, parameters, peak_memory, random_rollout, seconds
+from learner import parameters, random_rollout, time_updates
 from tensordict import TensorDict
 from tensordict.nn import (
     InteractionType,
@@ -137,23 +136,15 @@ def measure_stock(
             stepper.warmup(sample)
         update()
 
-    first = seconds(first_update, device)
-    for _ in range(2):
-        update()
-    times = [seconds(update, device) for _ in range(updates)]
-    median = statistics.median(times)
-    memory = peak_memory(device)
-    limit = matmul_speed(device, torch.bfloat16 if tuned and cuda else torch.float32)
-    flops = count_flops(stepper, sample)
     backend = "+".join(name for name, used in (("compile", compiled), ("graph", captured)) if used) or "eager"
+    timed = time_updates(
+        update, updates, device, tuned and cuda, lambda: count_flops(stepper, sample), backend == "eager", first_update
+    )
     changes = f"+no_grad+{precision}" + ("+bf16" if cuda else "") if tuned else ""
     return {
         "benchmark": "learner", "size": f"torchrl {shape}", "loss": "reconstruction", "actor": "reinforce",
         "backend": backend + changes, "batch": "x".join(map(str, batch)), "horizon": horizon,
-        "parameters": parameters(stepper), "s": median, "s_min": min(times), "s_first": first,
-        "calls": count_calls(update) if backend == "eager" else None, "GFLOP": flops / 1e9,
-        "GFLOP/s": flops / 1e9 / median, "limit GFLOP/s": limit / 1e9, "share": flops / median / limit,
-        "sample_share": None, "memory": memory,
+        "parameters": parameters(stepper), **timed, "sample_share": None,
     }  # fmt: skip
 
 

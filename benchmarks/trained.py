@@ -15,6 +15,7 @@ from composing.restoring import restore_learner
 from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig
 
+from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.modules.interface import PRIVILEGED
@@ -75,26 +76,15 @@ def fly(learner: WorldModelLearner, env: Environment, steps: int) -> TensorDict:
     ``belief`` and ``state`` are the latents with which it acted, ``reward`` and ``done`` what the step led to, and
     ``vector``, if the worlds tell it, the simulator's state that it acted in.
     """
-    num_envs, policy, size = env.batch_size[0], learner.policy(), learner.size
-    observation = env.reset()
-    memory = {
-        "belief": torch.zeros(num_envs, size.belief),
-        "state": torch.zeros(num_envs, size.latents * size.classes),
-        "previous_action": torch.zeros(num_envs, 4),
-    }
-    begins, records = torch.ones(num_envs, 1, dtype=torch.bool), []
+    policy, records = learner.policy(), []
+    remembering = with_memory(env, policy.make_primer())
+    step = remembering.reset()
     for _ in range(steps):
-        acted = policy(observation.clone(recurse=False).update({**memory, "is_init": begins}))
-        memory = {name: acted["next", name] for name in memory}
-        after = env.step(acted.select("action"))["next"]
-        record = {name: memory[name] for name in ("belief", "state")}
-        record |= {name: after[name] for name in ("reward", "done")}
-        if PRIVILEGED in observation.keys(True):
-            record["vector"] = observation[PRIVILEGED]
-        records.append(TensorDict(record, [num_envs]).clone())
-        begins, observation = after["done"].clone(), after.select(*env.observation_spec.keys()).clone()
-        if begins.any():
-            first = env.reset(TensorDict({"_reset": begins}, [num_envs]))
-            observation = torch.where(begins[:, 0], first.select(*observation.keys()), observation)
+        step, following = remembering.step_and_maybe_reset(policy(step))
+        record = step["next"].select("belief", "state", "reward", "done")
+        if PRIVILEGED in step.keys(True):
+            record["vector"] = step[PRIVILEGED]
+        records.append(record.clone())
+        step = following
     env.close()
     return cast(TensorDict, torch.stack(records))

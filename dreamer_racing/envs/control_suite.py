@@ -16,8 +16,8 @@ Camera, default image size, action repeat and time limit are those of DreamerV3'
 
 Images are dm_control's, with the same shadows, reflections, sky and four samples a pixel, but of a shadow map and of
 round shapes no finer than so small an image shows: drawn in software they are what takes most of the time.
-`benchmarks/control_suite.py` measures what that saves and what it changes: in 64 × 64 less than 0.5 of 255 on average
-in 19 of 20 tasks, and 1.9 in `quadruped_escape`, whose shadows lie on a whole terrain. In 32 × 32 it is 1.6
+What that changes (`benchmarks/control_suite.py` of commit b53e9fa measured it): in 64 × 64 less than 0.5 of 255 on
+average in 19 of 20 tasks, and 1.9 in `quadruped_escape`, whose shadows lie on a whole terrain. In 32 × 32 it is 1.6
 in `reacher_easy`.
 
 Shapes: N worlds, V observation, A action.
