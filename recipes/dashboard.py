@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from composing.building import worlds_of
-from composing.entry import plain_errors, recipe, start_logging
+from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
 
 from dreamer_racing.commands import from_here
@@ -53,6 +53,14 @@ class DashboardConfig:
     renderer: str = "auto"  # of flights that are flown now; as env.renderer in training, docs/options.md
     seed: int = setting(0, SEED)  # likewise
 
+    def check(self) -> None:
+        """Refuse what would leave open which flight is meant."""
+        if (self.run is None) == (self.agent is None):
+            given = "neither is given" if self.run is None else f"both are given, {self.run} and {self.agent}"
+            raise ValueError(f"run= names a stored flight, agent= what to fly now: give one of them; {given}.")
+        if self.output is not None and Path(self.output).suffix not in (".html", ".htm"):
+            raise ValueError(f"output={self.output}: the page is one HTML file, whose name ends in .html.")
+
 
 class Source(NamedTuple):
     """A flight, and where it came from."""
@@ -66,9 +74,7 @@ class Source(NamedTuple):
 @recipe("dashboard", DashboardConfig)
 def main(config: DashboardConfig) -> None:
     """Find or fly the flights, write the page, and show it if asked to."""
-    start_logging()
     with plain_errors():
-        check(config)
         check_viser()
         sources = find(config)
         training = [how_it_trained(sources)]
@@ -80,15 +86,6 @@ def main(config: DashboardConfig) -> None:
     print(f"page: {output} ({size / 1e6:.1f} MB, opens in a browser without a server)")
     if config.serve is not None:
         show(track, flights, config.serve, training)
-
-
-def check(config: DashboardConfig) -> None:
-    """Refuse what would leave open which flight is meant."""
-    if (config.run is None) == (config.agent is None):
-        given = "neither is given" if config.run is None else f"both are given, {config.run} and {config.agent}"
-        raise ValueError(f"run= names a stored flight, agent= what to fly now: give one of them; {given}.")
-    if config.output is not None and Path(config.output).suffix not in (".html", ".htm"):
-        raise ValueError(f"output={config.output}: the page is one HTML file, whose name ends in .html.")
 
 
 def find(config: DashboardConfig) -> list[Source]:

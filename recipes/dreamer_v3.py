@@ -11,17 +11,7 @@ Everything of a run lands in its run directory: checkpoints/, metrics.csv, tenso
 
 from typing import cast
 
-from composing.building import (
-    begin_with,
-    make_curriculum,
-    make_learner,
-    make_run_evaluator,
-    make_run_replay,
-    make_tracker,
-    measure,
-    num_gates,
-    seed_generators,
-)
+from composing import building
 from composing.entry import recipe
 from composing.launching import launch
 from composing.resolving import resolve_world_model as resolve
@@ -46,22 +36,22 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
     """Collect, replay, update, evaluate, save."""
     own = share_of(config)  # of several processes
     env = make_own_env(own)
-    learner = cast(DreamerV3, make_learner(own, Interface.of(env), own.device, config.seed))
+    learner = cast(DreamerV3, building.make_learner(own, Interface.of(env), own.device, config.seed))
     if config.init_from and not config.resume:
-        print(begin_with(learner, config, env))
-    seed_generators(own.seed)
-    curriculum = make_curriculum(config, env)
+        print(building.begin_with(learner, config, env))
+    building.seed_generators(own.seed)
+    curriculum = building.make_curriculum(config, env)
     rollouts = make_rollouts(own, env, learner)
     latents = learner.latent_format if config.replay.context else None
-    replay = make_run_replay(own, env, curriculum, (own.model.batch_size, own.model.batch_length), latents)
+    replay = building.make_run_replay(own, env, curriculum, (own.model.batch_size, own.model.batch_length), latents)
     ratio = config.make_replay_ratio()
-    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps, num_gates(env))
+    schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps, building.num_gates(env))
     session.track(
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=make_run_evaluator(config, session.directory.path, learner),
-        tracker=make_tracker(config),
+        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        tracker=building.make_tracker(config),
         replay=replay,
         ratio=ratio,
         schedule=schedule,
@@ -95,7 +85,7 @@ def train(config: DreamerV3RunConfig, session: Session) -> None:
         if session.due("evaluate"):
             session.evaluate()
         if session.due("log"):
-            session.write_row(measure(session, learner, replay, scheduled))
+            session.write_row(building.measure(session, learner, replay, scheduled))
         session.save_if_due()
 
 

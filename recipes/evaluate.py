@@ -10,13 +10,12 @@ docs/evaluation.md, with both presets of physics, and adds evaluation.md. An ear
 """
 
 import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from composing.building import make_evaluator, track_as_begun, worlds_of
-from composing.entry import plain_disk_errors, plain_errors, recipe, start_logging
+from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
@@ -54,14 +53,20 @@ class EvaluateConfig(FlightConfig):
     video_steps: int = setting(500, COUNT)
     seed: int = setting(1, SEED)  # of starts and drones: others than those of evaluations in training, whose seed is 0
 
+    def check(self) -> None:
+        """Refuse what is no protocol, or would be ignored."""
+        if self.protocol not in PROTOCOLS:
+            raise ValueError(f"protocol={self.protocol}: there are {', '.join(PROTOCOLS)}.")
+        if self.protocol == "full" and self.start_noise:
+            raise ValueError(
+                f"start_noise={self.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."
+            )
+
 
 @recipe("evaluate", EvaluateConfig)
 def main(config: EvaluateConfig) -> None:
     """Restore the policy, fly it, report."""
-    start_logging()
-    started = time.monotonic()
     with plain_errors():
-        check(config)
         restored = restore(config)
         refuse_races(config, track_as_begun(restored.trained))
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
@@ -73,22 +78,12 @@ def main(config: EvaluateConfig) -> None:
         else:
             results = evaluate_fully(config, restored, directory)
             written = describe(results, restored.trained.env.preset)
-        written["provenance"] = restored.provenance(config, time.monotonic() - started)
+        written["provenance"] = restored.provenance(config)
         written["provenance"]["start_noise"] = config.start_noise
         if not report:
             write_markdown(directory, results, written["provenance"])
         replace_text(directory / EVALUATION, json.dumps(written, indent=2, allow_nan=False) + "\n")
     say(f"\nwritten to {directory}")
-
-
-def check(config: EvaluateConfig) -> None:
-    """Refuse what is no protocol, or would be ignored."""
-    if config.protocol not in PROTOCOLS:
-        raise ValueError(f"protocol={config.protocol}: there are {', '.join(PROTOCOLS)}.")
-    if config.protocol == "full" and config.start_noise:
-        raise ValueError(
-            f"start_noise={config.start_noise} is for protocol=nominal: protocol=full has noise among its conditions."
-        )
 
 
 def refuse_races(config: EvaluateConfig, track: Track) -> None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from composing.building import describe_file, track_as_begun, worlds_of
-from composing.entry import as_override, override_key, override_value, plain_errors, recipe, start_logging
+from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
 from composing.restoring import config_folder, find_trained, results_of
 from composing.saved import read_yaml, trained_config
@@ -83,7 +83,6 @@ class ExportConfig:
 @recipe("export", ExportConfig)
 def main(config: ExportConfig) -> None:
     """Restore the policy, fly it, export it, compare, measure."""
-    start_logging()
     # Its exporter says four times that torchvision is not installed, which nothing here needs, and warns of a class of
     # its own that it copies.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)

@@ -25,7 +25,7 @@ from typing import Any
 import composing  # noqa: F401 - first: says how to run this where packages are missing
 import numpy as np
 from composing.building import worlds_of
-from composing.entry import plain_errors, recipe, start_logging
+from composing.entry import plain_errors, recipe
 from composing.restoring import FlightConfig, restore
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -79,6 +79,29 @@ class FlyConfig:
     viewer: bool = False  # watch agent or pilot live in a window instead of writing files
     seed: int = setting(0, SEED)
 
+    def check(self) -> None:
+        """Refuse what would fail only after the flight.
+
+        Raises:
+            ValueError: bad value; the message names the field and what is allowed.
+        """
+        if self.agent is not None and self.pilot is not None:
+            raise ValueError(f"pilot={self.pilot} and agent={self.agent}: give one of them.")
+        if self.pilot not in (None, *PILOTS, *KINDS):
+            raise ValueError(f"pilot={self.pilot}: there are {', '.join((*PILOTS, *KINDS))}.")
+        if self.pilot in KINDS:
+            if self.viewer:
+                raise ValueError(
+                    f"viewer=true and pilot={self.pilot}, which has a window of its own: give one of them."
+                )
+            check_by_hand(self.pilot)
+        if self.view not in VIEWS:
+            raise ValueError(f"view={self.view}: there are {', '.join(VIEWS)}.")
+        if self.viewer and self.view == "chase":
+            raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
+        if self.viewer:
+            check_display(self)
+
 
 def scripted(track: Track, parameters: QuadrotorParameters) -> Acting:
     """Make the pilot that plans a line through the gates and follows it."""
@@ -97,36 +120,11 @@ PILOTS: dict[str, Callable[[Track, QuadrotorParameters], Acting]] = {"scripted":
 @recipe("fly", FlyConfig)
 def main(config: FlyConfig) -> None:
     """Fly or watch."""
-    start_logging()
     set_num_threads(1)  # a single drone: further threads would wait, and keep cores busy with it
-    with plain_errors():
-        check(config)
     if config.viewer:
         watch(config)
     else:
         fly(config)
-
-
-def check(config: FlyConfig) -> None:
-    """Refuse what would fail only after the flight.
-
-    Raises:
-        ValueError: bad value; the message names the field and what is allowed.
-    """
-    if config.agent is not None and config.pilot is not None:
-        raise ValueError(f"pilot={config.pilot} and agent={config.agent}: give one of them.")
-    if config.pilot not in (None, *PILOTS, *KINDS):
-        raise ValueError(f"pilot={config.pilot}: there are {', '.join((*PILOTS, *KINDS))}.")
-    if config.pilot in KINDS:
-        if config.viewer:
-            raise ValueError(f"viewer=true and pilot={config.pilot}, which has a window of its own: give one of them.")
-        check_by_hand(config.pilot)
-    if config.view not in VIEWS:
-        raise ValueError(f"view={config.view}: there are {', '.join(VIEWS)}.")
-    if config.viewer and config.view == "chase":
-        raise ValueError("viewer=true and view=chase, which films the flight: give one of them.")
-    if config.viewer:
-        check_display(config)
 
 
 def check_display(config: FlyConfig) -> None:

@@ -21,7 +21,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from composing.entry import new_run_dir, plain_errors, recipe, start_logging
+from composing.entry import new_run_dir, plain_errors, recipe
 from composing.options import command
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -61,7 +61,6 @@ STATISTICS = "statistics.json"
 @recipe("hil", HilConfig)
 def main(config: HilConfig) -> None:
     """Fly, or look at a flight."""
-    start_logging()
     with plainly():
         check(config)
         if config.actor is None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from composing.entry import plain_errors, recipe, start_logging
+from composing.entry import plain_errors, recipe
 
 from dreamer_racing.envs.drone.variations import SUFFIXES
 
@@ -30,20 +30,17 @@ class IdentificationConfig:
     preset: str = "betaflight"  # where to begin: a preset with a Betaflight, or a drone's file; mass and inertia stay
     output: str = "drone.yaml"  # the file to write
 
+    def check(self) -> None:
+        """Refuse what could only fail once all is done."""
+        if not self.output.endswith(SUFFIXES):
+            raise ValueError(f"output={self.output}: the name of the file must end in {' or '.join(SUFFIXES)}.")
+
 
 @recipe("identification", IdentificationConfig)
 def main(config: IdentificationConfig) -> None:
     """Read, fit, write."""
-    start_logging()
     with plain_errors():
-        check(config)
         identify(config)
-
-
-def check(config: IdentificationConfig) -> None:
-    """Refuse what could only fail once all is done."""
-    if not config.output.endswith(SUFFIXES):
-        raise ValueError(f"output={config.output}: the name of the file must end in {' or '.join(SUFFIXES)}.")
 
 
 def identify(config: IdentificationConfig) -> None:

@@ -9,13 +9,12 @@ earlier report is never overwritten. docs/evaluation.md says what is measured.
 """
 
 import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from composing.building import track_as_begun, worlds_of
-from composing.entry import plain_disk_errors, plain_errors, recipe, start_logging
+from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 from composing.schema import RunConfig
 
@@ -48,8 +47,6 @@ class PerceptionConfig(FlightConfig):
 @recipe("perception", PerceptionConfig)
 def main(config: PerceptionConfig) -> None:
     """Restore the policy, fly it with and without decoys and with corrupted images, report."""
-    start_logging()
-    started = time.monotonic()
     with plain_errors():
         restored = restore(config)
         if not restored.trained.env.from_pixels:
@@ -58,7 +55,7 @@ def main(config: PerceptionConfig) -> None:
         directory = fresh_directory(config.run_dir or restored.run_dir / "perception", RESULT)
     looked = fly_and_look(config, restored, tracks)
     corrupted = {noise: fly_corrupted(config, restored, noise) for noise in (NO_NOISE, START_NOISE)}
-    provenance = restored.provenance(config, time.monotonic() - started)
+    provenance = restored.provenance(config)
     with plain_disk_errors():
         write(directory, looked, corrupted, provenance, worlds_of(restored.trained)["camera"])
     say(f"\nwritten to {directory}")

@@ -15,7 +15,7 @@ sitl. With betaflight= one does that runs already.
 
 from dataclasses import dataclass
 
-from composing.entry import plain_errors, recipe, start_logging
+from composing.entry import plain_errors, recipe
 
 from dreamer_racing.export.agents import existing_agent_path
 from dreamer_racing.export.onnx_actor import read_contract
@@ -35,13 +35,18 @@ class PlantConfig(ProcessOptions, Delivery, Mismatch):
     # with firmware=: for whose largest body rates it is set up: pilot, an agent's name, or its path
     actor: str = "pilot"
 
+    def check(self) -> None:
+        """Refuse a delay where nothing would be delayed, and an actor for whom nothing is set up."""
+        if self.delay is not None and (name := by_firmware(self)):
+            raise ValueError(f"delay={self.delay} is of commands, and {name}={getattr(self, name)}: leave one out.")
+        if self.actor != PILOT and self.firmware is None:
+            raise ValueError(f"actor={self.actor} is for firmware=, which is set up for it: add that, or leave it out.")
+
 
 @recipe("plant", PlantConfig)
 def main(config: PlantConfig) -> None:
     """Fly until stopped."""
-    start_logging()
     with plain_errors():
-        check(config)
         vehicle = PlantVehicle(config.track, config.preset, config)
         sockets = open_sockets(config)
         firmware = None
@@ -57,14 +62,6 @@ def settings_for(actor: str) -> list[str]:
     path = existing_agent_path("actor", actor)
     contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
     return print_settings(contract, "betaflight_sitl")
-
-
-def check(config: PlantConfig) -> None:
-    """Refuse a delay where nothing would be delayed, and an actor for whom nothing is set up."""
-    if config.delay is not None and (name := by_firmware(config)):
-        raise ValueError(f"delay={config.delay} is of commands, and {name}={getattr(config, name)}: leave one out.")
-    if config.actor != PILOT and config.firmware is None:
-        raise ValueError(f"actor={config.actor} is for firmware=, which is set up for it: add that, or leave it out.")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ named, and does not cost the others. `learning_curves.csv` beside a figure holds
 `runs=learning_curves.csv` draws it again.
 """
 
-from composing.entry import plain_errors, recipe, start_logging
+from composing.entry import plain_errors, recipe
 
 from dreamer_racing.figures.plotting import PlotConfig, draw
 
@@ -18,7 +18,6 @@ from dreamer_racing.figures.plotting import PlotConfig, draw
 @recipe("plot", PlotConfig)
 def main(config: PlotConfig) -> None:
     """Make the figures asked for, say what was left out."""
-    start_logging()
     with plain_errors():
         draw(config)
 

@@ -10,15 +10,7 @@ Everything of a run lands in its run directory, as with recipes/dreamer_v3.py.
 from functools import partial
 from typing import cast
 
-from composing.building import (
-    make_collector,
-    make_curriculum,
-    make_env,
-    make_learner,
-    make_run_evaluator,
-    make_tracker,
-    seed_generators,
-)
+from composing import building
 from composing.entry import recipe
 from composing.launching import launch
 from composing.resolving import resolve_baseline
@@ -41,17 +33,17 @@ def main(config: DictConfig) -> None:
 
 def train(config: PPORunConfig, session: Session) -> None:
     """Collect, update, evaluate, save."""
-    env = make_env(config)
-    learner = cast(PPOLearner, make_learner(config, Interface.of(env), config.device))
-    seed_generators(config.seed)
-    rollouts = Rollouts(make_collector(config, env, learner.policy()))
-    curriculum = make_curriculum(config, env)
+    env = building.make_env(config)
+    learner = cast(PPOLearner, building.make_learner(config, Interface.of(env), config.device))
+    building.seed_generators(config.seed)
+    rollouts = Rollouts(building.make_collector(config, env, learner.policy()))
+    curriculum = building.make_curriculum(config, env)
     session.track(
         learner=learner,
         env=env,
         rollouts=rollouts,
-        evaluator=make_run_evaluator(config, session.directory.path, learner),
-        tracker=make_tracker(config),
+        evaluator=building.make_run_evaluator(config, session.directory.path, learner),
+        tracker=building.make_tracker(config),
         curriculum=curriculum,
     )
 

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from composing.entry import new_run_dir, plain_errors, recipe, start_logging
+from composing.entry import new_run_dir, plain_errors, recipe
 
 from dreamer_racing.envs.drone.parameters import load_preset
 from dreamer_racing.envs.tracks import Track, load_track
@@ -53,7 +53,6 @@ class SimToRealConfig:
 @recipe("sim_to_real", SimToRealConfig)
 def main(config: SimToRealConfig) -> None:
     """Fly all of it, print a table, write files."""
-    start_logging()
     with plain_errors():
         track, make_flyer = check(config)
         folder = Path(config.run_dir) if config.run_dir else new_run_dir("sim_to_real", track.name)

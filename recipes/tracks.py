@@ -30,12 +30,16 @@ class TracksConfig:
     picture: str | None = None  # file to draw them into, as maps from above and from the side: .png, .pdf or .svg
     json: bool = False  # for programs, on stdout; --json does the same
 
+    def check(self) -> None:
+        """Refuse a picture of an unknown kind."""
+        if self.picture is not None and Path(self.picture).suffix not in PICTURES:
+            raise ValueError(f"picture={self.picture}: the name of the file must end in {', '.join(PICTURES)}.")
+
 
 @recipe("tracks", TracksConfig)
 def main(config: TracksConfig) -> None:
     """List, and draw."""
     with plain_errors():
-        check(config)
         tracks = [load_track(name) for name in ([config.track] if config.track else BUILTIN_TRACKS)]
     found = [measures(track) for track in tracks]
     print(json.dumps(found, indent=1) if config.json else "\n".join(table(found)))
@@ -46,12 +50,6 @@ def main(config: TracksConfig) -> None:
             plot_tracks(tracks, config.picture)
         if not config.json:
             print(f"picture: {config.picture}")
-
-
-def check(config: TracksConfig) -> None:
-    """Refuse a picture of an unknown kind."""
-    if config.picture is not None and Path(config.picture).suffix not in PICTURES:
-        raise ValueError(f"picture={config.picture}: the name of the file must end in {', '.join(PICTURES)}.")
 
 
 def measures(track: Track) -> dict[str, Any]:

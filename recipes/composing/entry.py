@@ -134,7 +134,7 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
             none it is the schema alone, and hydra leaves nothing behind.
         schema: dataclass of the configuration.
         composed: whether the function takes what hydra composed, with settings left open, instead of an object of the
-            dataclass whose numbers are within their ranges.
+            dataclass whose numbers are within their ranges, and that its method `check` takes, if it has one.
     """
     SCHEMAS[name] = schema
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
@@ -144,7 +144,10 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         @functools.wraps(function)
         def with_typed(config: DictConfig) -> None:
-            function(typed(config))
+            settings = typed(config)
+            if not getattr(settings, "json", False):  # what programs read is nothing else
+                start_logging()
+            function(settings)
 
         task = function if composed else with_typed
         main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(task)
@@ -170,10 +173,12 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
 
 
 def typed(config: DictConfig) -> Any:
-    """Return an object of the dataclass of a configuration; refuse what is missing, and numbers out of their range."""
+    """Return an object of the dataclass of a configuration; refuse what is missing, out of its range, or by `check`."""
     with plain_errors():
-        settings = OmegaConf.to_object(config)
+        settings: Any = OmegaConf.to_object(config)
         check_settings(settings)
+        if hasattr(settings, "check"):
+            settings.check()
     return settings
 
 

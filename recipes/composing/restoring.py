@@ -1,5 +1,6 @@
 """What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
 
+import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -70,6 +71,7 @@ class Restored:
     weights: str  # which of them fly: averaged | trained
     env_steps: int
     machine: dict[str, Any]  # versions and commit too, as they were at the start
+    started: float  # s, by the monotonic clock
 
     @property
     def run_dir(self) -> Path:
@@ -83,8 +85,8 @@ class Restored:
             return hash_weights(ActorStep(self.flyer.flying_agent))
         return hash_weights(ActorStep(self.flyer.agent)) if isinstance(self.flyer, ShippedAgent) else None
 
-    def provenance(self, config: FlightConfig, seconds: float) -> dict[str, Any]:
-        """Say how the numbers of an evaluation of so many seconds came about."""
+    def provenance(self, config: FlightConfig) -> dict[str, Any]:
+        """Say how the numbers of an evaluation that ends now came about."""
         return {
             "command": command_line(),
             "checkpoint": config.checkpoint,
@@ -102,7 +104,7 @@ class Restored:
             "renderer": self.trained.env.renderer,
             "episodes": config.episodes,
             "seed": config.seed,
-            "wall_clock_seconds": round(seconds, 1),
+            "wall_clock_seconds": round(time.monotonic() - self.started, 1),
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
             **self.machine,
         }
@@ -116,7 +118,7 @@ def restore(config: FlightConfig) -> Restored:
         ValueError: it was not trained to race, lacks the weights asked for, or the device is not there.
         TrackError: there is no such track, or no such decoys on it.
     """
-    machine = provenance()
+    started, machine = time.monotonic(), provenance()
     device = choose_device(config.device)
     checkpoint = find_trained(config.checkpoint)
     trained = trained_config(config_folder(checkpoint))
@@ -144,7 +146,7 @@ def restore(config: FlightConfig) -> Restored:
         print(f"worlds: {trained.env.device} (renderer={config.renderer})")
     print(f"checkpoint: {checkpoint} ({trained.algorithm}, trained on {trained_on}, {env_steps:,} env_steps)")
     print(f"weights: {weights}{' (weights=auto)' if config.weights == 'auto' else ''}")
-    return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine)
+    return Restored(checkpoint, trained, trained_on, flyer, weights, env_steps, machine, started)
 
 
 def find_trained(name: str) -> Path:

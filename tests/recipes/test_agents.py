@@ -123,7 +123,7 @@ def test_what_an_agent_cannot_fly_is_refused(
 ) -> None:
     fly = recipe_module("fly")
     config = fly.FlyConfig(agent=str(agent), **settings)
-    fly.check(config)
+    config.check()
     with pytest.raises(SystemExit, match="2"):
         fly.make_flight(config)
     assert re.search(f"^error: .*{words}", capsys.readouterr().err)
@@ -139,9 +139,9 @@ def test_weights_that_an_agent_does_not_hold_are_refused(agent: Path) -> None:
 def test_settings_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> None:
     fly, export = map(recipe_module, ("fly", "export"))
     with pytest.raises(ValueError, match="pilot=hover and agent=kidney: give one of them"):
-        fly.check(fly.FlyConfig(agent="kidney", pilot="hover"))
+        fly.FlyConfig(agent="kidney", pilot="hover").check()
     with pytest.raises(ValueError, match="pilot=human: there are scripted, hover, keyboard, gamepad"):
-        fly.check(fly.FlyConfig(pilot="human"))
+        fly.FlyConfig(pilot="human").check()
     (tmp_path / "agent.json").write_text("{}")
     for settings, words in (
         ({"commit": "abc"}, "commit=abc is for agent=FOLDER"),

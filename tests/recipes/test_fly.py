@@ -46,7 +46,7 @@ def watch(fly: ModuleType, monkeypatch: pytest.MonkeyPatch, pictures: int, **set
     monkeypatch.setattr(fly, "BREAK", 0.0)
     monkeypatch.setattr(fly, "check_window", lambda: None)
     config = fly.FlyConfig(viewer=True, **settings)
-    fly.check(config)
+    config.check()
     fly.watch(config)
     (window,) = opened
     assert window.closed
@@ -78,7 +78,7 @@ def test_without_a_display_it_says_in_a_sentence_how_to_get_a_video(monkeypatch:
     )
     for flown in ({"agent": "kidney"}, {"pilot": "hover"}):
         with pytest.raises(ValueError, match=words):
-            fly.check(fly.FlyConfig(viewer=True, **flown))
+            fly.FlyConfig(viewer=True, **flown).check()
 
 
 @pytest.mark.parametrize(
@@ -114,9 +114,9 @@ def test_the_refusal_as_a_user_meets_it(tmp_path) -> None:
 def test_a_view_that_there_is_not_is_refused_before_the_flight() -> None:
     fly = recipe_module("fly")
     with pytest.raises(ValueError, match=r"^view=side: there are map, chase\.$"):
-        fly.check(fly.FlyConfig(view="side"))
+        fly.FlyConfig(view="side").check()
     with pytest.raises(ValueError, match=r"^viewer=true and view=chase"):
-        fly.check(fly.FlyConfig(viewer=True, view="chase"))
+        fly.FlyConfig(viewer=True, view="chase").check()
 
 
 @pytest.mark.parametrize("flyer", [{"agent": "circle"}, {"pilot": "hover", "track": "circle", "control_rate": 10}])

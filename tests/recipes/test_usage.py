@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dreamer_racing import commands
-from dreamer_racing.settings import check_settings, shortened
+from dreamer_racing.settings import shortened
 from tests.running_recipes import CONFIG, ROOT, recipe, recipe_module
 
 options = recipe_module("composing.options")
@@ -148,9 +148,8 @@ def check(recipe: str, config: DictConfig) -> None:
     elif recipe == "experiment":
         module.check(config)
     else:
-        settings = OmegaConf.to_object(config)
-        check_settings(settings)
-        getattr(module, "check_plot" if recipe == "plot" else "check", lambda checked: None)(settings)
+        settings = recipe_module("composing.entry").typed(config)
+        getattr(module, "check", lambda checked: None)(settings)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
