@@ -32,7 +32,6 @@ from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
 from dreamer_racing.evaluation.held_out import SEEN as OBSERVED
 from dreamer_racing.evaluation.held_out import held_out_metrics, world_model_metrics
@@ -90,21 +89,9 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
     return str(device) if device.type == "cuda" and fits else "cpu"
 
 
-def imu_of(config: RunConfig) -> str | None:
-    """The inertial measurements that the agent sees, as `DroneRacingEnv` takes them."""
-    return None if config.env.imu == "none" else config.env.imu
-
-
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
-    env = config.env
-    same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
-    return {
-        "track": track_as_begun(config),
-        "camera": Camera(env.image_size, env.image_size, tilt=env.camera_tilt, rate=env.camera_rate),
-        "imu": imu_of(config),
-        **{name: getattr(env, name) for name in same},
-    }
+    return {"track": track_as_begun(config), **config.env.worlds()}
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
@@ -115,20 +102,15 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
         num_envs: worlds; those of the configuration if None.
         num_threads: that step and draw a race's worlds on a CPU; if None one a CPU, at most `OMP_NUM_THREADS`.
     """
-    env = config.env
-    num_envs = num_envs or env.num_envs
+    num_envs = num_envs or config.env.num_envs
     readers = privileged_losses(config) if isinstance(config, WorldModelRunConfig) else []
     if is_race(config):
-        training = (
-            "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius",
-            "action_change_weight", "looks",
-        )  # fmt: skip
         return DroneRacingEnv(
             num_envs=num_envs,
             privileged=bool(readers),
             seed=config.seed,
             num_threads=num_threads,
-            **{name: getattr(env, name) for name in training},
+            **config.env.training(),
             **worlds_of(config),
         )
     if readers:
@@ -136,7 +118,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
             f"{' and '.join(readers)}: read the race's privileged state, which env=dmc does not have. Choose other "
             "losses, e.g. loss=reconstruction, and of recipes/latent_ppo.py loss.critic=latent."
         )
-    return make_suite(config, num_envs, config.seed, env.episode_steps)
+    return make_suite(config, num_envs, config.seed, config.env.episode_steps)
 
 
 def privileged_losses(config: WorldModelRunConfig) -> list[str]:

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
-from composing.building import imu_of, track_as_begun
+from composing.building import track_as_begun
 from composing.entry import override_key
 from composing.schema import (
     CollectorKind,
@@ -26,12 +24,7 @@ from composing.schema import (
     is_race,
 )
 from dreamer_racing import parallel
-from dreamer_racing.envs.drone.parameters import at_control_rate, load_preset
-from dreamer_racing.envs.imu import load_imu
-from dreamer_racing.envs.race.gates import GateSweeper
 from dreamer_racing.envs.race.starts import StartSampler
-from dreamer_racing.envs.simulator.scene import Camera, frame_interval
-from dreamer_racing.envs.worlds import ACTION_SIZE, RaceWorlds
 from dreamer_racing.experience.ray_cluster import WorkersConfig
 from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.experience.replay import Storage
@@ -39,9 +32,6 @@ from dreamer_racing.losses import Barlow, Image, State, Target, find_objective, 
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import check_settings
-
-OF_EVERY_SUITE = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
-"""Settings of an environment that are not for races alone."""
 
 
 def check_overrides(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -119,64 +109,24 @@ def check(config: RunConfig) -> None:
 
 
 def check_worlds(config: RunConfig) -> None:
-    """Refuse worlds that cannot be where they are to be, and what is not for their suite."""
-    env = config.env
-    race, on_cuda = is_race(config), env.device.partition(":")[0] == "cuda"
-    if not on_cuda and env.device != "cpu":
-        raise ValueError(f"env.device={env.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
-    if on_cuda and not race:
-        raise ValueError(f"env.device={env.device} is for races: env.suite={env.suite} runs on cpu.")
-    if env.looks != "nominal" and not (race and env.from_pixels):
-        raise ValueError(f"env.looks={env.looks} is for races seen in images: leave it at nominal.")
-    if race:
-        check_race(config)
+    """Refuse worlds that cannot be, races that leave each other no room to start, and noise of starts elsewhere."""
+    env, noise, track = config.env, config.evaluation.start_noise, track_as_begun(config) if is_race(config) else None
+    env.check()
+    if track is None:
+        if noise:
+            raise ValueError(f"evaluation.start_noise={noise} is for races, and env.suite={env.suite}: leave it at 0.")
         return
-    default = RunConfig()
-    settings = [("env", name) for name in vars(env) if name not in OF_EVERY_SUITE]
-    for group, name in (*settings, ("evaluation", "start_noise")):
-        value, usual = (getattr(getattr(one, group), name) for one in (config, default))
-        if value != usual:
-            raise ValueError(f"{group}.{name}={value} is for races, and env.suite={env.suite}: leave it at {usual}.")
-
-
-def check_race(config: RunConfig) -> None:
-    """Refuse what the parts of a race would refuse later, and starts that leave each other no room."""
-    env, track = config.env, track_as_begun(config)
-    if env.camera_rate is not None and not env.from_pixels:
-        raise ValueError(f"env.camera_rate={env.camera_rate:g} is of images: leave it out of a run from numbers.")
-    for group, make in (
-        ("env", lambda: at_control_rate(load_preset(env.preset), env.control_rate)),
-        ("env", lambda: frame_interval(Camera(rate=env.camera_rate), env.control_rate)),
-        ("env", lambda: load_imu(imu_of(config), env.from_pixels)),
-        ("env", lambda: try_own(config)),
-        ("env", lambda: GateSweeper(track, miss_radius=env.miss_radius)),
-        ("evaluation", lambda: StartSampler(track, start_noise=config.evaluation.start_noise)),
-    ):
-        try:
-            make()
-        except ValueError as error:
-            raise ValueError(f"{group}.{error}") from error
+    env.check_race(track)
+    try:
+        StartSampler(track, start_noise=noise)
+    except ValueError as error:
+        raise ValueError(f"evaluation.{error}") from error
     moves = isinstance(config, WorldModelRunConfig) and config.schedule.start_on_line.to is not None
     if env.start_on_line == 1 and env.start_beyond_gate and not moves:
         raise ValueError(
             f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
             "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
         )
-
-
-def try_own(config: RunConfig) -> None:
-    """Refuse a reward or numbers of a user's own that are not as they should be: fly a step by them."""
-    env = config.env
-    if env.reward is None and env.vector is None:
-        return
-    if env.vector is not None and imu_of(config) is not None:
-        raise ValueError("vector and env.imu: agents see one set of numbers, leave one of them out.")
-    own: dict[str, Any] = {name: getattr(env, name) for name in ("control_rate", "device", "reward", "vector")}
-    worlds = RaceWorlds(track_as_begun(config), 2, env.preset, from_pixels=False, **own)
-    worlds.reset()
-    worlds.step(torch.zeros(2, ACTION_SIZE, device=env.device))
-    worlds.observed_vector()
-    worlds.close()
 
 
 def check_replay(config: ReplayRunConfig) -> None:

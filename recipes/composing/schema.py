@@ -7,7 +7,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from dreamer_racing.envs.drone.parameters import MIN_CONTROL_RATE
+from dreamer_racing.envs.config import EnvConfig
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
 from dreamer_racing.experience.ray_cluster import WorkersConfig
 from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig
@@ -15,49 +15,10 @@ from dreamer_racing.figures.loggers import LoggerConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, setting
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, setting
 from dreamer_racing.training.journal import CheckpointConfig, EvaluationConfig
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, LatentPPOScheduleConfig, ScheduleConfig
-
-SUITES = ("race", "dmc")
-
-
-@dataclass
-class EnvConfig:
-    """Where the agent acts: the race, or a task of the DeepMind Control Suite to compare with published curves."""
-
-    suite: str = "race"  # race | dmc
-    preset: str = "easy"  # physics: easy | faithful | betaflight
-    num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
-    control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
-    # frames a second, Hz, control_rate divided by a whole number; null: one at every control step
-    camera_rate: float | None = setting(None, POSITIVE)
-    # gyro and accelerometer, seen beside the images: none | exact | noisy
-    imu: str = "none"
-    # module:function of your own in place of Eq. 1 of the paper (docs/own_rewards.md); null: that
-    reward: str | None = None
-    # module:function of your own, whose numbers the agent sees, too (docs/own_rewards.md); null: none beside images
-    vector: str | None = None
-    # control steps of a training episode; null: those of 20 s, with env=dmc those of the task
-    episode_steps: int | None = setting(None, COUNT)
-    # share of training episodes, but for those on a line, that begin behind a gate, to practise turns
-    start_beyond_gate: float = setting(0.0, SHARE)
-    # share of those that begin neither there nor on a line, that begin in flight before a gate instead of at the start
-    start_at_gate: float = setting(0.5, SHARE)
-    # share of training episodes that begin in flight on a planned racing line
-    start_on_line: float = setting(0.0, SHARE)
-    # m; training episodes end where a gate is missed by less than this; 0: they go on
-    miss_radius: float = setting(0.0, NOT_NEGATIVE)
-    # b3, penalty in training for each unit of |a_t - a_t-1|^2; 0: none, as in the paper; 1e-4 in champion-level racing
-    action_change_weight: float = setting(0.0, NOT_NEGATIVE)
-    # of the worlds, to train and to be evaluated in: cpu | cuda | auto, which takes the learner's where it can
-    device: str = "auto"
-    renderer: str = "auto"  # auto | egl | osmesa | warp | warp_cuda; on cuda auto | warp
-    looks: str = "nominal"  # in training: nominal | randomised (light, colours, camera tilt, lens, noise)
-    from_pixels: bool = True  # false: the agent sees the numbers of `vector` instead of images
-    image_size: int = 64  # pixels, side of the images: a multiple of 16, by which the networks divide it
-    camera_tilt: float = 25.0  # degrees upwards
 
 
 @dataclass
@@ -221,13 +182,7 @@ RECIPES: dict[str, type[RunConfig]] = {
 
 
 def is_race(config: RunConfig) -> bool:
-    """Whether the run races drones, rather than being tested on the Control Suite.
-
-    Raises:
-        ValueError: unknown suite.
-    """
-    if config.env.suite not in SUITES:
-        raise ValueError(f"env.suite={config.env.suite}: there are {', '.join(SUITES)}.")
+    """Return whether the run races drones, rather than being tested on the Control Suite."""
     return config.env.suite == "race"
 
 
