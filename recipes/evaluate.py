@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from composing.building import make_evaluator, track_as_begun, worlds_of
+from composing.building import make_evaluator, worlds_of
 from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 
@@ -68,7 +68,7 @@ def main(config: EvaluateConfig) -> None:
     """Restore the policy, fly it, report."""
     with plain_errors():
         restored = restore(config)
-        refuse_races(config, track_as_begun(restored.trained))
+        refuse_races(config, restored.trained.track_as_begun())
         directory = fresh_directory(config.run_dir or RunDirectory(restored.run_dir).evaluation, EVALUATION)
         print(f"race: {restored.trained.track}, {restored.trained.env.preset}, {config.episodes} episodes")
         report = make_nominal_report(config, restored, directory) if config.protocol == "nominal" else None

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from composing.building import describe_file, track_as_begun, worlds_of
+from composing.building import describe_file, worlds_of
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
 from composing.restoring import config_folder, find_trained, results_of
@@ -156,7 +156,7 @@ def prepare(
         flight = record_flight(env, agent, config.steps)
     finally:
         env.close()
-    track = track_as_begun(trained)
+    track = trained.track_as_begun()
     contract = make_contract(
         step,
         env.worlds.parameters,
@@ -252,7 +252,7 @@ def read_evaluation(
         FileNotFoundError: there is none.
         ValueError: it is of other weights or another track, or no evaluation; the message says how to make one.
     """
-    track_sha256 = hash_track(track_as_begun(trained))
+    track_sha256 = hash_track(trained.track_as_begun())
     path = Path(config.evaluation or newest_evaluation(results_of(checkpoint), weights_sha256, track_sha256))
     how = f"Make it with: {command('evaluate')} checkpoint={shlex.quote(config.checkpoint)} episodes=100"
     if not path.is_file():

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from composing.building import track_as_begun, worlds_of
+from composing.building import worlds_of
 from composing.entry import plain_disk_errors, plain_errors, recipe
 from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
 from composing.schema import RunConfig
@@ -82,7 +82,7 @@ class Looked:
 
 def tracks_to_fly(trained: RunConfig) -> dict[str, Track]:
     """The track without decoys and, if it has a place for them, with them."""
-    track = track_as_begun(trained)
+    track = trained.track_as_begun()
     if trained.decoys is None and not track.decoys:
         track = with_decoys(track, decoys_for(track))
     plain = {WITHOUT: with_decoys(track, "none")}

@@ -49,6 +49,18 @@ class WorkersConfig:
         """Where a worker's policy lives."""
         return "cuda" if self.gpus else "cpu"
 
+    def check(self) -> None:
+        """Refuse parts of several GPUs.
+
+        Raises:
+            ValueError: the message gives the next number that can be.
+        """
+        if self.gpus > 1 and self.gpus % 1:
+            raise ValueError(
+                f"workers.gpus={self.gpus:g}: Ray gives a worker a part of one GPU or whole ones, e.g. "
+                f"workers.gpus={math.floor(self.gpus)}."
+            )
+
 
 def join(address: str) -> bool:
     """Join a Ray cluster, unless this process has joined one already; return whether it did now.

@@ -32,7 +32,7 @@ from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.envs.policy_memory import with_memory
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, RelabelReward
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Track, describe_track, load_track, read_track, with_decoys
+from dreamer_racing.envs.tracks import BUILTIN_TRACKS, describe_track, load_track
 from dreamer_racing.evaluation.held_out import SEEN as OBSERVED
 from dreamer_racing.evaluation.held_out import held_out_metrics, world_model_metrics
 from dreamer_racing.experience.replay import SequenceReplayConfig, Storage, StreamReplay, make_replay, replay_bytes
@@ -76,13 +76,6 @@ def describe_file(track: str) -> str | None:
     return json.dumps(describe_track(load_track(track))).replace("$", "\\u0024")  # which OmegaConf would read
 
 
-def track_as_begun(config: RunConfig) -> Track:
-    """Return the track of a run: of a file as it was when the run was begun, whatever became of that."""
-    noted = config.track_description
-    track = config.track if noted is None else read_track(json.loads(noted), f"track_description of {config.track}")
-    return with_decoys(track, config.decoys)
-
-
 def worlds_device(device: torch.device, env: EnvConfig) -> str:
     """The device for worlds: the learner's, where they have a simulator and the renderer asked for, else the CPU."""
     fits = env.suite == "race" and env.renderer in ("auto", "warp")
@@ -91,7 +84,7 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
 
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
-    return {"track": track_as_begun(config), **config.env.worlds()}
+    return {"track": config.track_as_begun(), **config.env.worlds()}
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:

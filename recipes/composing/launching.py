@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from composing.building import run_directory
-from composing.checks import check, check_overrides, check_read
+from composing.checks import check_overrides, check_read
 from composing.entry import (
     as_override,
     follow_quietly,
@@ -152,7 +152,7 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
     Raises:
         ValueError: it cannot; or the directory holds another run, or is in use by a live one.
     """
-    check(config)
+    config.check()
     directory = run_directory(config)
     lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
     if parallel.is_first() and not config.resume:

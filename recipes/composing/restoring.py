@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from omegaconf import MISSING
 
-from composing.building import Environment, describe_file, make_env, make_learner, track_as_begun, worlds_device
+from composing.building import Environment, describe_file, make_env, make_learner, worlds_device
 from composing.saved import trained_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
 from dreamer_racing.commands import from_here
@@ -96,7 +96,7 @@ class Restored:
             "env_steps": self.env_steps,
             "trained_on": self.trained_on,
             "track": self.trained.track,
-            "track_sha256": hash_track(track_as_begun(self.trained)),
+            "track_sha256": hash_track(self.trained.track_as_begun()),
             "decoys": self.trained.decoys,
             "preset": self.trained.env.preset,
             "control_rate": self.trained.env.control_rate,

@@ -1,5 +1,6 @@
 """Typed configuration of the recipes: hydra refuses a value of the wrong type, naming the field."""
 
+import json
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -7,15 +8,21 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
+from dreamer_racing import parallel
 from dreamer_racing.envs.config import EnvConfig
 from dreamer_racing.envs.race.curriculum import BodyRateSchedule
+from dreamer_racing.envs.race.starts import StartSampler
+from dreamer_racing.envs.tracks import Track, read_track, with_decoys
 from dreamer_racing.experience.ray_cluster import WorkersConfig
+from dreamer_racing.experience.ray_rollouts import check_interval
 from dreamer_racing.experience.replay import ReplayConfig, SequenceReplayConfig
 from dreamer_racing.figures.loggers import LoggerConfig
 from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.config import LearnerConfig
-from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig
-from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, setting
+from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig, find_objective
+from dreamer_racing.modules import get_size
+from dreamer_racing.modules.encoder import smallest_map
+from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, check_settings, setting
 from dreamer_racing.training.journal import CheckpointConfig, EvaluationConfig
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, LatentPPOScheduleConfig, ScheduleConfig
@@ -68,6 +75,50 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
+    def track_as_begun(self) -> Track:
+        """Return the track: of a file as it was when the run was begun, whatever became of that."""
+        noted = self.track_description
+        track = self.track if noted is None else read_track(json.loads(noted), f"track_description of {self.track}")
+        return with_decoys(track, self.decoys)
+
+    def check(self) -> None:
+        """Refuse settings with which the run could not work, once nothing is left open.
+
+        Raises:
+            ValueError: the message names the setting as it is written, its value, and what would be right.
+        """
+        check_settings(self)
+        self.logger.check()
+        if parallel.asked_for() > 1 and not isinstance(self, WorldModelRunConfig):
+            raise ValueError(
+                f"WORLD_SIZE={parallel.asked_for()}: algorithm={self.algorithm} trains in one process, and of those "
+                "that torchrun starts only recipes/dreamer_v3.py and latent_ppo.py makes use: start it without "
+                "torchrun."
+            )
+        self.check_worlds()
+
+    def check_worlds(self) -> None:
+        """Refuse worlds that cannot be, races that leave each other no room to start, and noise of starts elsewhere."""
+        env, noise, track = self.env, self.evaluation.start_noise, self.track_as_begun() if is_race(self) else None
+        env.check()
+        if track is None:
+            if noise:
+                raise ValueError(
+                    f"evaluation.start_noise={noise} is for races, and env.suite={env.suite}: leave it at 0."
+                )
+            return
+        env.check_race(track)
+        try:
+            StartSampler(track, start_noise=noise)
+        except ValueError as error:
+            raise ValueError(f"evaluation.{error}") from error
+        moves = isinstance(self, WorldModelRunConfig) and self.schedule.start_on_line.to is not None
+        if env.start_on_line == 1 and env.start_beyond_gate and not moves:
+            raise ValueError(
+                f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
+                "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
+            )
+
 
 @dataclass
 class ReplayRunConfig(RunConfig):
@@ -79,6 +130,22 @@ class ReplayRunConfig(RunConfig):
     def make_replay_ratio(self) -> ReplayRatio:
         """Make what says how much the run trains."""
         raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
+
+    def check(self) -> None:
+        """As `RunConfig.check`; and refuse settings with which there would be no update."""
+        super().check()
+        if self.total_env_steps <= self.prefill:
+            raise ValueError(
+                f"total_env_steps={self.total_env_steps} must be above prefill={self.prefill}, the steps before the "
+                "first update: raise the one, or lower the other."
+            )
+        replay, group = self.make_replay_ratio(), "sac" if isinstance(self, SACRunConfig) else "model"
+        if not replay.updates(self.total_env_steps):
+            raise ValueError(
+                f"{group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={self.total_env_steps:,} less "
+                f"prefill={self.prefill:,} asks for no whole update of {replay.records} records. "
+                "Raise total_env_steps or the ratio, or lower the prefill."
+            )
 
 
 @dataclass
@@ -117,6 +184,57 @@ class WorldModelRunConfig(ReplayRunConfig):
         """How many env_steps old the weights of workers are at most."""
         return self.workers.weight_interval or 2 * self.env.num_envs * self.rollout_steps
 
+    def check(self) -> None:
+        """As `ReplayRunConfig.check`; and refuse schedules, networks and workers that cannot be."""
+        super().check()
+        self.schedule.check(self.scheduled, self.env.suite)
+        self.check_windows()
+        self.check_collector()
+
+    def check_windows(self) -> None:
+        """Refuse images that networks of that size cannot halve, and windows longer than what is collected before."""
+        env, size = self.env, get_size(self.model.size)
+        try:
+            smallest_map(env.image_size, size.cnn_patch, len(size.cnn_multipliers))
+        except ValueError as error:
+            raise ValueError(f"env.{error}") from error
+        if self.tuned == "images" and not env.from_pixels:
+            raise ValueError(
+                "tuned=images is for agents that see images, and env.from_pixels=false shows them the state: leave one "
+                "out."
+            )
+        prefilled, length = self.prefill // env.num_envs, self.model.batch_length
+        if prefilled < length:
+            raise ValueError(
+                f"prefill={self.prefill} gives each of env.num_envs={env.num_envs} worlds {prefilled} records, "
+                f"and the first update needs windows of model.batch_length={length}: prefill must be at least "
+                f"{env.num_envs * length}."
+            )
+
+    def check_collector(self) -> None:
+        """Refuse workers beside other ways to collect, and worlds or weights that cannot be shared out among them."""
+        workers, num_envs, asked = self.num_workers, self.env.num_envs, self.workers
+        if self.collector is not CollectorKind.ray:
+            default = vars(WorkersConfig())
+            given = [] if workers is None else [f"num_workers={workers}"]
+            given += [f"workers.{name}={value}" for name, value in vars(asked).items() if value != default[name]]
+            if given:
+                raise ValueError(f"{given[0]} is for collector=ray: add that, or leave it out.")
+            return
+        assert workers is not None, "resolve_workers() says how many"
+        if parallel.asked_for() > 1:
+            raise ValueError(
+                f"WORLD_SIZE={parallel.asked_for()} with collector=ray: workers fly for a single learner. Start it "
+                "without torchrun, or set collector=local."
+            )
+        if num_envs % workers:
+            raise ValueError(
+                f"env.num_envs={num_envs} worlds cannot be shared equally by num_workers={workers}: make it a "
+                f"multiple, e.g. env.num_envs={-(-num_envs // workers) * workers}, or choose another number of workers."
+            )
+        asked.check()
+        check_interval(self.weight_interval, num_envs * self.rollout_steps)
+
 
 @dataclass
 class DreamerV3RunConfig(WorldModelRunConfig):
@@ -125,6 +243,16 @@ class DreamerV3RunConfig(WorldModelRunConfig):
     algorithm: str = "dreamer_v3"
     loss: DreamerV3Losses = field(default_factory=DreamerV3Losses)
     schedule: DreamerV3ScheduleConfig = field(default_factory=DreamerV3ScheduleConfig)
+
+    def check(self) -> None:
+        """As `WorldModelRunConfig.check`; and refuse objectives of collected steps, and losses beyond a window."""
+        super().check()
+        find_objective(self.loss.actor, collected=False)
+        steps, length = self.loss.open_loop_steps, self.model.batch_length
+        if steps >= length:
+            raise ValueError(
+                f"loss.open_loop_steps={steps} must be less than the records of a window, model.batch_length={length}."
+            )
 
 
 @dataclass
@@ -139,6 +267,11 @@ class LatentPPORunConfig(WorldModelRunConfig):
     def scheduled(self) -> dict[str, Any]:
         """Whose settings the schedule moves, by their names."""
         return super().scheduled | {"loss.ppo": self.loss.ppo}
+
+    def check(self) -> None:
+        """As `WorldModelRunConfig.check`; and refuse objectives of imagined steps."""
+        super().check()
+        find_objective(self.loss.actor, collected=True)
 
 
 @dataclass
@@ -158,6 +291,17 @@ class PPORunConfig(RunConfig):
     rollout_steps: int = setting(32, COUNT)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+
+    def check(self) -> None:
+        """As `RunConfig.check`; and refuse more minibatches than a rollout has records."""
+        super().check()
+        records = self.env.num_envs * self.rollout_steps
+        if self.ppo.minibatches > records:
+            raise ValueError(
+                f"ppo.minibatches={self.ppo.minibatches} are more than the {records} records of a rollout, "
+                f"env.num_envs={self.env.num_envs} times rollout_steps={self.rollout_steps}: lower the one, or "
+                "raise the others."
+            )
 
 
 @dataclass

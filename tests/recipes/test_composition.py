@@ -29,11 +29,11 @@ def test_every_group_composes(path: Path) -> None:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_variant_of_an_experiment_is_a_run_that_differs_from_the_others(experiment: str) -> None:
     algorithm, variants, overrides = (compose(experiment)[name] for name in ("algorithm", "variants", "overrides"))
-    checks, recipe = recipe_module("composing.checks"), recipe_module(algorithm)
+    recipe = recipe_module(algorithm)
     settings = set()
     for changes in variants.values():
         resolved = recipe.resolve(compose(algorithm, "device=cpu", "run_dir=run", *changes, *overrides))
-        checks.check(OmegaConf.to_object(resolved))
+        OmegaConf.to_object(resolved).check()
         settings.add(OmegaConf.to_yaml(resolved))
     assert len(settings) == len(variants)
     swept = OmegaConf.load(CONFIG / f"{experiment}.yaml").hydra.sweeper.params.variant
@@ -135,7 +135,7 @@ def test_on_cuda_windows_are_short_and_warm_and_updates_a_graph(
     config = resolved_on("cuda", monkeypatch, *overrides)
     model = config.model
     assert (model.size, model.batch_size, model.batch_length, config.replay.context, model.cuda_graph) == expected
-    recipe_module("composing.checks").check(OmegaConf.to_object(config))
+    OmegaConf.to_object(config).check()
 
 
 def test_on_a_cpu_nothing_of_that_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ def test_few_worlds_hold_nothing_out_unless_asked(capsys: pytest.CaptureFixture[
 )
 def test_what_races_goes_with_other_actors(name: str, override: str) -> None:
     config = recipe_module(name).resolve(compose(name, "tuned=race", override))
-    recipe_module("composing.checks").check(OmegaConf.to_object(config))
+    OmegaConf.to_object(config).check()
 
 
 def test_settings_that_race_yield_to_the_command_line() -> None:
@@ -295,7 +295,7 @@ def test_what_goes_by_gates_passed_moves_with_them_and_not_with_the_run():
     overrides = ["tuned=none", "model=debug", "device=cpu", "schedule.min_std.to=0.05", "schedule.min_std.begin=0.5"]
     overrides += ["schedule.min_std.end=0.7", "schedule.min_std.by=passes", "total_env_steps=100000"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
-    recipe_module("composing.checks").check(config)
+    config.check()
     schedule = Schedule(config.schedule, config.scheduled, config.total_env_steps)
     schedule.pass_rate = GatePassRate(num_gates=1)
     assert schedule.at(100_000)["min_std"] == pytest.approx(0.1)
@@ -339,7 +339,7 @@ def test_nothing_goes_by_gates_where_there_are_none():
     overrides = ["env=dmc", "model=debug", "device=cpu", "schedule.discount.to=0.9", "schedule.discount.by=passes"]
     config = OmegaConf.to_object(recipe_module("dreamer_v3").resolve(compose("dreamer_v3", *overrides)))
     with pytest.raises(ValueError, match=r"schedule.discount.by=passes goes by gates, and env.suite=dmc has none"):
-        recipe_module("composing.checks").check(config)
+        config.check()
 
 
 def test_a_run_begins_with_the_weights_that_restoring_makes_before_it_loads_any(tmp_path: Path) -> None:

@@ -121,17 +121,17 @@ def test_training_and_evaluation_have_them_and_the_run_remembers(folder: Path) -
     ],
 )
 def test_bad_ones_are_refused_before_anything_is_built(folder: Path, own: str, message: str) -> None:
-    dreamer, checks = map(recipe_module, ("dreamer_v3", "composing.checks"))
+    dreamer = recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", *RUN, f"env.{own}")))
     with pytest.raises(ValueError, match=message):
-        checks.check(config)
+        config.check()
 
 
 def test_the_control_suite_has_neither() -> None:
-    dreamer, checks = map(recipe_module, ("dreamer_v3", "composing.checks"))
+    dreamer = recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "env=dmc", "model=debug", OWN[0])))
     with pytest.raises(ValueError, match=r"env\.reward=my_own:constant is for races"):
-        checks.check(config)
+        config.check()
 
 
 def test_what_sees_numbers_of_ones_own_is_not_exported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,13 +195,13 @@ def test_a_run_keeps_the_track_of_a_file_that_is_gone(track: Track, tmp_path: Pa
 def test_the_track_of_a_file_is_noted_when_a_run_begins(track: Track, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     write(track, file)
-    dreamer, arena = recipe_module("dreamer_v3"), recipe_module("composing.building")
+    dreamer = recipe_module("dreamer_v3")
     config = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", f"track={file}", "model=debug")))
-    assert arena.track_as_begun(config) == track
+    assert config.track_as_begun() == track
     file.write_text("gates: []", encoding="utf-8")
-    assert arena.track_as_begun(config) == track
+    assert config.track_as_begun() == track
     built_in = OmegaConf.to_object(dreamer.resolve(compose("dreamer_v3", "track=kidney", "model=debug")))
-    assert (arena.track_as_begun(built_in), built_in.track_description) == (load_track("kidney"), None)
+    assert (built_in.track_as_begun(), built_in.track_description) == (load_track("kidney"), None)
 
 
 def test_what_a_run_notes_is_not_to_be_given() -> None:

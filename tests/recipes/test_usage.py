@@ -144,7 +144,7 @@ def check(recipe: str, config: DictConfig) -> None:
     """Refuse what a recipe does before it makes or reads anything."""
     module = recipe_module(recipe)
     if recipe in TRAINING:
-        recipe_module("composing.checks").check(OmegaConf.to_object(module.resolve(config)))
+        OmegaConf.to_object(module.resolve(config)).check()
     elif recipe == "experiment":
         module.check(config)
     else:

@@ -265,7 +265,7 @@ def overrides(draw: random.Random, folder: Path) -> Iterator[Callable[[], bool]]
                 with hydra.initialize_config_dir(config_dir, version_base="1.3"):
                     config = hydra.compose("dreamer_v3", overrides=given)
                 checks.check_overrides(config, given)
-                checks.check(cast(schema.WorldModelRunConfig, OmegaConf.to_object(resolve(config))))
+                cast(schema.WorldModelRunConfig, OmegaConf.to_object(resolve(config))).check()
         except HydraException as error:
             return not entry.in_plain_words(error, "dreamer_v3", given)
         except SystemExit as refused:
