@@ -21,9 +21,9 @@ from typing import Any
 
 from measuring import make_parser, print_table, write_json
 
+from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.onnx_actor import read_contract
 
-AGENTS = Path(__file__).parents[1] / "agents"
 RECIPES = Path(__file__).parents[1] / "recipes"
 PLANT = ["jitter=0.002", "packet_loss=0.01", "position_noise=0.001", "attitude_noise=0.003"]
 COLUMNS = ("actor", "seed", "finished", "gates", "laps_s", "speed_max", "latency_p99_ms", "jitter_p99_ms", "overruns")
@@ -54,10 +54,7 @@ def preset_of(actor: str) -> str:
     """Physics that an actor was trained on; of the pilot the easy ones."""
     if actor == PILOT:
         return "easy"
-    folder = AGENTS / actor if (AGENTS / actor).is_dir() else Path(actor)
-    if folder.suffix == ".onnx":
-        folder = folder.parent
-    return str(read_contract(folder / "contract.json")["source"].get("preset", "easy"))
+    return str(read_contract(agent_path(actor))["source"].get("preset", "easy"))
 
 
 def fly(actor: str, seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:

@@ -25,9 +25,9 @@ from composing.building import describe_file, worlds_of
 from composing.entry import as_override, override_key, override_value, plain_errors, recipe
 from composing.options import command
 from composing.restoring import config_folder, find_trained, results_of
-from composing.saved import read_yaml, trained_config
+from composing.saved import trained_config
 from composing.schema import WorldModelRunConfig, is_race
-from omegaconf import MISSING, ListConfig, OmegaConf
+from omegaconf import MISSING, OmegaConf
 from torch import set_num_threads
 
 from dreamer_racing.envs.imu import load_imu
@@ -202,7 +202,8 @@ def describe(
     commit = config.commit or (history[-1]["commit"] if history else None)
     if commit is None:
         print("commit of the training: not noted, for neither the run nor commit= says it")
-    training = {"command": training_command(trained, checkpoint), "commit": commit, "seed": trained.seed}
+    trains = f"python recipes/{trained.algorithm}.py {shlex.join(history[-1]['overrides'])}" if history else None
+    training = {"command": trains, "commit": commit, "seed": trained.seed}
     if len(history) > 1:  # begun or continued with other settings, perhaps
         training["starts"] = history
     return {
@@ -225,15 +226,6 @@ def history_of(checkpoint: Path, env_steps: int) -> list[dict[str, Any]]:
         for start in RunDirectory(config_folder(checkpoint)).run.read_starts()
         if start["env_steps"] < env_steps
     ]
-
-
-def training_command(trained: WorldModelRunConfig, checkpoint: Path) -> str | None:
-    """Return the command that trains such an agent, without what is of one machine; None if the run did not keep it."""
-    path = RunDirectory(config_folder(checkpoint)).run.overrides
-    if not path.exists():
-        return None
-    overrides = without_machine(map(str, read_yaml(path, ListConfig)))
-    return f"python recipes/{trained.algorithm}.py {shlex.join(overrides)}"
 
 
 def without_machine(overrides: Iterable[str]) -> list[str]:

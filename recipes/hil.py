@@ -16,8 +16,9 @@ import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -56,6 +57,7 @@ from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
+plainly = partial(plain_errors, also=(ImportError,))  # packages of links and poses are extras
 
 
 @recipe("hil", HilConfig)
@@ -91,16 +93,6 @@ def make_flyer(config: HilConfig, track: Track | None = None) -> tuple[Flyer, di
         return steps, pilot_contract(config)
     flyer = ActorFlyer(existing_agent_path("actor", config.actor))
     return flyer, flyer.contract
-
-
-@contextmanager
-def plainly() -> Iterator[None]:
-    """Say errors that a person can mend in a paragraph, a missing package among them."""
-    with plain_errors():
-        try:
-            yield
-        except ImportError as error:
-            raise ValueError(str(error)) from error
 
 
 def fly(config: HilConfig) -> int:

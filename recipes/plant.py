@@ -59,9 +59,7 @@ def settings_for(actor: str) -> list[str]:
     """Return lines for the CLI of a firmware that an actor is to fly."""
     if actor == PILOT:
         return print_settings(pilot_contract(HilConfig(actor=PILOT)), "betaflight_sitl")
-    path = existing_agent_path("actor", actor)
-    contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
-    return print_settings(contract, "betaflight_sitl")
+    return print_settings(read_contract(existing_agent_path("actor", actor)), "betaflight_sitl")
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def check(config: SimToRealConfig) -> tuple[Track, Callable[[], Flyer]]:
         track = load_track(config.track)
         return track, pilot_on(track, config)
     path = existing_agent_path("actor", config.actor)
-    contract = read_contract((path if path.is_dir() else path.parent) / "contract.json")
+    contract = read_contract(path)
     track = load_track(config.track) if config.track else trained_track(contract)
     if note := check_contract(contract, track):
         print(f"note: {note}")

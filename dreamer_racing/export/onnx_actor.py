@@ -277,13 +277,15 @@ class OnnxActor(RecurrentActor):
 
 
 def read_contract(path: str | Path) -> dict[str, Any]:
-    """Read a contract.json.
+    """Read a contract.json, given it or its actor: the ``.onnx`` file beside it, or the folder of both.
 
     Raises:
         FileNotFoundError: There is none.
         ValueError: It is no contract of an exported actor, or of another version.
     """
     path = Path(path)
+    if path.is_dir() or path.suffix == ".onnx":
+        path = (path if path.is_dir() else path.parent) / CONTRACT
     if not path.is_file():
         raise FileNotFoundError(f"There is no {path}: it belongs beside the .onnx file, from the same export.")
     try:

@@ -27,16 +27,18 @@ from dreamer_racing.settings import check_settings
 
 
 @contextmanager
-def plain_errors(applies: Callable[[], bool] = lambda: True) -> Iterator[None]:
+def plain_errors(applies: Callable[[], bool] = lambda: True, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Turn errors that a person can mend into one paragraph on stderr and exit status 2.
 
     Args:
         applies: whether it does by now; during set-up only, since the same error types inside training are defects,
             and keep their tracebacks.
+        also: further types of errors that a person can mend here.
     """
+    mended: tuple[type[Exception], ...] = (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError, *also)
     try:
         yield
-    except (MissingMandatoryValue, ValueError, OSError, RendererUnavailableError) as error:
+    except mended as error:
         if not applies():
             raise
         missing = isinstance(error, MissingMandatoryValue)
