@@ -16,7 +16,7 @@ from typing import Any, cast
 
 from composing.building import make_evaluator, worlds_of
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
+from composing.restoring import FlightConfig, Restored, heading, restore
 
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import Track
@@ -37,7 +37,7 @@ from dreamer_racing.figures.report import EvaluationReport
 from dreamer_racing.figures.top_down import plot_top_down
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SEED, setting
 from dreamer_racing.terminal import say
-from dreamer_racing.training.directory import EVALUATION, RunDirectory, replace_text
+from dreamer_racing.training.directory import EVALUATION, RunDirectory, fresh_directory, replace_text
 
 PROTOCOLS = ("nominal", "full")
 

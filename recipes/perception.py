@@ -15,7 +15,7 @@ from typing import Any
 
 from composing.building import worlds_of
 from composing.entry import plain_disk_errors, plain_errors, recipe
-from composing.restoring import FlightConfig, Restored, fresh_directory, heading, restore
+from composing.restoring import FlightConfig, Restored, heading, restore
 from composing.schema import RunConfig
 
 from dreamer_racing.envs.simulator.scene import Camera
@@ -27,7 +27,7 @@ from dreamer_racing.evaluation.trajectory import Trajectory
 from dreamer_racing.figures.protocol import plot_sight
 from dreamer_racing.settings import COUNT, setting
 from dreamer_racing.terminal import say
-from dreamer_racing.training.directory import replace_text
+from dreamer_racing.training.directory import fresh_directory, replace_text
 
 RESULT = "perception.json"
 WITHOUT, WITH = "without decoys", "with decoys"

@@ -7,14 +7,17 @@ import logging
 import os
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from dreamer_racing import parallel
+from dreamer_racing.commands import from_here
 from dreamer_racing.training.lock import RunLock
 
 logger = logging.getLogger(__name__)
@@ -27,6 +30,8 @@ PROCESS, PROCESSES = "process-", "processes"
 """Folders of what processes beside the first have of their own, and the metadata that says how many there were."""
 EVALUATION = "evaluation.json"
 """Numbers of an evaluation, in whichever folder it is written to."""
+BEGUN = ".begun"
+"""File by which a process claims a folder for what it is about to measure."""
 
 
 @dataclass(frozen=True)
@@ -304,3 +309,26 @@ def is_complete(path: Path) -> bool:
     except (CheckpointError, OSError, TypeError, ValueError, AttributeError):  # the last for JSON that is no object
         return False
     return all((path / part["path"] / name).is_file() for part in parts for name in part["files"])
+
+
+def fresh_directory(path: str | Path, result: str) -> Path:
+    """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
+
+    So nothing is mixed with what an earlier evaluation left, or one that was killed, or another that goes on.
+
+    Args:
+        path: the folder asked for.
+        result: name of the file that is written last.
+    """
+    asked = Path(path).expanduser().absolute()
+    for number in count(1):
+        directory = asked if number == 1 else asked.with_name(f"{asked.name}_{number}")
+        if not (directory.is_dir() and any(directory.iterdir())):
+            ensure_writable(directory)
+            with suppress(FileExistsError):  # another process has just claimed it
+                (directory / BEGUN).touch(exist_ok=False)
+                break
+    if directory != asked:
+        held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
+        logger.info("%s holds %s, which is kept: writing to %s", from_here(asked), held, from_here(directory))
+    return directory

@@ -1,10 +1,8 @@
 """What recipes that fly a trained policy share: the checkpoint brought back, and what is written beside its numbers."""
 
 import time
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +12,6 @@ from omegaconf import MISSING
 from composing.building import Environment, describe_file, make_env, make_learner, worlds_device
 from composing.saved import trained_config
 from composing.schema import RunConfig, WorldModelRunConfig, is_race
-from dreamer_racing.commands import from_here
 from dreamer_racing.devices import choose_device
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import hash_track
@@ -35,11 +32,8 @@ from dreamer_racing.machine import command_line, provenance
 from dreamer_racing.modules import Interface
 from dreamer_racing.settings import COUNT, SEED, setting
 from dreamer_racing.training.checkpoint import load_components, load_state, newest_sound
-from dreamer_racing.training.directory import RunDirectory, ensure_writable
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.schedule import Schedule
-
-BEGUN = ".begun"
-"""File by which a process claims a folder for what it is about to measure."""
 
 
 @dataclass
@@ -178,29 +172,6 @@ def config_folder(checkpoint: Path) -> Path:
 def results_of(checkpoint: Path) -> Path:
     """Where results of a checkpoint or an agent go."""
     return Path("runs") / f"agent_{checkpoint.name}" if is_agent(checkpoint) else RunDirectory.of(checkpoint).path
-
-
-def fresh_directory(path: str | Path, result: str) -> Path:
-    """Return a folder to write to: the one asked for, or if it holds anything already, the first free `<name>_2`, ...
-
-    So nothing is mixed with what an earlier evaluation left, or one that was killed, or another that goes on.
-
-    Args:
-        path: the folder asked for.
-        result: name of the file that is written last.
-    """
-    asked = Path(path).expanduser().absolute()
-    for number in count(1):
-        directory = asked if number == 1 else asked.with_name(f"{asked.name}_{number}")
-        if not (directory.is_dir() and any(directory.iterdir())):
-            ensure_writable(directory)
-            with suppress(FileExistsError):  # another process has just claimed it
-                (directory / BEGUN).touch(exist_ok=False)
-                break
-    if directory != asked:
-        held = f"an earlier {result}" if (asked / result).exists() else f"files, but no {result}"
-        print(f"{from_here(asked)} holds {held}, which is kept: writing to {from_here(directory)}")
-    return directory
 
 
 def heading(title: str, provenance: dict[str, Any]) -> str:

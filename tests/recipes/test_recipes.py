@@ -140,24 +140,6 @@ def test_evaluate_reports_both_policies(run_dir: Path) -> None:
         assert (run_dir / "evaluation" / "videos" / f"{policy}.mp4").stat().st_size > 0
 
 
-def test_an_earlier_evaluation_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fresh = recipe_module("composing.restoring").fresh_directory
-    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation"
-    assert capsys.readouterr().out == ""
-    for number in (1, 2):
-        holding = tmp_path / ("evaluation" if number == 1 else f"evaluation_{number}")
-        (holding / "evaluation.json").write_text("{}")
-        assert fresh(tmp_path / "evaluation", "evaluation.json").name == f"evaluation_{number + 1}"
-        assert f"evaluation_{number + 1}" in capsys.readouterr().out
-    (tmp_path / "evaluation_3" / "plots").mkdir()  # of one that was killed
-    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
-    (tmp_path / "evaluation" / "evaluation.json").unlink()
-    (tmp_path / "evaluation" / "plots").mkdir()
-    assert fresh(tmp_path / "evaluation", "evaluation.json").name == "evaluation_5"  # another has begun in _4
-    assert "holds files, but no evaluation.json" in capsys.readouterr().out
-    assert fresh(f"{tmp_path}/evaluation/", "evaluation.json") == tmp_path / "evaluation_6"
-
-
 KILLED_BEHIND_THE_FIRST_POLICY = """
 import os, signal
 from dreamer_racing.figures.report import EvaluationReport

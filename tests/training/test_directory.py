@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import subprocess
@@ -12,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 
 from dreamer_racing.training import directory
-from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, replace_text
+from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, fresh_directory, replace_text
 from dreamer_racing.training.journal import Interval, Journal, Periods
 from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.metrics import PendingMetrics
@@ -221,3 +222,21 @@ def test_a_first_one_comes_before_the_periods_once_and_costs_none_of_them():
     assert [place for place in places if periods.due("evaluate", place)] == [31, 105, 210]
     assert [place for place in places if periods.due("log", place)] == [105, 210]
     assert not Periods({"evaluate": 30}, evaluate=0).due("evaluate", 40)
+
+
+def test_an_earlier_evaluation_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert fresh_directory(tmp_path / "evaluation", "evaluation.json").name == "evaluation"
+    assert not caplog.text
+    for number in (1, 2):
+        holding = tmp_path / ("evaluation" if number == 1 else f"evaluation_{number}")
+        (holding / "evaluation.json").write_text("{}")
+        assert fresh_directory(tmp_path / "evaluation", "evaluation.json").name == f"evaluation_{number + 1}"
+        assert f"evaluation_{number + 1}" in caplog.messages[-1]
+    (tmp_path / "evaluation_3" / "plots").mkdir()  # of one that was killed
+    assert fresh_directory(tmp_path / "evaluation", "evaluation.json").name == "evaluation_4"
+    (tmp_path / "evaluation" / "evaluation.json").unlink()
+    (tmp_path / "evaluation" / "plots").mkdir()
+    assert fresh_directory(tmp_path / "evaluation", "evaluation.json").name == "evaluation_5"  # another has begun in _4
+    assert "holds files, but no evaluation.json" in caplog.messages[-1]
+    assert fresh_directory(f"{tmp_path}/evaluation/", "evaluation.json") == tmp_path / "evaluation_6"
