@@ -308,7 +308,7 @@ def make_run_replay(
     numbers = interface.vector_dim + interface.privileged_dim
     image = interface.image_shape if interface.pixels else (0,)
     size = replay_bytes(settings.capacity, image, interface.action_dim, numbers, latents)
-    files = run_directory(config).replay if settings.storage is Storage.memmap else None
+    files = config.run_directory.replay if settings.storage is Storage.memmap else None
     device = settings.device if files is None else "cpu"
     if device == "auto":
         fits = config.device != "cpu" and size < 0.5 * available_memory(config.device)
@@ -354,7 +354,7 @@ def check_room(size: int, capacity: int, device: str, files: Path | None) -> Non
 
 def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     """Say what checkpoints with a replay of so many bytes take at their peak, and what there is for them."""
-    directory = run_directory(config)
+    directory = config.run_directory
     there = sum(file.stat().st_size for file in directory.checkpoints.rglob("*") if file.is_file())
     peak, free = (config.checkpoint.keep + 1) * replay, shutil.disk_usage(directory.path).free + there
     line = (
@@ -363,12 +363,6 @@ def disk_needed(config: ReplayRunConfig, replay: int) -> str:
     )
     advice = "lower checkpoint.keep= or replay.capacity=, or choose another run_dir=; a run goes on without saving"
     return f"{line}: MAY NOT BE ENOUGH, {advice}" if peak > free else line
-
-
-def run_directory(config: RunConfig) -> RunDirectory:
-    """Return that of a resolved configuration."""
-    assert config.run_dir is not None, "resolve_common() names it"
-    return RunDirectory(Path(config.run_dir))
 
 
 def make_run_evaluator(config: RunConfig, directory: Path, learner: Learner) -> Evaluator:

@@ -146,10 +146,9 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         @functools.wraps(function)
         def with_typed(config: DictConfig) -> None:
-            settings = typed(config)
-            if not getattr(settings, "json", False):  # what programs read is nothing else
+            if not config.get("json"):  # what programs read is nothing else
                 start_logging()
-            function(settings)
+            function(typed(config))
 
         task = function if composed else with_typed
         main = hydra.main(version_base="1.3", config_path=str(CONFIG_DIR), config_name=name)(task)

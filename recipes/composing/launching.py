@@ -14,7 +14,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from composing.building import run_directory
 from composing.checks import check_overrides, check_read
 from composing.entry import (
     as_override,
@@ -153,7 +152,7 @@ def open_session(config: RunConfig, overrides: Sequence[str]) -> Session:
         ValueError: it cannot; or the directory holds another run, or is in use by a live one.
     """
     config.check()
-    directory = run_directory(config)
+    directory = config.run_directory
     lock = directory.claim() if parallel.is_first() else LockHeldByFirst(directory.path)
     if parallel.is_first() and not config.resume:
         with suppress(FileNotFoundError):

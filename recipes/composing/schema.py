@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -23,6 +24,7 @@ from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig, 
 from dreamer_racing.modules import get_size
 from dreamer_racing.modules.encoder import smallest_map
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, check_settings, setting
+from dreamer_racing.training.directory import RunDirectory
 from dreamer_racing.training.journal import CheckpointConfig, EvaluationConfig
 from dreamer_racing.training.replay_ratio import ReplayRatio
 from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, LatentPPOScheduleConfig, ScheduleConfig
@@ -74,6 +76,12 @@ class RunConfig:
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+    @property
+    def run_directory(self) -> RunDirectory:
+        """Where everything of the run lands, once that is chosen."""
+        assert self.run_dir is not None, "resolve_common() names it"
+        return RunDirectory(Path(self.run_dir))
 
     def track_as_begun(self) -> Track:
         """Return the track: of a file as it was when the run was begun, whatever became of that."""
