@@ -256,9 +256,8 @@ def read_evaluation(
         raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
-    same_name = made["track"] == trained.track  # which has to do for an older evaluation
-    if not (made["track_sha256"] == track_sha256 if "track_sha256" in made else same_name):
-        there = "another track, or with other decoys" if same_name else made["track"]
+    if made["track_sha256"] != track_sha256:
+        there = "another track, or with other decoys" if made["track"] == trained.track else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")
     statistics = {mode: {name: value for name, value in written[mode].items() if name not in BY_ITEM} for mode in MODES}
@@ -274,8 +273,7 @@ def newest_evaluation(folder: Path, weights_sha256: str, track_sha256: str) -> P
     there = first.parent.parent.glob(f"{first.parent.name}*/{first.name}")
     texts = {path: path.read_text(encoding="utf-8") for path in there}
     of_these = [path for path, text in texts.items() if f'"weights_sha256": "{weights_sha256}"' in text]
-    named = f'"track_sha256": "{track_sha256}"'  # an older evaluation says nothing of it
-    fitting = [path for path in of_these if named in texts[path] or '"track_sha256"' not in texts[path]]
+    fitting = [path for path in of_these if f'"track_sha256": "{track_sha256}"' in texts[path]]
     return max(fitting or of_these, key=lambda path: path.stat().st_mtime, default=first)
 
 

@@ -82,18 +82,18 @@ class EnvConfig:
         Raises:
             ValueError: the message names the setting.
         """
-        race, on_cuda = self.suite == "race", self.device.partition(":")[0] == "cuda"
         if self.suite not in SUITES:
             raise ValueError(f"env.suite={self.suite}: there are {', '.join(SUITES)}.")
+        race, on_cuda = self.suite == "race", self.device.partition(":")[0] == "cuda"
         if not on_cuda and self.device != "cpu":
             raise ValueError(f"env.device={self.device}: worlds live on cpu, cuda or cuda:1 ..., or auto.")
         if on_cuda and not race:
             raise ValueError(f"env.device={self.device} is for races: env.suite={self.suite} runs on cpu.")
         if self.looks != "nominal" and not (race and self.from_pixels):
             raise ValueError(f"env.looks={self.looks} is for races seen in images: leave it at nominal.")
-        if self.camera_rate is not None and race and not self.from_pixels:
-            raise ValueError(f"env.camera_rate={self.camera_rate:g} is of images: leave it out of a run from numbers.")
-        for name, usual in {} if race else vars(EnvConfig()).items():
+        if race:
+            return
+        for name, usual in vars(EnvConfig()).items():
             if name not in EVERYWHERE and (value := getattr(self, name)) != usual:
                 raise ValueError(f"env.{name}={value} is for races, and env.suite={self.suite}: leave it at {usual}.")
 
@@ -103,6 +103,8 @@ class EnvConfig:
         Raises:
             ValueError: the message names the setting.
         """
+        if self.camera_rate is not None and not self.from_pixels:
+            raise ValueError(f"env.camera_rate={self.camera_rate:g} is of images: leave it out of a run from numbers.")
         try:
             at_control_rate(load_preset(self.preset), self.control_rate)
             frame_interval(Camera(rate=self.camera_rate), self.control_rate)

@@ -107,14 +107,15 @@ class RunConfig:
 
     def check_worlds(self) -> None:
         """Refuse worlds that cannot be, races that leave each other no room to start, and noise of starts elsewhere."""
-        env, noise, track = self.env, self.evaluation.start_noise, self.track_as_begun() if is_race(self) else None
+        env, noise = self.env, self.evaluation.start_noise
         env.check()
-        if track is None:
+        if not is_race(self):
             if noise:
                 raise ValueError(
                     f"evaluation.start_noise={noise} is for races, and env.suite={env.suite}: leave it at 0."
                 )
             return
+        track = self.track_as_begun()
         env.check_race(track)
         try:
             StartSampler(track, start_noise=noise)
