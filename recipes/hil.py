@@ -12,7 +12,6 @@ r"""Fly a vehicle, real or simulated in a process of its own: poses in, images d
 Read docs/hil_safety.md before anything with propellers. Only actor=pilot and report= need torch.
 """
 
-import itertools
 import json
 import math
 import sys
@@ -53,6 +52,7 @@ from dreamer_racing.hil.links.link import TransportLink
 from dreamer_racing.hil.loop import FlightLoop
 from dreamer_racing.hil.pose import PoseSource
 from dreamer_racing.hil.pose_sources import make_poses
+from dreamer_racing.hil.progress import flying_laps
 from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
 
@@ -166,7 +166,7 @@ def conclude(config: HilConfig, flight: Prepared, ended: str) -> dict[str, Any]:
     summary = {
         "ended": ended,
         "passes": [list(passed) for passed in chain.progress.passes],
-        "laps": lap_times(chain),
+        "laps": flying_laps(chain.progress.passes),
         "loop": flight.loop.statistics.summary(),
         "poses": {"rejected": flight.poses.rejected, "out_of_order": chain.clock.out_of_order},
         "commands_dropped": flight.link.dropped,
@@ -186,12 +186,6 @@ def battery_summary(config: HilConfig, chain: FlightChain, link: TransportLink) 
         return {**summary, "readings": 0}
     age = battery.age if math.isfinite(battery.age) else None
     return {**summary, "readings": battery.readings, "implausible": battery.implausible, "last_reading_age_s": age}
-
-
-def lap_times(chain: FlightChain) -> list[float]:
-    """Return the times of whole laps from the first gate on, s."""
-    firsts = [passed.time for passed in chain.progress.passes if passed.gate == 0]
-    return [later - earlier for earlier, later in itertools.pairwise(firsts)]
 
 
 def as_json(config: HilConfig) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from dreamer_racing.envs.drone.parameters import GRAVITY
 from dreamer_racing.envs.tracks import Track, TrackError
 from dreamer_racing.hil.chain import Inputs, read_inputs
 from dreamer_racing.hil.loop import percentiles
-from dreamer_racing.hil.progress import GatePass, GateProgress
+from dreamer_racing.hil.progress import GatePass, GateProgress, flying_laps
 from dreamer_racing.hil.recording import Flight
 from dreamer_racing.hil.safety_limits import SafetyLimits
 from dreamer_racing.hil.stamping import PoseClock, Stamping
@@ -190,10 +190,9 @@ def lap_times(flight: FlownFlight, passes: list[GatePass]) -> dict[str, list[flo
     ``flying``: from the first gate to the first gate. ``race``: from the last gate to the last gate, the first one from
     arming; evaluations count so.
     """
-    firsts = [passed.time for passed in passes if passed.gate == 0]
     lasts = [passed.time for passed in passes if passed.gate == flight.track.num_gates - 1]
     began = [float(flight.time[flight.flown][0])] if lasts else []
-    return {"flying": np.diff(firsts).tolist(), "race": np.diff(began + lasts).tolist()}
+    return {"flying": flying_laps(passes), "race": np.diff(began + lasts).tolist()}
 
 
 def responses(flight: FlownFlight) -> dict[str, Response]:

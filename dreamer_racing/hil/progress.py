@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -81,3 +82,9 @@ class GateProgress:
         self.passes.append(passed)
         self.target = (self.target + 1) % len(self._centres)
         return passed
+
+
+def flying_laps(passes: Sequence[GatePass]) -> list[float]:
+    """Return the times of whole laps, from the first gate to the first gate, s."""
+    firsts = [passed.time for passed in passes if passed.gate == 0]
+    return np.diff(firsts).tolist()
