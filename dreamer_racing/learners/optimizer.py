@@ -1,11 +1,17 @@
-"""The optimiser of a world model and what learns beside it: what is trained, at which rate, how large gradients are."""
+"""What a gradient step needs beside losses: optimiser, gradient norms, a guard against what is not finite, CUDA graphs.
+
+An update of a small model is some thousands of kernels, which a GPU finishes sooner than a CPU can launch them; a graph
+launches them all at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
@@ -37,3 +43,140 @@ def restore(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
     own = [{name: value for name, value in group.items() if name in names} for group in optimizer.param_groups]
     groups = [{**group, **settings} for group, settings in zip(state["param_groups"], own, strict=True)]
     optimizer.load_state_dict({**state, "param_groups": groups})
+
+
+class NonFiniteLossError(RuntimeError):
+    """The loss, its gradient or a reward became infinite or not a number.
+
+    Attributes:
+        batch: What it was computed of: an update's batch ``[B, T]``, or what the actor's loss keeps for improvements.
+    """
+
+    def __init__(self, batch: TensorDictBase, of: str = "") -> None:
+        super().__init__(
+            f"The loss{of}, its gradient or a reward is not finite: the learning rate may be too high, or a reward or "
+            "observation is bad."
+        )
+        self.batch = batch
+
+
+class Flag:
+    """A truth value on its way from the device, so that reading it later waits for nothing that came after it.
+
+    Args:
+        value: bool, a scalar.
+    """
+
+    def __init__(self, value: Tensor) -> None:
+        self._value = value.to("cpu", non_blocking=True)
+        self._arrived: torch.cuda.Event | None = None
+        if value.is_cuda:
+            self._arrived = torch.cuda.Event()
+            self._arrived.record(torch.cuda.current_stream(value.device))
+
+    def __bool__(self) -> bool:
+        """Wait until it is here."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return bool(self._value)
+
+
+class FiniteGuard:
+    """Raises once an update would spoil the networks.
+
+    Args:
+        lag: Updates after which one is looked at: 0 at once, which waits for the device.
+    """
+
+    def __init__(self, lag: int) -> None:
+        self._lag = lag
+        self._pending: deque[tuple[Flag, TensorDictBase, str]] = deque()
+
+    def check(self, metrics: dict[str, Tensor], batch: TensorDictBase, of: str = "") -> None:
+        """Take note of an update's metrics; raise ``NonFiniteLossError`` if those ``lag`` updates ago were bad.
+
+        The loss alone does not tell: two-hot targets are clamped, so that an infinite reward makes it merely large.
+
+        Args:
+            metrics: Scalars by name.
+            batch: What they are of.
+            of: Whose loss it is, as the error says it; the update's if empty.
+        """
+        watched = [
+            value
+            for name, value in metrics.items()
+            if name in ("loss", "reward_error") or name.startswith("gradient_norm/")
+        ]
+        self._pending.append((Flag(torch.stack(watched).isfinite().all()), batch, of))
+        self.settle(self._lag)
+
+    def settle(self, lag: int = 0) -> None:
+        """Look at all updates but the latest ``lag``; raise ``NonFiniteLossError`` at the first that was bad."""
+        while len(self._pending) > lag:
+            finite, batch, of = self._pending.popleft()
+            if not finite:
+                raise NonFiniteLossError(batch, of)
+
+
+Step = Callable[[TensorDictBase], dict[str, Tensor]]
+"""Computes losses of a batch ``[B, T]`` and their gradients; returns scalars."""
+
+
+class GraphedStep:
+    """Replays a step as one CUDA graph, captured at the first call.
+
+    The step must not wait for the device, and must find ``.grad`` unset: gradients live in the graph's own memory and
+    are overwritten at every replay, so they must not be set to None between calls.
+
+    Args:
+        step: What to capture.
+        module: Whose gradients and buffers the step writes; the buffers are put back after the warm-up.
+        warmups: Calls before the capture, in which libraries allocate and choose kernels.
+
+    Raises:
+        ValueError: At a call with a batch of other shapes than the first.
+    """
+
+    def __init__(self, step: Step, module: nn.Module, warmups: int = 3) -> None:
+        self._step = step
+        self._module = module
+        self._warmups = warmups
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Run the step on a batch ``[B, T]`` on the CUDA device; return copies of its scalars."""
+        with torch.cuda.device(batch.device):  # streams and graphs belong to the current device
+            return self._replay(batch)
+
+    def _replay(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        graph = self._graph or self._capture(batch)
+        if batch.batch_size != self._batch.batch_size:
+            raise ValueError(
+                f"The CUDA graph was captured for a batch of {list(self._batch.batch_size)}, got "
+                f"{list(batch.batch_size)}: keep the shape, or set cuda_graph=False."
+            )
+        self._batch.update_(batch)
+        graph.replay()
+        return dict(zip(self._names, torch.stack(self._scalars).unbind(0), strict=True))
+
+    def _capture(self, batch: TensorDictBase) -> torch.cuda.CUDAGraph:
+        self._batch = batch.clone()
+        buffers = {name: buffer.clone() for name, buffer in self._module.named_buffers()}
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        # The warm-up leaves neither random numbers nor buffers changed: a resumed run makes it again.
+        with torch.random.fork_rng(devices=[batch.device]), torch.cuda.stream(side):
+            for _ in range(self._warmups):
+                self._module.zero_grad(set_to_none=True)
+                self._step(self._batch)
+        torch.cuda.current_stream().wait_stream(side)
+        for name, buffer in self._module.named_buffers():
+            buffer.copy_(buffers[name])
+        self._module.zero_grad(set_to_none=True)
+        graph = torch.cuda.CUDAGraph()
+        # Threads that prefetch samples may use the device meanwhile.
+        with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
+            metrics = self._step(self._batch)
+        self._names, self._scalars = list(metrics), [value.detach() for value in metrics.values()]
+        self._graph = graph
+        return graph

@@ -10,7 +10,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from dreamer_racing.learners.ppo_update import KL_TOLERANCE
+from dreamer_racing.learners.latent_ppo import KL_TOLERANCE
 from dreamer_racing.settings import COUNT, POSITIVE, Range, allowed_values, setting
 from dreamer_racing.training.gate_pass_rate import GatePassRate
 

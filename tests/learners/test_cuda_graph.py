@@ -20,7 +20,7 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.evaluation.course import Course
 from dreamer_racing.evaluation.held_out import SEEN, held_out_metrics
-from dreamer_racing.learners import ppo_update
+from dreamer_racing.learners import latent_ppo
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.launches import Launches, launches
 from dreamer_racing.learners.update import WorldModelLearner
@@ -206,7 +206,7 @@ def test_kernels_waits_and_devices_are_told_apart() -> None:
 def test_no_update_waits_for_the_device(
     monkeypatch: pytest.MonkeyPatch, world_model: str, actor: str, mixed_precision: bool
 ) -> None:
-    monkeypatch.setattr(ppo_update, "masks_steps", lambda device: True)
+    monkeypatch.setattr(latent_ppo, "masks_steps", lambda device: True)
     kinds = {"world_model": world_model, "drift_scale": 1.0, "mixed_precision": mixed_precision}
     learner = make_learner(actor, **kinds)
     batch = with_context(records(), learner)
