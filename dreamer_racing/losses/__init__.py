@@ -10,8 +10,6 @@ from dreamer_racing.losses.config import (
     LossConfig,
     PPOUpdateConfig,
 )
-from dreamer_racing.losses.critic import critic_loss, replay_critic_loss
-from dreamer_racing.losses.imagination import Imagination, Starts, choose_starts, imagine
 from dreamer_racing.losses.policy import (
     OBJECTIVES,
     Objective,
@@ -25,9 +23,30 @@ from dreamer_racing.losses.policy import (
     reinforce,
     through_dynamics,
 )
-from dreamer_racing.losses.returns import lambda_return, replay_return, rollout_return
-from dreamer_racing.losses.targets import TARGETS, Barlow, Image, State, Target, Vector, find_targets
-from dreamer_racing.losses.world_model import Latents, WorldModelLoss, kl_losses, open_loop_loss
+from dreamer_racing.losses.returns import (
+    Imagination,
+    Starts,
+    choose_starts,
+    critic_loss,
+    imagine,
+    lambda_return,
+    replay_critic_loss,
+    replay_return,
+    rollout_return,
+)
+from dreamer_racing.losses.world_model import (
+    TARGETS,
+    Barlow,
+    Image,
+    Latents,
+    State,
+    Target,
+    Vector,
+    WorldModelLoss,
+    find_targets,
+    kl_losses,
+    open_loop_loss,
+)
 
 __all__ = [
     "HORIZON",

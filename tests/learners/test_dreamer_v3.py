@@ -10,7 +10,7 @@ from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.learner import seeded
 from dreamer_racing.learners.optimizer import NonFiniteLossError, gradient_norms
 from dreamer_racing.losses import TARGETS, DreamerV3Losses, Target
-from dreamer_racing.losses.targets import Image
+from dreamer_racing.losses.world_model import Image
 from dreamer_racing.modules import SIZES, Agent, Interface
 from dreamer_racing.modules.interface import PRIVILEGED
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of

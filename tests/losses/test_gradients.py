@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import TARGETS
+from dreamer_racing.losses.policy import frozen
 from dreamer_racing.modules import Interface
-from dreamer_racing.modules.frozen import frozen
 from dreamer_racing.modules.world_model import RSSMS
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.losses import TARGETS, Barlow, LossConfig, Target, WorldModelLoss, find_targets
-from dreamer_racing.losses.targets import Image, State, Vector, redundancy_reduction
+from dreamer_racing.losses.world_model import Image, State, Vector, redundancy_reduction
 from dreamer_racing.modules import SIZES, Interface, join_features, symlog
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.layers import autocast

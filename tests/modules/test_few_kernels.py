@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.launches import launches
-from dreamer_racing.losses.imagination import Imagination, imagine
+from dreamer_racing.losses.returns import Imagination, imagine
 from dreamer_racing.modules import ModelSize, cast_weights, get_size
 from dreamer_racing.modules.cast_weights import cast_once
 from dreamer_racing.modules.few_kernels import GatedUpdate, gate_shift
