@@ -37,7 +37,7 @@ from dreamer_racing.evaluation.held_out import correlation
 from dreamer_racing.experience.replay import StreamReplay
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import OBJECTIVES, choose_starts, gradient_of_actions, imagine, lambda_return
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.rssm import join_features
 
 PARTS = ("returns", "gradient", "drift")
 OF_IMAGINED_STEPS = ("reinforce", "dynamics")

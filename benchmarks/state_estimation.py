@@ -37,10 +37,10 @@ from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.losses import DreamerV3Losses, Latents, LossConfig, WorldModelLoss
 from dreamer_racing.modules import ModelSize, join_features, symlog
-from dreamer_racing.modules.decoder import VectorDecoder
+from dreamer_racing.modules.autoencoder import VectorDecoder
 from dreamer_racing.modules.interface import PRIVILEGED, Interface
 from dreamer_racing.modules.layers import autocast
-from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.modules.rssm import CONTEXT
 
 HELD_OUT, LENGTH, RECENT = 128, 32, 4_000  # windows measured, their records, and from how many newest of each world
 WORLDS, MEASURED, STEPS = 64, 12, 704  # flown: worlds, those measured, steps

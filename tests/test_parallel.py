@@ -22,8 +22,8 @@ from dreamer_racing.learners.optimizer import NonFiniteLossError
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, PPOUpdateConfig
 from dreamer_racing.modules import Agent, Interface, get_size
-from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.heads import ActionDistribution
+from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
 from dreamer_racing.training.signals import GracefulExit
 from tests.forked import Forked

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dreamer_racing.losses import State
-from dreamer_racing.modules.decoder import VectorDecoder
+from dreamer_racing.modules.autoencoder import VectorDecoder
 
 if TYPE_CHECKING:
     from dreamer_racing.envs.worlds import RaceWorlds

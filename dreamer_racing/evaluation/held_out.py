@@ -15,7 +15,7 @@ from torch import Tensor
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import imagine
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.rssm import join_features
 
 SEEN = 16
 """Records that the model sees before it has to predict."""

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
+from dreamer_racing.modules.rssm import CONTEXT, LatentFormat
 
 RACE_REWARD_KEYS = ("reward", "reward_base", "body_rate_norm")
 """The reward of a race and the terms of which `RelabelReward` recomputes it."""

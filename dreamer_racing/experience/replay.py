@@ -36,7 +36,7 @@ from dreamer_racing.experience.streams import (
     check_layout,
     send,
 )
-from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
+from dreamer_racing.modules.rssm import CONTEXT, LatentFormat
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, SHARE, setting
 
 _FIELD = "{}.zst"

@@ -15,7 +15,7 @@ from tensordict.utils import NestedKey
 
 from dreamer_racing.modules.heads import symlog
 from dreamer_racing.modules.interface import PRIVILEGED
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.rssm import join_features
 
 READ: tuple[NestedKey, ...] = (
     "action", "previous_action", "loc", "scale", ("next", "belief"), ("next", "state"), ("next", "reward"),

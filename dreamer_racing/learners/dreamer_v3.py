@@ -31,7 +31,7 @@ from dreamer_racing.losses import (
     replay_critic_loss,
 )
 from dreamer_racing.modules import Agent
-from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.heads import ActionDistribution
 
 
 class DreamerV3(WorldModelLearner):

@@ -41,10 +41,9 @@ from dreamer_racing.losses import (
 )
 from dreamer_racing.losses.config import PPOUpdateConfig
 from dreamer_racing.modules import Agent
-from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.modules.heads import TwoHotHead, symlog
+from dreamer_racing.modules.heads import ActionDistribution, TwoHotHead, symlog
 from dreamer_racing.modules.interface import PRIVILEGED
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.rssm import join_features
 from dreamer_racing.settings import suggestion
 
 CRITICS = ("latent", "state")

@@ -23,11 +23,9 @@ from dreamer_racing.learners.optimizer import FiniteGuard, GraphedStep, gradient
 from dreamer_racing.learners.saved import Unmatched, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift
 from dreamer_racing.modules import Agent, DreamerPolicy, Interface, ModelSize, get_size
-from dreamer_racing.modules.cast_weights import cast_once
-from dreamer_racing.modules.few_kernels import save_kernels
+from dreamer_racing.modules.few_kernels import cast_once, save_kernels
 from dreamer_racing.modules.layers import autocast
-from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.rssm import CONTEXT, LatentFormat, join_features
 from dreamer_racing.settings import check_settings
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dreamer_racing.modules.actor import MAX_STD, MIN_STD
+from dreamer_racing.modules.heads import MAX_STD, MIN_STD
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHARE, SHARE, setting
 
 HORIZON = 16

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
-from dreamer_racing.modules.actor import ActionDistribution
+from dreamer_racing.modules.heads import ActionDistribution
 from dreamer_racing.settings import import_own, suggestion
 
 

@@ -12,11 +12,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dreamer_racing.modules.actor import Actor
-from dreamer_racing.modules.critic import Critic
-from dreamer_racing.modules.deferred import autocast_type
-from dreamer_racing.modules.rssm import RSSM
-from dreamer_racing.modules.world_model import join_features
+from dreamer_racing.modules.heads import Actor, Critic
+from dreamer_racing.modules.layers import autocast_type
+from dreamer_racing.modules.rssm import RSSM, join_features
 
 
 class Imagination(NamedTuple):

@@ -3,11 +3,14 @@
 On a CUDA device a kernel takes some microseconds to launch, however little it does. What is here is chosen by the
 learner (`LearnerConfig.few_kernels`); on a CPU, where it gains nothing, results stay bit for bit what they were.
 
-Shape legend: N any one-dimensional batch, D belief, G blocks, W = D / G.
+Autocast casts a weight each time that a layer uses it: imagination alone makes a kernel for every weight in each of its
+steps. Here all weights are cast by one kernel, and their gradients back by another.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -15,8 +18,10 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-UPDATE_SHIFT = 1.0
-"""By which the update gate is lower, so that a fresh cell remembers rather than overwrites."""
+from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm
+
+LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, BlockLinear, LayerNorm, RMSNorm)
+"""Those whose weights, biases and gains are cast; what else is learned stays in float32."""
 
 
 def save_kernels(module: nn.Module) -> None:
@@ -26,40 +31,46 @@ def save_kernels(module: nn.Module) -> None:
             part.few_kernels = True  # type: ignore[assignment]  # no tensor, nor a module
 
 
-def gate_shift() -> Tensor:
-    """Return what is subtracted from reset, candidate and update, ``(3, 1)``."""
-    return torch.tensor([[0.0], [0.0], [UPDATE_SHIFT]])
+@contextmanager
+def cast_once(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
+    """Let the layers of a module compute with copies of their parameters, through which gradients reach these.
 
+    Where a parameter is used several times, its gradients are added up in the type of the copies.
 
-class GatedUpdate(Function):
-    """The GRU's step from its gates on: 5 kernels and 9 on the way back, where autograd's own take 7 and 14.
-
-    ``apply(gates, shift, belief)`` takes gates ``(N, G, 3, W)`` in any type, in each block reset, candidate and update;
-    ``gate_shift()`` in float32; and the belief, float32 ``(N, D)``. It returns the next belief, float32 ``(N, D)``.
+    Args:
+        module: Under autocast, which then has nothing left to cast but activations.
+        dtype: Of the copies.
     """
+    layers = {layer: None for layer in module.modules() if isinstance(layer, LAYERS)}
+    held = [(layer, name, p) for layer in layers for name, p in layer._parameters.items() if p is not None]
+    copies = _Cast.apply(dtype, *(parameter for _, _, parameter in held))
+    # Not by assignment, which takes nothing but parameters in the place of a parameter.
+    for (layer, name, _), copy in zip(held, copies, strict=True):
+        layer._parameters[name] = copy
+    try:
+        yield
+    finally:
+        for layer, name, parameter in held:
+            layer._parameters[name] = parameter
+
+
+class _Cast(Function):
+    """Casts many tensors by one kernel."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, gates: Tensor, shift: Tensor, belief: Tensor) -> Tensor:
-        """Return the next belief."""
-        shifted = gates - shift  # in float32
-        squashed = torch.sigmoid(shifted)
-        candidate = torch.tanh(squashed[:, :, 0] * shifted[:, :, 1])  # (N, G, W)
-        before = belief.view_as(candidate)
-        ctx.save_for_backward(shifted, squashed, candidate, before)
-        ctx.gate_type = gates.dtype  # type: ignore[attr-defined]  # torch lets a context hold anything
-        return torch.lerp(before, candidate, squashed[:, :, 2]).flatten(1)
+    def forward(ctx: FunctionCtx, dtype: torch.dtype, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        return tuple(_cast(tensors, dtype))
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor]:
-        """Return the gradients of gates and belief."""
-        shifted, squashed, candidate, before = ctx.saved_tensors
-        gradient = gradient.view_as(candidate)
-        of_candidate = gradient * squashed[:, :, 2]
-        of_belief = (gradient - of_candidate).flatten(1)
-        of_product = torch.ops.aten.tanh_backward(of_candidate, candidate)
-        of_squashed = torch.empty_like(squashed)  # the candidate's place stays empty: it is not squashed
-        torch.mul(of_product, shifted[:, :, 1], out=of_squashed[:, :, 0])
-        torch.mul(gradient, candidate - before, out=of_squashed[:, :, 2])
-        of_gates = torch.ops.aten.sigmoid_backward(of_squashed, squashed)
-        torch.mul(of_product, squashed[:, :, 0], out=of_gates[:, :, 1])
-        return of_gates.to(ctx.gate_type), None, of_belief
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        there = [gradient for gradient in gradients if gradient is not None]
+        cast = iter(_cast(there, torch.float32))
+        return None, *(None if gradient is None else next(cast) for gradient in gradients)
+
+
+def _cast(tensors: list[Tensor] | tuple[Tensor, ...], dtype: torch.dtype) -> list[Tensor]:
+    copies = [torch.empty_like(tensor, dtype=dtype) for tensor in tensors]
+    if copies:
+        torch._foreach_copy_(copies, list(tensors))
+    return copies

@@ -1,22 +1,67 @@
 """Recurrent cells of an RSSM: the next belief from the belief, state and action before it.
 
-Shape legend: N any one-dimensional batch, A action, D belief, S state, U hidden.
+Shape legend: N any one-dimensional batch, A action, D belief, S state, U hidden, G blocks, W = D / G.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd import Function
+from torch.autograd.function import FunctionCtx
 
-from dreamer_racing.modules.few_kernels import UPDATE_SHIFT, GatedUpdate, gate_shift
 from dreamer_racing.modules.layers import NORMS, BlockLinear, NormedLinear, SplitNormedLinear, linear
+
+UPDATE_SHIFT = 1.0
+"""By which the update gate is lower, so that a fresh cell remembers rather than overwrites."""
 
 
 def gated_update(reset: Tensor, candidate: Tensor, update: Tensor, belief: Tensor) -> Tensor:
     """Return the next belief from the gates before activation and the belief, each float32 ``(N, D)``."""
     candidate = torch.tanh(torch.sigmoid(reset) * candidate)
     return torch.lerp(belief, candidate, torch.sigmoid(update - UPDATE_SHIFT))
+
+
+def gate_shift() -> Tensor:
+    """Return what is subtracted from reset, candidate and update, ``(3, 1)``."""
+    return torch.tensor([[0.0], [0.0], [UPDATE_SHIFT]])
+
+
+class GatedUpdate(Function):
+    """The GRU's step from its gates on: 5 kernels and 9 on the way back, where autograd's own take 7 and 14.
+
+    ``apply(gates, shift, belief)`` takes gates ``(N, G, 3, W)`` in any type, in each block reset, candidate and update;
+    ``gate_shift()`` in float32; and the belief, float32 ``(N, D)``. It returns the next belief, float32 ``(N, D)``.
+    """
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, gates: Tensor, shift: Tensor, belief: Tensor) -> Tensor:
+        """Return the next belief."""
+        shifted = gates - shift  # in float32
+        squashed = torch.sigmoid(shifted)
+        candidate = torch.tanh(squashed[:, :, 0] * shifted[:, :, 1])  # (N, G, W)
+        before = belief.view_as(candidate)
+        ctx.save_for_backward(shifted, squashed, candidate, before)
+        ctx.gate_type = gates.dtype  # type: ignore[attr-defined]  # torch lets a context hold anything
+        return torch.lerp(before, candidate, squashed[:, :, 2]).flatten(1)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor]:
+        """Return the gradients of gates and belief."""
+        shifted, squashed, candidate, before = ctx.saved_tensors
+        gradient = gradient.view_as(candidate)
+        of_candidate = gradient * squashed[:, :, 2]
+        of_belief = (gradient - of_candidate).flatten(1)
+        of_product = torch.ops.aten.tanh_backward(of_candidate, candidate)
+        of_squashed = torch.empty_like(squashed)  # the candidate's place stays empty: it is not squashed
+        torch.mul(of_product, shifted[:, :, 1], out=of_squashed[:, :, 0])
+        torch.mul(gradient, candidate - before, out=of_squashed[:, :, 2])
+        of_gates = torch.ops.aten.sigmoid_backward(of_squashed, squashed)
+        torch.mul(of_product, squashed[:, :, 0], out=of_gates[:, :, 1])
+        return of_gates.to(ctx.gate_type), None, of_belief
 
 
 class SplitInputCell(nn.Module):

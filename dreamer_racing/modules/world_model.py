@@ -10,8 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from dreamer_racing.modules.decoder import ImageDecoder, VectorDecoder
-from dreamer_racing.modules.encoder import ObservationEncoder
+from dreamer_racing.modules.autoencoder import ImageDecoder, ObservationEncoder, VectorDecoder
 from dreamer_racing.modules.heads import ContinueHead, TwoHotHead
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.parallel_rssm import ParallelRSSM
@@ -20,11 +19,6 @@ from dreamer_racing.modules.sizes import ModelSize, get_size
 
 RSSMS: dict[str, type[RSSM]] = {recurrence: kind for kind in (RSSM, ParallelRSSM) for recurrence in kind.cells}
 """Dynamics by the recurrence that a ``ModelSize`` gives."""
-
-
-def join_features(belief: Tensor, state: Tensor) -> Tensor:
-    """Concatenate belief ``(..., D)`` and state ``(..., S)`` into what every head reads, ``(..., F)``."""
-    return torch.cat((belief, state), -1)
 
 
 class WorldModel(nn.Module):

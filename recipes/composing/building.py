@@ -54,7 +54,7 @@ from dreamer_racing.machine import (
 )
 from dreamer_racing.modules import Agent, Interface, ModelSize, get_size
 from dreamer_racing.modules.interface import PRIVILEGED
-from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker

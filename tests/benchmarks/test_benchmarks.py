@@ -11,8 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing import machine
-from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.modules.heads import symexp
+from dreamer_racing.modules.heads import ActionDistribution, symexp
 from tests.running_recipes import module_of
 
 

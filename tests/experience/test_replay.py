@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from dreamer_racing.experience.records import records_from_rollout
 from dreamer_racing.experience.replay import make_replay, replay_bytes
 from dreamer_racing.learners.launches import launches
-from dreamer_racing.modules.stored_latents import LatentFormat
+from dreamer_racing.modules.rssm import LatentFormat
 
 REWARDS = ("reward", "reward_base", "body_rate_norm")
 KEYS = ("pixels", "previous_action", *REWARDS, "is_init", "terminated", "truncated")

@@ -18,8 +18,7 @@ from dreamer_racing.learners.launches import launches
 from dreamer_racing.learners.optimizer import FiniteGuard, NonFiniteLossError
 from dreamer_racing.losses import PPOUpdateConfig, rollout_return
 from dreamer_racing.modules import Interface, join_features
-from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.modules.heads import symlog
+from dreamer_racing.modules.heads import ActionDistribution, symlog
 from tests.dreamers import latent_ppo_of
 from tests.learners.test_dreamer_v3 import make_batch
 

@@ -28,11 +28,11 @@ from dreamer_racing.losses import (
     reinforce,
 )
 from dreamer_racing.modules import SIZES, Actor
-from dreamer_racing.modules.actor import ActionDistribution
-from dreamer_racing.modules.stored_latents import CONTEXT
+from dreamer_racing.modules.heads import ActionDistribution
+from dreamer_racing.modules.rssm import CONTEXT
 from tests.dreamers import learner_of
 from tests.learners.test_dreamer_v3 import make_batch
-from tests.modules.test_policy import NoiseEnv
+from tests.modules.test_agent import NoiseEnv
 
 H, N, A, F = 3, 4, 2, 5
 

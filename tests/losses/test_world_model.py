@@ -160,7 +160,7 @@ def test_every_parameter_of_the_world_model_gets_a_gradient(image_size):
 
 
 def test_a_window_begins_with_the_first_records_context():
-    from dreamer_racing.modules.stored_latents import CONTEXT
+    from dreamer_racing.modules.rssm import CONTEXT
 
     learner = learner_of(seed=0)
     loss, batch = learner.world_model_loss, make_batch()
@@ -185,7 +185,7 @@ def test_a_window_begins_with_the_first_records_context():
 def test_a_refreshed_context_is_what_the_next_window_begins_with():
     """From the learner's update through the replay into the next sample."""
     from dreamer_racing.experience.replay import make_replay
-    from dreamer_racing.modules.stored_latents import CONTEXT
+    from dreamer_racing.modules.rssm import CONTEXT
     from tests.experience.test_replay import CountingEnv, collect
 
     config = {"horizon": 2, "imagination_starts": 4, "learning_rate": 1e-3, "warmup_updates": 0}

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.launches import launches
 from dreamer_racing.losses.returns import Imagination, imagine
-from dreamer_racing.modules import ModelSize, cast_weights, get_size
-from dreamer_racing.modules.cast_weights import cast_once
-from dreamer_racing.modules.few_kernels import GatedUpdate, gate_shift
+from dreamer_racing.modules import ModelSize, few_kernels, get_size
+from dreamer_racing.modules.few_kernels import cast_once
 from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, linear, unrolled
-from dreamer_racing.modules.recurrent_cells import gated_update
+from dreamer_racing.modules.recurrent_cells import GatedUpdate, gate_shift, gated_update
 from dreamer_racing.modules.rssm import sample_one_hot
 from tests.dreamers import imagine_from, latent_ppo_of, learner_of
 from tests.learners.test_dreamer_v3 import make_batch
@@ -78,7 +77,7 @@ def test_gradients_are_the_same_in_bfloat16_but_for_its_rounding(
     of it is rounding, in a network so small. Gains of layer norms stay in float32, because a CPU, unlike CUDA, would
     keep the statistics in the type of the gains.
     """
-    monkeypatch.setattr(cast_weights, "LAYERS", tuple(kind for kind in cast_weights.LAYERS if kind is not LayerNorm))
+    monkeypatch.setattr(few_kernels, "LAYERS", tuple(kind for kind in few_kernels.LAYERS if kind is not LayerNorm))
     exact = gradients(make_pair(SIZES[size], world_model=world_model)[0])
     plain, few = (gradients(of) for of in make_pair(SIZES[size], world_model=world_model, mixed_precision=True))
     assert all(value.dtype == torch.float32 for value in few.values())

@@ -10,10 +10,19 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import SymExpTwoHot
 from torchrl.objectives.dreamer_v3 import two_hot_cross_entropy
 
-from dreamer_racing.modules.actor import FIRST_STD, ActionDistribution, Actor
 from dreamer_racing.modules.clipped_normal import clipped_mean
-from dreamer_racing.modules.critic import Critic
-from dreamer_racing.modules.heads import MLP, ContinueHead, TwoHot, TwoHotHead, symexp, symlog
+from dreamer_racing.modules.heads import (
+    FIRST_STD,
+    MLP,
+    ActionDistribution,
+    Actor,
+    ContinueHead,
+    Critic,
+    TwoHot,
+    TwoHotHead,
+    symexp,
+    symlog,
+)
 
 
 def test_symlog_and_symexp_are_known_and_inverse():

@@ -5,8 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dreamer_racing.modules.decoder import ImageDecoder
-from dreamer_racing.modules.encoder import ImageEncoder, _centred, fold_patches, smallest_map, unfold_patches
+from dreamer_racing.modules.autoencoder import (
+    ImageDecoder,
+    ImageEncoder,
+    _centred,
+    fold_patches,
+    smallest_map,
+    unfold_patches,
+)
 from dreamer_racing.modules.layers import autocast
 from dreamer_racing.modules.world_model import WorldModel
 

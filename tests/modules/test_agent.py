@@ -12,13 +12,11 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from dreamer_racing.experience.records import records_from_rollout
-from dreamer_racing.modules.agent import Agent
+from dreamer_racing.modules.agent import Agent, DreamerPolicy
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.parallel_rssm import ParallelRSSM
-from dreamer_racing.modules.policy import DreamerPolicy
-from dreamer_racing.modules.rssm import RSSM
+from dreamer_racing.modules.rssm import CONTEXT, RSSM, LatentFormat
 from dreamer_racing.modules.sizes import SIZES
-from dreamer_racing.modules.stored_latents import CONTEXT, LatentFormat
 
 
 class NoiseEnv(EnvBase):
