@@ -23,8 +23,7 @@ from dreamer_racing import parallel
 from dreamer_racing.envs import DroneRacingEnv
 from dreamer_racing.learners.latent_ppo import LatentPPO
 from dreamer_racing.modules import Interface
-from dreamer_racing.training.model_lag import ModelLag
-from dreamer_racing.training.schedule import Schedule
+from dreamer_racing.training.schedule import ModelLag, Schedule
 from dreamer_racing.training.session import Session
 
 REMEDY = "model.learning_rate (of an actor's update loss.ppo.learning_rate), or model.mixed_precision=false"

@@ -29,7 +29,6 @@ from torchrl.checkpoint import (
 )
 
 from dreamer_racing import parallel
-from dreamer_racing.training.checksums import damage_of
 from dreamer_racing.training.directory import (
     PREFIX,
     PROCESS,
@@ -40,7 +39,7 @@ from dreamer_racing.training.directory import (
     ensure_writable,
     is_complete,
 )
-from dreamer_racing.training.publishing import publish, remove, remove_unfinished
+from dreamer_racing.training.publishing import damage_of, publish, remove, remove_unfinished
 
 logger = logging.getLogger(__name__)
 

@@ -28,12 +28,10 @@ from dreamer_racing.experience.collector_state import CollectorState
 from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.machine import KeptMemory
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
-from dreamer_racing.training.clock import RunClock
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.clock import Interval, Journal, Periods, RunClock
+from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
-from dreamer_racing.training.journal import Interval, Journal, Periods
-from dreamer_racing.training.lock import RunLock
 from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
 from dreamer_racing.training.progress import Progress

@@ -59,7 +59,7 @@ from dreamer_racing.training.checkpoint import load_state
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
 from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import NoReport
-from dreamer_racing.training.model_lag import ModelLag
+from dreamer_racing.training.schedule import ModelLag
 from dreamer_racing.training.session import Evaluator, Session
 
 if TYPE_CHECKING:

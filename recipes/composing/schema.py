@@ -22,12 +22,16 @@ from dreamer_racing.learners import PPOConfig, SACConfig
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.losses import DreamerV3Losses, LatentPPOLosses, LossConfig, find_objective
 from dreamer_racing.modules import get_size
-from dreamer_racing.modules.encoder import smallest_map
+from dreamer_racing.modules.autoencoder import smallest_map
 from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SEED, Range, check_settings, setting
+from dreamer_racing.training.clock import CheckpointConfig, EvaluationConfig
 from dreamer_racing.training.directory import RunDirectory
-from dreamer_racing.training.journal import CheckpointConfig, EvaluationConfig
-from dreamer_racing.training.replay_ratio import ReplayRatio
-from dreamer_racing.training.schedule import DreamerV3ScheduleConfig, LatentPPOScheduleConfig, ScheduleConfig
+from dreamer_racing.training.schedule import (
+    DreamerV3ScheduleConfig,
+    LatentPPOScheduleConfig,
+    ReplayRatio,
+    ScheduleConfig,
+)
 
 
 @dataclass

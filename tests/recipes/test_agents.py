@@ -16,8 +16,8 @@ from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.export import agents
 from dreamer_racing.export.onnx_actor import read_contract
 from dreamer_racing.export.shipped_agent import FILES, ShippedAgent, is_agent
-from dreamer_racing.training.checksums import write_checksums
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
+from dreamer_racing.training.publishing import write_checksums
 from tests.running_recipes import ROOT, UNDRAWN, recipe, recipe_module
 
 pytest.importorskip("onnxscript")

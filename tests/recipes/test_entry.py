@@ -14,7 +14,7 @@ import torch
 from hydra.errors import HydraException
 
 from dreamer_racing.figures.plotting import PlotConfig
-from dreamer_racing.training.model_lag import LOOKS
+from dreamer_racing.training.schedule import LOOKS
 from tests.running_recipes import CONFIG, ROOT, TINY, compose, open_session, recipe, recipe_module
 
 
@@ -151,8 +151,8 @@ runpy.run_path({recipes!r} + "/ppo.py", run_name="__main__")
 """
 SETTING_UP = """
 import os, signal
-from dreamer_racing.training import lock
-lock.RunLock.__init__ = lambda *given: os.kill(os.getpid(), signal.SIGINT)
+from dreamer_racing.training import directory
+directory.RunLock.__init__ = lambda *given: os.kill(os.getpid(), signal.SIGINT)
 """
 
 

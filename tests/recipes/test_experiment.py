@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from dreamer_racing.training.directory import RunDirectory, latest_checkpoint
-from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.directory import RunDirectory, RunLock, latest_checkpoint
 from tests.running_recipes import ROOT, compose, recipe, recipe_module, rows, started
 
 

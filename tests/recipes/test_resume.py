@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-from dreamer_racing.training.checksums import CHECKSUMS
 from dreamer_racing.training.directory import latest_checkpoint
+from dreamer_racing.training.publishing import CHECKSUMS
 from tests.running_recipes import UNDRAWN, recipe, rows
 
 SETTINGS = [

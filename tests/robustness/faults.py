@@ -48,8 +48,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from dreamer_racing.machine import provenance  # noqa: E402
-from dreamer_racing.training.checksums import CHECKSUMS  # noqa: E402
 from dreamer_racing.training.directory import RunDirectory, latest_checkpoint  # noqa: E402
+from dreamer_racing.training.publishing import CHECKSUMS  # noqa: E402
 from tests.forked import recipe  # noqa: E402
 
 RECIPE = ROOT / "recipes" / "dreamer_v3.py"

@@ -53,8 +53,8 @@ from dreamer_racing.experience.replay import make_replay  # noqa: E402
 from dreamer_racing.export.onnx_actor import OnnxActor, read_contract  # noqa: E402
 from dreamer_racing.machine import provenance  # noqa: E402
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints  # noqa: E402
-from dreamer_racing.training.checksums import write_checksums  # noqa: E402
 from dreamer_racing.training.directory import latest_checkpoint  # noqa: E402
+from dreamer_racing.training.publishing import write_checksums  # noqa: E402
 from tests.forked import Forked  # noqa: E402
 
 TRACKS = ROOT / "dreamer_racing" / "envs" / "tracks"

@@ -13,9 +13,14 @@ from unittest.mock import Mock
 import pytest
 
 from dreamer_racing.training import directory
-from dreamer_racing.training.directory import RunDirectory, complete_checkpoints, fresh_directory, replace_text
-from dreamer_racing.training.journal import Interval, Journal, Periods
-from dreamer_racing.training.lock import RunLock
+from dreamer_racing.training.clock import Interval, Journal, Periods
+from dreamer_racing.training.directory import (
+    RunDirectory,
+    RunLock,
+    complete_checkpoints,
+    fresh_directory,
+    replace_text,
+)
 from dreamer_racing.training.metrics import PendingMetrics
 
 
@@ -132,7 +137,7 @@ def test_a_directory_in_use_is_refused_until_it_is_released(tmp_path: Path) -> N
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     code = f"""if True:
-        from dreamer_racing.training.lock import RunLock
+        from dreamer_racing.training.directory import RunLock
         lock = RunLock({str(tmp_path)!r})
         print("held", flush=True)
         input()"""
@@ -198,7 +203,7 @@ def test_what_was_due_when_a_run_was_saved_is_due_when_it_goes_on() -> None:
 
 def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
     interval, never = Interval(2.0), Interval(0.0)
     for now[0], due in ((119.0, False), (120.0, True), (200.0, False), (245.0, True)):
         assert interval.due() == due and not never.due()
@@ -206,7 +211,7 @@ def test_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_first_time_of_an_interval_may_come_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
     intervals = {minutes: Interval(minutes, first=2.0) for minutes in (0.0, 1.0, 10.0)}
     due: dict[float, list[int]] = {minutes: [] for minutes in intervals}
     for minute in range(1, 25):

@@ -9,10 +9,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dreamer_racing.training.gate_pass_rate import KNOWN, MEMORY, PACE, GatePassRate
-from dreamer_racing.training.model_lag import LOOKS, PATIENCE, ModelLag
-from dreamer_racing.training.replay_ratio import ReplayRatio
-from dreamer_racing.training.schedule import Ramp, RampClock
+from dreamer_racing.training.episodes import KNOWN, MEMORY, PACE, GatePassRate
+from dreamer_racing.training.schedule import LOOKS, PATIENCE, ModelLag, Ramp, RampClock, ReplayRatio
 
 
 @pytest.mark.parametrize(

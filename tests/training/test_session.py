@@ -170,7 +170,7 @@ def test_a_run_that_saves_on_the_way_does_so_within_two_minutes(
     every: int, saved: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("dreamer_racing.training.journal.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dreamer_racing.training.clock.time.monotonic", lambda: now[0])
     run = Run(tmp_path, total=200, rollout=4, save_every=every)
 
     def pass_time(updates: int) -> None:
