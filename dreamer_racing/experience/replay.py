@@ -1,6 +1,6 @@
 """Replay of what a collector yields: batches of windows, checkpoints.
 
-Records (`dreamer_racing.experience.records`) live in per-environment streams (`dreamer_racing.experience.streams`).
+Records live in per-environment streams (`dreamer_racing.experience.streams`).
 
 Shapes: N streams (= environments), L records a stream, B windows a batch, T records a window or steps a rollout,
 M records of one rollout.
@@ -26,14 +26,16 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import Transform
 
-from dreamer_racing.experience.records import END_KEYS, RACE_REWARD_KEYS, records_from_rollout
 from dreamer_racing.experience.streams import (
+    END_KEYS,
+    RACE_REWARD_KEYS,
     RecordStorage,
     StreamMemmapStorage,
     StreamSampler,
     StreamTensorStorage,
     StreamWriter,
     check_layout,
+    records_from_rollout,
     send,
 )
 from dreamer_racing.modules.rssm import CONTEXT, LatentFormat

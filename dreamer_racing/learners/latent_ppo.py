@@ -26,7 +26,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from dreamer_racing import parallel
-from dreamer_racing.experience.rollout_storage import RolloutStorage
+from dreamer_racing.experience.rollouts import RolloutStorage
 from dreamer_racing.learners.config import LearnerConfig
 from dreamer_racing.learners.learner import Timer, ValueFunction, untimed
 from dreamer_racing.learners.optimizer import restore

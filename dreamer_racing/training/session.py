@@ -24,8 +24,7 @@ from torchrl.envs import EnvBase
 from torchrl.record.loggers import Logger
 
 from dreamer_racing import parallel
-from dreamer_racing.experience.collector_state import CollectorState
-from dreamer_racing.experience.rollouts import Rollouts, WorkerError
+from dreamer_racing.experience.rollouts import CollectorState, Rollouts, WorkerError
 from dreamer_racing.machine import KeptMemory
 from dreamer_racing.training.checkpoint import BestCheckpoint, RunCheckpointError, RunCheckpoints
 from dreamer_racing.training.clock import Interval, Journal, Periods, RunClock

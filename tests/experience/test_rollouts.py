@@ -12,9 +12,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
-from dreamer_racing.experience.collector_state import CollectorState
-from dreamer_racing.experience.rollout_storage import RolloutStorage
-from dreamer_racing.experience.rollouts import Rollouts
+from dreamer_racing.experience.rollouts import CollectorState, Rollouts, RolloutStorage
 from dreamer_racing.modules import Interface, symlog
 from tests.dreamers import learner_of
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import InitTracker, TransformedEnv
 
-from dreamer_racing.experience.records import records_from_rollout
+from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.losses import (
     OBJECTIVES,

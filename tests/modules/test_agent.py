@@ -11,7 +11,7 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from dreamer_racing.experience.records import records_from_rollout
+from dreamer_racing.experience.streams import records_from_rollout
 from dreamer_racing.modules.agent import Agent, DreamerPolicy
 from dreamer_racing.modules.interface import Interface
 from dreamer_racing.modules.parallel_rssm import ParallelRSSM
