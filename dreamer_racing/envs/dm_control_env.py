@@ -49,9 +49,7 @@ from dreamer_racing.envs.own import (
     Transition,
     VectorFunction,
 )
-from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
-from dreamer_racing.envs.race.race_vector import RaceVector
-from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep, RaceVector, RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight

@@ -13,8 +13,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from dreamer_racing.envs.race.race import Race, RaceStep
-from dreamer_racing.envs.race.race_vector import RaceVector
+from dreamer_racing.envs.race.race import Race, RaceStep, RaceVector
 from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.settings import import_own, quoted
 

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.imu import IMU_SIZE
-from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
+from dreamer_racing.envs.race.race import RACE_VECTOR_SIZE
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.envs.worlds import ACTION_SIZE, RaceOptions, RaceWorlds, check_options
 from dreamer_racing.settings import check_flags

@@ -22,10 +22,16 @@ from dreamer_racing.envs.drone.quadrotor import wrong_action_type
 from dreamer_racing.envs.held_frames import HeldFrames
 from dreamer_racing.envs.imu import Imu, ImuErrors, load_imu
 from dreamer_racing.envs.own import OwnFunction, RaceState, RaceStates, RewardFunction, Transition, VectorFunction
-from dreamer_racing.envs.race.race import EPISODE_TIME, EVALUATION_TIME, Race, RaceStep
-from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE, RaceVector
+from dreamer_racing.envs.race.race import (
+    EPISODE_TIME,
+    EVALUATION_TIME,
+    RACE_VECTOR_SIZE,
+    Race,
+    RaceStep,
+    RaceVector,
+    RewardWeights,
+)
 from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
-from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator.backends import check_device, make_simulator
 from dreamer_racing.envs.simulator.base import Simulator

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from dreamer_racing.commands import install_extra
-from dreamer_racing.envs.race.race_vector import RACE_VECTOR_SIZE
+from dreamer_racing.envs.race.race import RACE_VECTOR_SIZE
 from dreamer_racing.export.onnx_actor import CONTRACT, PARTS, RECURRENT, OnnxActor, RecurrentActor, hash_file
 from dreamer_racing.export.parity import ACTION_TOLERANCE, RecordedFlight, TorchActor, check_parity, check_steps
 from dreamer_racing.export.weights_file import write_weights

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dreamer_racing.envs.drone.parameters import GRAVITY, QuadrotorParameters, Randomisation
 from dreamer_racing.envs.imu import ImuErrors
-from dreamer_racing.envs.race.race_vector import RACE_VECTOR_ENTRIES
+from dreamer_racing.envs.race.race import RACE_VECTOR_ENTRIES
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.export.actor_step import OUTPUTS, ActorStep
 from dreamer_racing.export.onnx_actor import FORMAT

@@ -18,7 +18,7 @@ from dreamer_racing.envs import dm_control_gl
 from dreamer_racing.envs.dm_control_env import OnboardView, load
 from dreamer_racing.envs.drone.rotation import rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.race import RewardWeights
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
 from dreamer_racing.envs.tracks import Gate, Track, load_track, make_track

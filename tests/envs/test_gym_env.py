@@ -24,7 +24,7 @@ from dreamer_racing.envs.drone.parameters import QuadrotorParameters, load_prese
 from dreamer_racing.envs.gym_env import OBSERVATIONS, RENDER_VIEWS, DroneRaceGymEnv
 from dreamer_racing.envs.gym_vector_env import DroneRaceVectorEnv
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.race import RewardWeights
 from dreamer_racing.envs.simulator.chase import ChaseView
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv

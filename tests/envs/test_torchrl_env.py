@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
 from dreamer_racing.envs.race.gates import CrashCause
-from dreamer_racing.envs.race.rewards import RewardWeights
+from dreamer_racing.envs.race.race import RewardWeights
 from dreamer_racing.envs.torchrl_env import DroneRacingEnv
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, TrackError, make_track
 

@@ -1,6 +1,10 @@
-"""Episodes of N drones on one track: target gates, laps, time and rewards.
+"""Episodes of N drones on one track: target gates, laps, time, the reward of Eq. 1, and the race as its drone feels it.
 
-Shape legend: N drones, P physics steps per control step, G race gates. SI units, world z up, quaternions wxyz.
+The reward is split so that a replayed step can be given today's body-rate weight. The race vector, in the drone's own
+frame, is for state policies and informed losses.
+
+Shape legend: N drones, P physics steps per control step, G race gates. SI units, of the vector before scaling; world z
+up, body frame FLU, quaternions wxyz. Reference: paper, Eq. 1.
 """
 
 from __future__ import annotations
@@ -9,11 +13,13 @@ import dataclasses
 from collections.abc import Mapping
 
 import torch
+from torch import Tensor
 
+from dreamer_racing.envs.drone.rotation import align, rotate, rotate_inverse
 from dreamer_racing.envs.race.gates import CrashCause, GateSweeper
-from dreamer_racing.envs.race.rewards import RewardWeights, race_reward
+from dreamer_racing.envs.simulator.base import DroneState
 from dreamer_racing.envs.tracks import Track
-from dreamer_racing.settings import quoted
+from dreamer_racing.settings import FINITE, check_settings, quoted, setting
 
 EPISODE_TIME = 20.0
 """Time after which a training episode is truncated, s [choice]."""
@@ -25,35 +31,48 @@ over 30 m, give 47 [choice]."""
 EVALUATION_TIME = 30.0
 """The same in evaluation, s: three laps of split_s take a good pilot 22 s [choice]."""
 
+RACE_VECTOR_SIZE = 21
+VELOCITY, RATES, DISTANCE = 5.0, 5.0, 4.0  # m/s, rad/s, m
+RACE_VECTOR_ENTRIES = (
+    ("linear velocity of the drone", "m/s", VELOCITY),
+    ("body rates of the drone", "rad/s", RATES),
+    ("direction of the world's up", "1", 1.0),
+    ("from the drone to the centre of the target gate", "m", DISTANCE),
+    ("direction of flight through the target gate", "1", 1.0),
+    ("from the drone to the centre of the gate after it", "m", DISTANCE),
+    ("direction of flight through the gate after it", "1", 1.0),
+)
+"""Meaning, unit and divisor of each triple x, y, z of a race vector, all in the body frame."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RaceStep:
     """What one control step did to each drone; every tensor is (N,)."""
 
-    reward_base: torch.Tensor
+    reward_base: Tensor
     """float: the reward at b₂ = 0 (Eq. 1)."""
-    body_rate_norm: torch.Tensor
+    body_rate_norm: Tensor
     """float: ‖ω‖ where Eq. 1 has a rate term, 0 on a pass or crash, rad/s."""
-    terminated: torch.Tensor
+    terminated: Tensor
     """bool: the drone crashed."""
-    truncated: torch.Tensor
+    truncated: Tensor
     """bool: out of time, or the last lap is complete; never together with ``terminated``."""
-    passes: torch.Tensor
+    passes: Tensor
     """int64: gates passed in this step; 2 only where gates lie within a control step's reach of each other."""
-    gates_passed: torch.Tensor
+    gates_passed: Tensor
     """int64: gates passed in this episode."""
-    gate_offset: torch.Tensor
+    gate_offset: Tensor
     """float: distance from the gate's centre at a pass in this step, else 0, m."""
-    lap_time: torch.Tensor
+    lap_time: Tensor
     """float: duration of the lap completed in this step, else 0, s."""
-    crash: torch.Tensor
+    crash: Tensor
     """int64: ``CrashCause``, 0 while flying."""
-    finished: torch.Tensor
+    finished: Tensor
     """bool: the last lap was completed, without a crash in the same step."""
-    target_gate: torch.Tensor
+    target_gate: Tensor
     """int64: the gate to pass next, after this step."""
 
-    def reward(self, body_rate_weight: float) -> torch.Tensor:
+    def reward(self, body_rate_weight: float) -> Tensor:
         """Return the reward (N,) with a weight b₂ of the body rates. Reference: paper, Eq. 1."""
         return self.reward_base - body_rate_weight * self.body_rate_norm
 
@@ -101,7 +120,7 @@ class Race:
         miss_radius: float = 0.0,
     ):
         if not isinstance(weights, RewardWeights | None):
-            raise ValueError(f"weights={quoted(weights)}: must be RewardWeights, of dreamer_racing.envs.race.rewards.")
+            raise ValueError(f"weights={quoted(weights)}: must be RewardWeights, of dreamer_racing.envs.race.race.")
         self.track = track
         self.weights = weights or RewardWeights()
         if episode_steps is not None and episode_steps < 1:
@@ -113,7 +132,7 @@ class Race:
         self._gate_positions = track.gate_positions(device, dtype)
         self._dtype = dtype
 
-        def zeros() -> torch.Tensor:
+        def zeros() -> Tensor:
             return torch.zeros(num_envs, dtype=torch.int64, device=device)
 
         # all stay in place, so that a CUDA graph can advance them
@@ -123,7 +142,7 @@ class Race:
         self.lap_start_step = zeros()  # (N,) step at which the present lap began
         self.position = torch.zeros(num_envs, 3, dtype=dtype, device=device)  # (N, 3) at the last control step, m
 
-    def begin(self, mask: torch.Tensor, position: torch.Tensor, target_gate: torch.Tensor) -> None:
+    def begin(self, mask: Tensor, position: Tensor, target_gate: Tensor) -> None:
         """Begin an episode for some of the drones and leave the others alone.
 
         Args:
@@ -137,7 +156,7 @@ class Race:
         self.step_count.masked_fill_(mask, 0)
         self.lap_start_step.masked_fill_(mask, 0)
 
-    def step(self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor) -> RaceStep:
+    def step(self, path: Tensor, body_rates: Tensor, invalid_action: Tensor) -> RaceStep:
         """Judge one control step and advance every episode by it.
 
         Args:
@@ -179,18 +198,16 @@ class Race:
             target_gate=self.target_gate.clone(),
         )
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return where every episode stands."""
         return {name: getattr(self, name).clone() for name in self._EPISODE}
 
-    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
         for name in self._EPISODE:
             getattr(self, name).copy_(state_dict[name])
 
-    def _judge(
-        self, path: torch.Tensor, body_rates: torch.Tensor, invalid_action: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _judge(self, path: Tensor, body_rates: Tensor, invalid_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return passes, offsets and crashes (N,) of the path, the action before it and the body rates after it."""
         passes, offset, crash = self._sweep(path, self.target_gate)
         rates_lost = (crash == CrashCause.NONE) & ~body_rates.isfinite().all(-1)
@@ -198,7 +215,7 @@ class Race:
         crash = crash.masked_fill(invalid_action, CrashCause.INVALID_ACTION)
         return passes.masked_fill(invalid_action, 0), offset.masked_fill(invalid_action, 0.0), crash
 
-    def _advance(self, passes: torch.Tensor, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _advance(self, passes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
         """Move every episode on by one control step; return which laps it completed and their times (N,), s."""
         num_gates = self.track.num_gates
         self.position.copy_(position)
@@ -210,3 +227,133 @@ class Race:
         lap_time = torch.where(lap_complete, lap_steps * self.control_dt, 0.0).to(self._dtype)
         self.lap_start_step.copy_(torch.where(lap_complete, self.step_count, self.lap_start_step))
         return lap_complete, lap_time
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardWeights:
+    """The weights of Eq. 1.
+
+    Args:
+        progress: b₁, reward for each metre nearer to the target gate. Reference: paper, Table of reward parameters.
+        body_rate: b₂, penalty for each rad/s of body rate; a curriculum raises it to 0.01.
+        gate: reward of a control step in which the target gate was passed, instead of progress.
+        collision: reward of a control step that ends in a crash, instead of everything else.
+
+    Raises:
+        ValueError: a weight is no finite number.
+    """
+
+    progress: float = setting(1.0, FINITE)
+    body_rate: float = setting(0.0, FINITE)
+    gate: float = setting(10.0, FINITE)
+    collision: float = setting(-4.0, FINITE)
+
+    def __post_init__(self) -> None:
+        check_settings(self, "RewardWeights.")
+
+
+def race_reward(
+    weights: RewardWeights,
+    gate_position: Tensor,
+    previous_position: Tensor,
+    position: Tensor,
+    body_rates: Tensor,
+    passes: Tensor,
+    crashed: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the two parts of Eq. 1; the reward is ``reward_base - weights.body_rate * body_rate_norm``.
+
+    A crash outweighs a pass of the same step. Both distances are to the gate that was the target during the step, so
+    after a pass the next step measures both to the new gate. Values that are not finite are allowed where crashed.
+
+    Args:
+        weights: the weights of Eq. 1; ``body_rate`` is left to the caller.
+        gate_position: centre of each drone's target gate, (N, 3), m.
+        previous_position: position at the last control step, (N, 3), m.
+        position: position now, (N, 3), m.
+        body_rates: angular velocity, (N, 3), rad/s.
+        passes: gates passed in this step, each of which is paid, (N,) int64.
+        crashed: the drone crashed in this step, (N,) bool.
+
+    Returns:
+        ``reward_base`` (N,), the reward at b₂ = 0, and ``body_rate_norm`` (N,), rad/s: ‖ω‖ where Eq. 1 has a rate term,
+        0 on a pass or a crash.
+
+    Reference: paper, Eq. 1.
+    """
+    progress = (gate_position - previous_position).norm(dim=-1) - (gate_position - position).norm(dim=-1)
+    passed = passes > 0
+    reward_base = torch.where(passed, weights.gate * passes, weights.progress * progress)
+    reward_base = torch.where(crashed, weights.collision, reward_base)
+    body_rate_norm = torch.where(passed | crashed, 0.0, body_rates.norm(dim=-1))
+    return reward_base, body_rate_norm
+
+
+class RaceVector:
+    """Computes the race vector of N drones, whose entries are those of ``RACE_VECTOR_ENTRIES``.
+
+    Every entry is of order one [choice of divisors].
+
+    Args:
+        track: The track.
+        device: Where the tensors live.
+        dtype: Floating-point type of the drones' state.
+
+    Example:
+        >>> from dreamer_racing.envs.worlds import RaceWorlds
+        >>> worlds = RaceWorlds("circle", num_envs=2, from_pixels=False)
+        >>> worlds.reset()
+        >>> worlds.vector().shape
+        torch.Size([2, 21])
+    """
+
+    def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64) -> None:
+        self._positions = track.gate_positions(device, dtype)  # (G, 3)
+        self._normals = track.gate_normals(device, dtype)  # (G, 3)
+        self._up = torch.tensor([0.0, 0.0, 1.0], device=device, dtype=dtype)
+
+    def __call__(self, state: DroneState, target_gate: Tensor) -> Tensor:
+        """Return the vectors, float32 ``(N, 21)``.
+
+        Args:
+            state: Of the drones.
+            target_gate: The gate to pass next, int64 ``(N,)``.
+        """
+        gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
+        to_gate = (self._positions[gates] - state.position.unsqueeze(1)) / DISTANCE  # (N, 2, 3)
+        world = torch.cat(
+            (
+                (state.linear_velocity / VELOCITY).unsqueeze(1),
+                self._up.expand(len(gates), 1, 3),
+                torch.stack((to_gate, self._normals[gates]), 2).flatten(1, 2),
+            ),
+            1,
+        )  # (N, 6, 3)
+        body = rotate_inverse(state.attitude.unsqueeze(1).expand(-1, 6, 4), world)
+        rates = (state.body_rates / RATES).unsqueeze(1)
+        return torch.cat((body[:, :1], rates, body[:, 1:]), 1).flatten(1).float()
+
+    def pose(self, vector: Tensor, target_gate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where a drone is whose race looks like this, as well as one can say of vectors that are not exact.
+
+        The attitude fits up, both gates' directions of flight and the line between them, by least squares; the position
+        is that from which the target gate lies where it seems to.
+
+        Args:
+            vector: As ``__call__`` returns them, ``(N, 21)``.
+            target_gate: The gate to pass next, int64 ``(N,)``.
+
+        Returns:
+            Positions ``(N, 3)`` in m, attitudes ``(N, 4)``, wxyz, and how badly these gates fit the vectors ``(N,)``:
+            the mean square of what is left, of vectors of length 1.
+        """
+        gates = torch.stack((target_gate, (target_gate + 1) % len(self._positions)), 1)  # (N, 2)
+        up, to_gate, direction, to_next, next_direction = vector.to(self._up.dtype).view(-1, 7, 3)[:, 2:].unbind(1)
+        places, normals = self._positions[gates], self._normals[gates]
+        body = torch.stack((up, direction, next_direction, DISTANCE * (to_next - to_gate)), 1)
+        world = torch.cat((self._up.expand(len(gates), 1, 3), normals, places[:, 1:] - places[:, :1]), 1)  # (N, 4, 3)
+        length = world.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        body, world = body / length, world / length
+        attitude = align(body, world)
+        misfit = (rotate(attitude.unsqueeze(1), body) - world).square().sum(-1).mean(-1)
+        return places[:, 0] - rotate(attitude, DISTANCE * to_gate), attitude, misfit

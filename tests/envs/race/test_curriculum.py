@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.envs.race.curriculum import BodyRateCurriculum, BodyRateSchedule, RelabelReward
-from dreamer_racing.envs.race.rewards import RewardWeights, race_reward
+from dreamer_racing.envs.race.race import RewardWeights, race_reward
 from dreamer_racing.envs.worlds import RaceWorlds
 from dreamer_racing.experience.replay import make_replay
 

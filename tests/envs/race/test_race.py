@@ -14,9 +14,8 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, load_preset, without_r
 from dreamer_racing.envs.drone.rotation import rotate
 from dreamer_racing.envs.race.gates import CrashCause, GateSweeper
 from dreamer_racing.envs.race.pilot import ScriptedPilot
-from dreamer_racing.envs.race.race import Race, RaceStep
+from dreamer_racing.envs.race.race import Race, RaceStep, RewardWeights
 from dreamer_racing.envs.race.racing_line import START_LINE, plan_racing_line
-from dreamer_racing.envs.race.rewards import RewardWeights
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.tracks import BUILTIN_TRACKS, Gate, load_track, make_track, validate_track
 from dreamer_racing.envs.worlds import RaceWorlds
