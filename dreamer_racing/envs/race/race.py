@@ -183,7 +183,7 @@ class Race:
         if self.laps is None:
             finished = torch.zeros_like(crashed)
         else:
-            finished = lap_complete & ~crashed & (self.gates_passed >= self.laps * self.track.num_gates)
+            finished = lap_complete & ~crashed & (self.gates_passed >= self.laps * len(self._gate_positions))
         return RaceStep(
             reward_base=reward_base,
             body_rate_norm=body_rate_norm,
@@ -217,7 +217,7 @@ class Race:
 
     def _advance(self, passes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
         """Move every episode on by one control step; return which laps it completed and their times (N,), s."""
-        num_gates = self.track.num_gates
+        num_gates = len(self._gate_positions)
         self.position.copy_(position)
         self.step_count += 1
         self.gates_passed += passes

@@ -113,7 +113,7 @@ class StartSampler:
         self._start_yaw = torch.tensor(math.radians(track.start_yaw_degrees), device=device, dtype=dtype)
         level = torch.zeros_like(self._start_yaw)
         self._start_attitude = from_roll_pitch_yaw(level, level, self._start_yaw)
-        self._shape = track.shape
+        self._shape, self._half_opening = track.shape, track.shape.pass_half_width
         low, high = flyable_box(track, START_CLEARANCE)
         self._low = torch.tensor(low, device=device, dtype=dtype)
         self._high = torch.tensor(high, device=device, dtype=dtype)
@@ -191,7 +191,7 @@ class StartSampler:
         cos, sin, _ = self._gate_normals.unbind(-1)
         forward, left = x * cos + y * sin, y * cos - x * sin
         aside = torch.maximum(left.abs(), up.abs())
-        in_bars = (aside >= self._shape.pass_half_width) & (aside <= self._shape.outer / 2)
+        in_bars = (aside >= self._half_opening) & (aside <= self._shape.outer / 2)
         return (in_bars & (forward.abs() <= self._shape.depth / 2)).any(-1)
 
     def _put_on_line(self, line: RacingLine, pose: StartPose) -> StartPose:
