@@ -66,6 +66,7 @@ def main() -> None:
     parser.add_argument("--backends", nargs="*", default=["eager"], choices=BACKENDS)
     parser.add_argument("--batch", nargs=2, type=int, default=(8, 32), metavar=("B", "T"))
     parser.add_argument("--horizon", type=int, default=15)
+    parser.add_argument("--starts", type=int, help="latents of a batch that imagination begins from; default: all")
     parser.add_argument("--image-size", type=int, default=64, help="pixels; peers keep to 64")
     parser.add_argument("--mixed-precision", action="store_true", help="bfloat16 autocast")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -86,7 +87,7 @@ def main() -> None:
     shared = (tuple(arguments.batch), arguments.horizon, arguments.device, arguments.threads, arguments.updates)
     few_kernels = True if arguments.few_kernels else None
     settings = [
-        Setting(loss, actor, arguments.mixed_precision, arguments.image_size, *shared, few_kernels)
+        Setting(loss, actor, arguments.mixed_precision, arguments.image_size, *shared, few_kernels, arguments.starts)
         for loss in arguments.losses
         for actor in arguments.actor_losses
     ]
@@ -114,7 +115,8 @@ def main() -> None:
 
 def print_launches(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Count what a CUDA device would launch, with few kernels and without."""
-    unused = ("backends", "peers", "device", "mixed_precision", "few_kernels", "image_size", "threads", "updates")
+    of_times = ("backends", "peers", "device", "updates", "threads")
+    unused = (*of_times, "mixed_precision", "few_kernels", "image_size", "starts")
     if given := [name for name in unused if getattr(arguments, name) != parser.get_default(name)]:
         parser.error(f"--launches counts kernels of both ways on a CPU: no --{given[0].replace('_', '-')} with it.")
     counted = [
@@ -141,18 +143,19 @@ class Setting:
     threads: int
     updates: int  # timed, after WARM_UP
     few_kernels: bool | None = None  # None: on a CUDA device
+    starts: int | None = None  # of imagination; None: all latents of the batch
 
     def learner(self, size: str, backend: str = "eager") -> WorldModelLearner:
         """Make the learner of a size."""
         torch.set_num_threads(self.threads)
         torch.set_float32_matmul_precision("high")
-        config = LearnerConfig(
-            mixed_precision=self.mixed_precision,
-            cuda_graph="graph" in backend,
-            few_kernels=self.few_kernels,
-            imagination_horizon=self.horizon,
-        )
+        graph, mixed, few = "graph" in backend, self.mixed_precision, self.few_kernels
+        config = replace(self.config(), cuda_graph=graph, mixed_precision=mixed, few_kernels=few)
         return make_learner(size, self.loss, self.actor, config, self.image_size, self.device)
+
+    def config(self) -> LearnerConfig:
+        """Return the numbers of an update, by which its FLOPs are counted, too."""
+        return LearnerConfig(imagination_horizon=self.horizon, imagination_starts=self.starts)
 
 
 def make_learner(
@@ -179,7 +182,7 @@ def measure(size: str, backend: str, setting: Setting) -> dict[str, Any]:
         setting.updates,
         device,
         setting.mixed_precision,
-        lambda: dry_update(size, setting.loss, setting.actor, setting.batch, setting.horizon, setting.image_size)[0],
+        lambda: dry_update(size, setting.loss, setting.actor, setting.batch, setting.config(), setting.image_size)[0],
         count=backend == "eager",
     )
     return {
@@ -328,11 +331,11 @@ fused_rms_norm.register_autograd(
 
 
 def dry_update(
-    size: str, loss: str, actor: str, batch: tuple[int, int], horizon: int, image_size: int = 64
+    size: str, loss: str, actor: str, batch: tuple[int, int], config: LearnerConfig, image_size: int = 64
 ) -> tuple[int, int, int]:
     """Trace losses and gradients on the meta device; return FLOPs, trained parameters, bytes kept for the backward."""
     with torch.device("meta"):
-        learner = make_learner(size, loss, actor, LearnerConfig(imagination_horizon=horizon), image_size, "meta")
+        learner = make_learner(size, loss, actor, config, image_size, "meta")
         records: dict[Any, Tensor] = {
             "pixels": torch.empty(*batch, image_size, image_size, 3, dtype=torch.uint8),
             ("privileged", "vector"): torch.empty(*batch, PRIVILEGED_DIM),
@@ -375,7 +378,8 @@ def write_size_table(path: Path, batch: tuple[int, int] = (16, 64), horizon: int
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, size in SIZES.items():
-        flops, count, kept = dry_update(name, "reconstruction", "reinforce", batch, horizon)
+        config = LearnerConfig(imagination_horizon=horizon)
+        flops, count, kept = dry_update(name, "reconstruction", "reinforce", batch, config)
         lines.append(
             f"| `{name}` | {size.recurrence} | {size.belief} | {size.latents}×{size.classes} | {size.units} | "
             f"{size.cnn_depth} | {count / 1e6:.2f} M | {flops / 1e9:,.0f} | {count * 16 / 2**30:.2f} | "
