@@ -25,7 +25,7 @@ from dreamer_racing.modules import Agent, Interface, get_size
 from dreamer_racing.modules.heads import ActionDistribution
 from dreamer_racing.modules.rssm import LatentFormat
 from dreamer_racing.training.checkpoint import RunCheckpointError, RunCheckpoints, newest_sound
-from dreamer_racing.training.progress import GracefulExit
+from dreamer_racing.training.signals import GracefulExit
 from tests.forked import Forked
 from tests.learners.test_dreamer_v3 import make_batch
 

@@ -26,7 +26,7 @@ from dreamer_racing.plant.commands import TIMEOUT, CommandReceiver, Controls
 from dreamer_racing.plant.delivery import Delivery, PoseDelivery
 from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import POSITIVE, Range, setting
-from dreamer_racing.training.progress import GracefulExit
+from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
 

@@ -33,7 +33,8 @@ from dreamer_racing.training.episodes import EpisodeTracker
 from dreamer_racing.training.following import LockHeldByFirst, UnwrittenMetrics
 from dreamer_racing.training.media import log_evaluation
 from dreamer_racing.training.metrics import MetricsLog, PendingMetrics
-from dreamer_racing.training.progress import GracefulExit, Progress
+from dreamer_racing.training.progress import Progress
+from dreamer_racing.training.signals import GracefulExit
 
 logger = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ from dreamer_racing.plant.process import (
 )
 from dreamer_racing.plant.vehicle import PlantVehicle
 from dreamer_racing.settings import check_settings
-from dreamer_racing.training.progress import GracefulExit
+from dreamer_racing.training.signals import GracefulExit
 
 
 @pytest.fixture(scope="module")

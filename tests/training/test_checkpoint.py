@@ -31,8 +31,8 @@ from dreamer_racing.training.checkpoint import (
     newest_sound,
 )
 from dreamer_racing.training.directory import ensure_writable, latest_checkpoint
-from dreamer_racing.training.progress import GracefulExit
 from dreamer_racing.training.publishing import CHECKSUMS, write_checksums
+from dreamer_racing.training.signals import GracefulExit
 from tests.forked import SERVER
 
 

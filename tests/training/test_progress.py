@@ -14,8 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from dreamer_racing.training import signals
 from dreamer_racing.training.clock import MEASURED, REMEMBERED, SETTLING, RunClock, TimeLeft
-from dreamer_racing.training.progress import COLUMNS, GracefulExit, LiveTable, Progress
+from dreamer_racing.training.progress import COLUMNS, LiveTable, Progress
+from dreamer_racing.training.signals import GracefulExit
 
 
 def test_waiting_takes_wall_clock_but_no_core():
@@ -332,6 +334,7 @@ def test_what_is_logged_stands_above_and_the_table_stays(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("number", range(1, 42))
 def test_ctrl_c_is_answered_above_whatever_is_being_drawn(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = open_terminal(monkeypatch, terminal=(interrupted := Interrupted(10**9)))
+    monkeypatch.setattr(signals, "write_at_once", terminal.write)
     monkeypatch.setattr("dreamer_racing.training.progress.write_at_once", terminal.write)
     monkeypatch.setattr(logging.root, "handlers", [logging.StreamHandler(terminal)])
     with GracefulExit("saving") as stop, Progress(total=100) as progress:

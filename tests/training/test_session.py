@@ -19,8 +19,8 @@ from tensordict import TensorDict, TensorDictBase
 from dreamer_racing.experience.rollouts import Rollouts, WorkerError
 from dreamer_racing.training.directory import RunDirectory, env_steps_of
 from dreamer_racing.training.episodes import EpisodeTracker
-from dreamer_racing.training.progress import GracefulExit
 from dreamer_racing.training.session import Session
+from dreamer_racing.training.signals import GracefulExit
 
 
 class OneAhead(Rollouts):
@@ -223,7 +223,7 @@ def test_a_terminal_that_goes_is_no_second_signal(numbers: tuple[signal.Signals,
 PROGRAM = """
 import sys, time
 from dreamer_racing.training.progress import Progress
-from dreamer_racing.training.progress import GracefulExit
+from dreamer_racing.training.signals import GracefulExit
 with GracefulExit("saving") as stop, Progress(total=1000) as progress:
     stop.say = progress.answer
     open(sys.argv[1], "w").close()
