@@ -41,7 +41,7 @@ class DoctorConfig:
     json: bool = False  # for programs, on stdout; --json does the same
 
 
-@recipe("doctor", DoctorConfig)
+@recipe("doctor", DoctorConfig, logs=False)
 def main(config: DoctorConfig) -> None:
     """Examine, and print what was found."""
     findings = []

@@ -251,12 +251,14 @@ def read_evaluation(
         raise FileNotFoundError(f"There is no evaluation {path}: an agent ships with its numbers. {how}")
     try:
         written = json.loads(path.read_text(encoding="utf-8"))
-        made, flown_on = written["provenance"], written["provenance"]["track_sha256"]
+        made = written["provenance"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is no evaluation of recipes/evaluate.py ({error!r}). {how}") from error
     if made.get("weights_sha256") != weights_sha256:
         raise ValueError(f"{path} is the evaluation of other weights than those of {checkpoint}. {how}")
-    if flown_on != track_sha256:
+    if made.get("track_sha256") is None:
+        raise ValueError(f"{path} does not say which track it was flown on. {how}")
+    if made["track_sha256"] != track_sha256:
         there = "another track, or with other decoys" if made["track"] == trained.track else made["track"]
         raise ValueError(f"{path} was flown on {there}, and the agent was trained on {trained.track}. {how}")
     names = ("episodes", "seed", "start_noise", "preset", "decoys", "date", "commit")

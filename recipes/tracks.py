@@ -36,7 +36,7 @@ class TracksConfig:
             raise ValueError(f"picture={self.picture}: the name of the file must end in {', '.join(PICTURES)}.")
 
 
-@recipe("tracks", TracksConfig)
+@recipe("tracks", TracksConfig, logs=False)
 def main(config: TracksConfig) -> None:
     """List, and draw."""
     with plain_errors():

@@ -18,6 +18,7 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range,
 SUITES = ("race", "dmc")
 EVERYWHERE = ("suite", "num_envs", "device", "episode_steps", "from_pixels", "image_size")
 """Settings that are not for races alone."""
+MISSING = "???"  # OmegaConf's word for what must be given, which this package does not import for it
 IN_TRAINING = (
     "episode_steps", "start_beyond_gate", "start_at_gate", "start_on_line", "miss_radius", "action_change_weight",
     "looks",
@@ -31,7 +32,7 @@ class EnvConfig:
 
     suite: str = "race"  # race | dmc
     preset: str = "easy"  # physics: easy | faithful | betaflight
-    num_envs: int = setting("???", COUNT)  # worlds flown side by side; missing: the recipe's own number
+    num_envs: int = setting(MISSING, COUNT)  # worlds flown side by side; missing: the recipe's own number
     control_rate: float = setting(50.0, Range(MIN_CONTROL_RATE))  # actions a second, Hz
     # frames a second, Hz, control_rate divided by a whole number; null: one at every control step
     camera_rate: float | None = setting(None, POSITIVE)
@@ -66,13 +67,17 @@ class EnvConfig:
         """The nose camera of a race."""
         return Camera(self.image_size, self.image_size, tilt=self.camera_tilt, rate=self.camera_rate)
 
-    def worlds(self) -> dict[str, Any]:
+    @property
+    def measured(self) -> str | None:
+        """Inertial measurements, as `DroneRacingEnv` takes them."""
+        return None if self.imu == "none" else self.imu
+
+    def arguments(self) -> dict[str, Any]:
         """Return what every `DroneRacingEnv` is given, to train in and to be evaluated in, but for the track."""
         same = ("preset", "renderer", "control_rate", "from_pixels", "reward", "vector", "device")
-        imu = None if self.imu == "none" else self.imu
-        return {"camera": self.camera, "imu": imu, **{name: getattr(self, name) for name in same}}
+        return {"camera": self.camera, "imu": self.measured, **{name: getattr(self, name) for name in same}}
 
-    def training(self) -> dict[str, Any]:
+    def training_arguments(self) -> dict[str, Any]:
         """Return what one to train in is given besides."""
         return {name: getattr(self, name) for name in IN_TRAINING}
 
@@ -108,7 +113,7 @@ class EnvConfig:
         try:
             at_control_rate(load_preset(self.preset), self.control_rate)
             frame_interval(Camera(rate=self.camera_rate), self.control_rate)
-            load_imu(self.worlds()["imu"], self.from_pixels)
+            load_imu(self.measured, self.from_pixels)
             self.try_own(track)
             GateSweeper(track, miss_radius=self.miss_radius)
         except ValueError as error:
@@ -118,7 +123,7 @@ class EnvConfig:
         """Refuse a reward or numbers of a user's own that are not as they should be: fly a step by them."""
         if self.reward is None and self.vector is None:
             return
-        if self.vector is not None and self.imu != "none":
+        if self.vector is not None and self.measured:
             raise ValueError("vector and env.imu: agents see one set of numbers, leave one of them out.")
         own: dict[str, Any] = {name: getattr(self, name) for name in ("control_rate", "device", "reward", "vector")}
         worlds = RaceWorlds(track, 2, self.preset, from_pixels=False, **own)

@@ -25,7 +25,7 @@ def imports_with_variable(name: str) -> bool:
     `PYOPENGL_PLATFORM` is in the way where it is set to anything but `MUJOCO_GL`, which MuJoCo and dm_control refuse.
 
     Raises:
-        Exception: what the package raises, where neither is set.
+        Exception: what the package raises, where `MUJOCO_GL` is not set.
     """
     value, platform = os.environ.get("MUJOCO_GL"), os.environ.get("PYOPENGL_PLATFORM")
     loaded = set(sys.modules)

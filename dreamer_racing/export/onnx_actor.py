@@ -286,6 +286,8 @@ def read_contract(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if path.is_dir() or path.suffix == ".onnx":
         path = (path if path.is_dir() else path.parent) / CONTRACT
+    elif path.suffix != ".json":
+        raise ValueError(f"{path} is no actor: give an .onnx file, or the folder of one.")
     if not path.is_file():
         raise FileNotFoundError(f"There is no {path}: it belongs beside the .onnx file, from the same export.")
     try:

@@ -39,7 +39,7 @@ from dreamer_racing.losses import (
     replay_critic_loss,
     rollout_return,
 )
-from dreamer_racing.losses.config import PPOUpdateConfig
+from dreamer_racing.losses.config import KL_TOLERANCE, PPOUpdateConfig
 from dreamer_racing.modules import Agent
 from dreamer_racing.modules.heads import ActionDistribution, TwoHotHead, symlog
 from dreamer_racing.modules.interface import PRIVILEGED
@@ -50,8 +50,6 @@ CRITICS = ("latent", "state")
 """What the critic that teaches the actor may see."""
 CRITIC_LAYERS, CRITIC_UNITS = 3, 256
 """Hidden layers of that critic [choice]."""
-KL_TOLERANCE = 1.5
-"""Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
 RATE_CHANGE, SMALLEST_SCALE = 1.25, 0.01
 """Factor by which the learning rate then changes, and its smallest share [choice]."""
 

@@ -10,6 +10,8 @@ from dreamer_racing.settings import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_SHAR
 HORIZON = 16
 """H, imagined actions from each start, where nobody says; in recipes ``model.imagination_horizon`` does.
 Reference: Dream to Fly, where T = 16; danijar/dreamerv3 has 15 (``imag_length``)."""
+KL_TOLERANCE = 1.5
+"""Factor that a divergence may be off its target. Reference: Schulman et al. 2017, Section 4."""
 
 
 @dataclass

@@ -23,6 +23,25 @@ from dreamer_racing.modules.heads import ActionDistribution
 from dreamer_racing.settings import import_own, suggestion
 
 
+@contextmanager
+def frozen(*modules: nn.Module) -> Iterator[None]:
+    """Let gradient flow through modules but not into their parameters, nor what stands for these (``cast_once``)."""
+    layers = {layer: None for module in modules for layer in module.modules()}
+    held = [
+        (layer, name, parameter)
+        for layer in layers
+        for name, parameter in layer._parameters.items()
+        if parameter is not None and parameter.requires_grad
+    ]
+    for layer, name, parameter in held:
+        layer._parameters[name] = parameter.detach()  # type: ignore[assignment]  # no parameter, but in its place
+    try:
+        yield
+    finally:
+        for layer, name, parameter in held:
+            layer._parameters[name] = parameter
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Steps that a policy took, and what came of them; each ``(H, N, ...)``, or ``(M, ...)`` of a minibatch.
@@ -213,22 +232,3 @@ def find_objective(name: str, collected: bool | None = None) -> Objective:
         steps, takes = ("imagined", "dreamer_v3") if collected else ("collected", "latent_ppo")
         raise ValueError(f"loss.actor={name} learns from {steps} steps: recipes/{takes}.py takes it.")
     return OBJECTIVES[name]
-
-
-@contextmanager
-def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Let gradient flow through modules but not into their parameters, nor what stands for these (``cast_once``)."""
-    layers = {layer: None for module in modules for layer in module.modules()}
-    held = [
-        (layer, name, parameter)
-        for layer in layers
-        for name, parameter in layer._parameters.items()
-        if parameter is not None and parameter.requires_grad
-    ]
-    for layer, name, parameter in held:
-        layer._parameters[name] = parameter.detach()  # type: ignore[assignment]  # no parameter, but in its place
-    try:
-        yield
-    finally:
-        for layer, name, parameter in held:
-            layer._parameters[name] = parameter

@@ -1,7 +1,8 @@
 """Recurrent state-space model: belief h, categorical state z, their dynamics, and how a replay keeps them.
 
 Shape legend: B batch, T time, N any one-dimensional batch, A action, E embedding, D belief, L latents, K classes,
-S state = L·K, U hidden. Everything here is plain tensors, so that a time loop costs a few kernels a step.
+S state = L·K, U hidden. The networks take and give plain tensors, so that a time
+loop costs a few kernels a step; only `LatentFormat` packs a TensorDict.
 """
 
 from __future__ import annotations

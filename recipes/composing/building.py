@@ -84,7 +84,7 @@ def worlds_device(device: torch.device, env: EnvConfig) -> str:
 
 def worlds_of(config: RunConfig) -> dict[str, Any]:
     """Arguments of every `DroneRacingEnv` of the run: where it trains, and where it is evaluated."""
-    return {"track": config.track_as_begun(), **config.env.worlds()}
+    return {"track": config.track_as_begun(), **config.env.arguments()}
 
 
 def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | None = None) -> Environment:
@@ -103,7 +103,7 @@ def make_env(config: RunConfig, num_envs: int | None = None, num_threads: int | 
             privileged=bool(readers),
             seed=config.seed,
             num_threads=num_threads,
-            **config.env.training(),
+            **config.env.training_arguments(),
             **worlds_of(config),
         )
     if readers:

@@ -125,7 +125,9 @@ TEXTS = (
 """Settings that are no numbers, whatever they look like."""
 
 
-def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
+def recipe(
+    name: str, schema: type, composed: bool = False, logs: bool = True
+) -> Callable[[Callable[[Any], None]], Callable[[], None]]:
     """Make a function of a configuration the recipe of a name.
 
     An override that hydra does not take is said in one paragraph on stderr, with exit status 2. Ctrl-C, where the
@@ -137,6 +139,7 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
         schema: dataclass of the configuration.
         composed: whether the function takes what hydra composed, with settings left open, instead of an object of the
             dataclass whose numbers are within their ranges, and that its method `check` takes, if it has one.
+        logs: whether what the package logs is said, on stdout; not where programs read that.
     """
     SCHEMAS[name] = schema
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
@@ -146,7 +149,7 @@ def recipe(name: str, schema: type, composed: bool = False) -> Callable[[Callabl
     def decorate(function: Callable[[Any], None]) -> Callable[[], None]:
         @functools.wraps(function)
         def with_typed(config: DictConfig) -> None:
-            if not config.get("json"):  # what programs read is nothing else
+            if logs:
                 start_logging()
             function(typed(config))
 

@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
@@ -81,6 +81,13 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
+    many_processes: ClassVar[bool] = False  # whether torchrun may start several that train together
+
+    @property
+    def moves_start_on_line(self) -> bool:
+        """Whether the share of episodes that begin on a line changes in the run."""
+        return False
+
     @property
     def run_directory(self) -> RunDirectory:
         """Where everything of the run lands, once that is chosen."""
@@ -101,7 +108,7 @@ class RunConfig:
         """
         check_settings(self)
         self.logger.check()
-        if parallel.asked_for() > 1 and not isinstance(self, WorldModelRunConfig):
+        if parallel.asked_for() > 1 and not self.many_processes:
             raise ValueError(
                 f"WORLD_SIZE={parallel.asked_for()}: algorithm={self.algorithm} trains in one process, and of those "
                 "that torchrun starts only recipes/dreamer_v3.py and latent_ppo.py makes use: start it without "
@@ -125,8 +132,7 @@ class RunConfig:
             StartSampler(track, start_noise=noise)
         except ValueError as error:
             raise ValueError(f"evaluation.{error}") from error
-        moves = isinstance(self, WorldModelRunConfig) and self.schedule.start_on_line.to is not None
-        if env.start_on_line == 1 and env.start_beyond_gate and not moves:
+        if env.start_on_line == 1 and env.start_beyond_gate and not self.moves_start_on_line:
             raise ValueError(
                 f"env.start_beyond_gate={env.start_beyond_gate:g} is a share of the episodes that do not begin on a "
                 "line, and env.start_on_line=1 leaves none of them: lower that, or leave the other out."
@@ -140,6 +146,8 @@ class ReplayRunConfig(RunConfig):
     prefill: int = setting(MISSING, NOT_NEGATIVE)  # env_steps collected before the first update
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
+    ratio_group: ClassVar[str] = "model"  # of settings, that has replay_ratio
+
     def make_replay_ratio(self) -> ReplayRatio:
         """Make what says how much the run trains."""
         raise NotImplementedError(f"{type(self).__name__} must say how much its run trains.")
@@ -152,10 +160,10 @@ class ReplayRunConfig(RunConfig):
                 f"total_env_steps={self.total_env_steps} must be above prefill={self.prefill}, the steps before the "
                 "first update: raise the one, or lower the other."
             )
-        replay, group = self.make_replay_ratio(), "sac" if isinstance(self, SACRunConfig) else "model"
+        replay, steps = self.make_replay_ratio(), self.total_env_steps
         if not replay.updates(self.total_env_steps):
             raise ValueError(
-                f"{group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={self.total_env_steps:,} less "
+                f"{self.ratio_group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={steps:,} less "
                 f"prefill={self.prefill:,} asks for no whole update of {replay.records} records. "
                 "Raise total_env_steps or the ratio, or lower the prefill."
             )
@@ -181,6 +189,13 @@ class WorldModelRunConfig(ReplayRunConfig):
     loss: LossConfig = field(default_factory=LossConfig)
     replay: SequenceReplayConfig = field(default_factory=SequenceReplayConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+    many_processes: ClassVar[bool] = True
+
+    @property
+    def moves_start_on_line(self) -> bool:
+        """As of any run."""
+        return self.schedule.start_on_line.to is not None
 
     def make_replay_ratio(self) -> ReplayRatio:
         """Make what says how much the run trains."""
@@ -326,6 +341,8 @@ class SACRunConfig(ReplayRunConfig):
     rollout_steps: int = setting(1, COUNT)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     sac: SACConfig = field(default_factory=SACConfig)
+
+    ratio_group: ClassVar[str] = "sac"
 
     def make_replay_ratio(self) -> ReplayRatio:
         """Make what says how much the run trains."""

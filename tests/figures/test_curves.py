@@ -464,7 +464,7 @@ def test_the_columns_of_a_table_say_who_learned():
     """Of those that results keep: what their pages say trained them."""
     results = Path(__file__).parents[2] / "results"
     for name, algorithm in (
-        ("dreaming/metrics_circle_seed0.csv", "dreamer_v3"),
+        ("dreamer_v3/metrics_circle_seed0.csv", "dreamer_v3"),
         ("latent_ppo/metrics_kidney_seed1.csv", "latent_ppo"),
         ("baselines_from_pixels/metrics_sac.csv", "sac"),
         ("split_s/metrics_ppo_state.csv", "ppo"),

@@ -58,6 +58,7 @@ REFUSED = [
     (["env.num_envs=0"], ["env.num_envs=0", "at least 1"]),
     (["model.batch_length=1"], ["model.batch_length=1", "at least 2"]),
     (["model.learning_rate=-1"], ["model.learning_rate=-1", "above 0"]),
+    (["env.image_size=0"], ["env.image_size=0", "multiple of 16"]),
     (["env.image_size=40"], ["env.image_size=40", "multiple of 16", "32, 64 or 96"]),
     (["loss.discount=1.5"], ["loss.discount=1.5", "at least 0 and at most 1"]),
     (["checkpoint.keep=0"], ["checkpoint.keep=0", "at least 1"]),

@@ -66,7 +66,7 @@ def test_one_of_several_processes_knows_the_wall_clock_alone():
     assert RunClock({}, alone=False).read().keys() == {"wall_clock"}
 
 
-# What a run says of itself in a log; `test_live_table.py` is what it shows in a terminal.
+# What a run says of itself in a log; what it shows in a terminal is below.
 
 
 METRICS = {"episode/return": 12.345, "episode/gates_passed": 3.0, "rate/updates": 5.5, "loss": 1.25}
