@@ -43,7 +43,7 @@ NOT_RECORDED, NOT_RUN = "not recorded", "not run"
 HEAD = """# Results
 
 How well each algorithm flies here, what that took, and the command that runs it again. [What we know](what_we_know.md)
-draws the conclusions. To check a number at once, fly the included Kidney agent 200 times, 40 s of CPU:
+draws the conclusions. To check a number, fly the included Kidney agent 2 × 100 times (40 s of CPU):
 
 ```bash
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
@@ -69,7 +69,7 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
 | images alone | without the true state, also in training |
 | stopped | ended by hand, before the planned number of env_steps |
-| `schedule.NAME` | a setting that moves to the value `to`, as gates are passed ([`by: known`](recipes.md#options)) |
+| `schedule.NAME` | moves setting NAME to `to` as the gate pass rate rises ([`by: known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 

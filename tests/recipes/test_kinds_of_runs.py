@@ -145,7 +145,8 @@ def test_a_disk_that_may_not_be_enough_is_said_before_the_run(
 ) -> None:
     """Three replays are there at the peak, with checkpoint.keep=2; what a run's own checkpoints take is free for it."""
     building = recipe_module("composing.building")
-    config = compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2")
+    composed = recipe_module("dreamer_v3").resolve(compose("dreamer_v3", f"run_dir={tmp_path}", "checkpoint.keep=2"))
+    config = OmegaConf.to_object(composed)
     free = SimpleNamespace(free=3000)
     monkeypatch.setattr(building.shutil, "disk_usage", lambda path: free)
     assert "MAY NOT BE ENOUGH" not in building.disk_needed(config, 1000)
