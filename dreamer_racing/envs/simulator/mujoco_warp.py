@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from dreamer_racing.envs.drone.parameters import QuadrotorParameters
+from dreamer_racing.envs.simulator.base import Simulator, no_images
 from dreamer_racing.envs.simulator.looks import LooksRandomisation, LooksSampler
 from dreamer_racing.envs.simulator.ray_caster import RayCaster
 from dreamer_racing.envs.simulator.rendering import NoseMount
 from dreamer_racing.envs.simulator.scene import Camera, build_drone, build_scene
-from dreamer_racing.envs.simulator.simulators import Simulator, no_images
 from dreamer_racing.envs.simulator.warp_device import load_warp, scope
 from dreamer_racing.envs.tracks import Track
 from dreamer_racing.machine import GB, available_memory

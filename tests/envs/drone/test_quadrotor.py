@@ -18,8 +18,8 @@ from dreamer_racing.envs.drone.parameters import GRAVITY, PRESETS, QuadrotorPara
 from dreamer_racing.envs.drone.quadrotor import Quadrotor
 from dreamer_racing.envs.drone.rigid_step import RigidStep
 from dreamer_racing.envs.simulator.fused_flight import FusedFlight
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.scene import build_drone
-from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.tracks import load_track
 
 ROOT = Path(__file__).parents[3]

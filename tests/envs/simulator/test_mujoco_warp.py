@@ -14,10 +14,10 @@ from dreamer_racing.envs.drone.parameters import PRESETS
 from dreamer_racing.envs.race.starts import StartSampler
 from dreamer_racing.envs.simulator import mujoco_warp
 from dreamer_racing.envs.simulator.looks import load_looks
+from dreamer_racing.envs.simulator.mujoco_cpu import MujocoSimulator
 from dreamer_racing.envs.simulator.mujoco_warp import WarpSimulator, memory_of_worlds
 from dreamer_racing.envs.simulator.opengl import RendererUnavailableError
 from dreamer_racing.envs.simulator.scene import Camera
-from dreamer_racing.envs.simulator.simulators import MujocoSimulator
 from dreamer_racing.envs.simulator.warp_device import load_warp
 from dreamer_racing.envs.tracks import load_track
 from dreamer_racing.envs.worlds import RaceWorlds
