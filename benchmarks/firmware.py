@@ -40,7 +40,7 @@ LAPS, PATIENCE = 3, 60.0  # s
 def main() -> None:
     """Fly all that is asked for."""
     parser = make_parser(__doc__)
-    flyers = ["circle_betaflight", "kidney_betaflight", "pilot"]
+    flyers = ["circle_betaflight", "kidney_betaflight", "figure8_betaflight", "pilot"]
     parser.add_argument("--flyers", nargs="+", default=flyers, help="agents of agents/, or pilot")
     parser.add_argument("--flights", type=int, default=10)
     arguments = parser.parse_args()

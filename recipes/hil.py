@@ -57,9 +57,8 @@ from dreamer_racing.hil.recording import FILE, TRACK, Flight, FlightRecorder
 from dreamer_racing.hil.view import LiveView
 
 STATISTICS = "statistics.json"
-plainly = partial(
-    plain_errors, also=(ImportError,)
-)  # errors of links and poses whose packages, extras, are missing, too
+plainly = partial(plain_errors, also=(ImportError,))
+"""Errors in words, of links and poses whose packages, extras, are missing, too."""
 
 
 @recipe("hil", HilConfig)

@@ -22,7 +22,7 @@ refused: dict[str, str] = {}
 def imports_with_variable(name: str) -> bool:
     """Import a package that reads `MUJOCO_GL`; if that fails, take the variable that is in the way away and say so.
 
-    `PYOPENGL_PLATFORM` is in the way where it is set to anything but `MUJOCO_GL`, which MuJoCo and dm_control refuse.
+    That is `PYOPENGL_PLATFORM` where the error names it, as MuJoCo's and dm_control's do if it is another platform.
 
     Raises:
         Exception: what the package raises, where `MUJOCO_GL` is not set.
@@ -37,7 +37,8 @@ def imports_with_variable(name: str) -> bool:
         reason = f"{type(error).__name__}: {error}"
     else:
         return True
-    variable, refusal = ("PYOPENGL_PLATFORM", platform) if platform not in (None, value) else ("MUJOCO_GL", value)
+    named = platform is not None and "PYOPENGL_PLATFORM" in reason
+    variable, refusal = ("PYOPENGL_PLATFORM", platform) if named else ("MUJOCO_GL", value)
     del os.environ[variable]
     if platform is None:
         os.environ.pop("PYOPENGL_PLATFORM", None)  # set by what failed

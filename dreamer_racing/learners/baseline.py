@@ -9,9 +9,9 @@ import torch
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
+from dreamer_racing.learners.gradient_step import FiniteGuard
 from dreamer_racing.learners.learner import ValueFunction
 from dreamer_racing.learners.networks import BaselinePolicy, NetworkSize, check_layers, layers_of
-from dreamer_racing.learners.optimizer import FiniteGuard
 from dreamer_racing.modules import Interface
 
 

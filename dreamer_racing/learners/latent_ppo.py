@@ -28,8 +28,8 @@ from torch import Tensor, nn
 from dreamer_racing import parallel
 from dreamer_racing.experience.rollouts import RolloutStorage
 from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.gradient_step import restore
 from dreamer_racing.learners.learner import Timer, ValueFunction, untimed
-from dreamer_racing.learners.optimizer import restore
 from dreamer_racing.learners.update import WorldModelLearner
 from dreamer_racing.losses import (
     LatentPPOLosses,

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from dreamer_racing import parallel
 from dreamer_racing.learners.config import LearnerConfig
+from dreamer_racing.learners.gradient_step import FiniteGuard, GraphedStep, gradient_norms, make_optimizer, restore
 from dreamer_racing.learners.learner import Timer, ValueFunction, seeded, untimed
-from dreamer_racing.learners.optimizer import FiniteGuard, GraphedStep, gradient_norms, make_optimizer, restore
 from dreamer_racing.learners.saved import Unmatched, check_saved, check_weights, load_parameters, own_state
 from dreamer_racing.losses import Latents, LossConfig, WorldModelLoss, find_targets, policy_drift
 from dreamer_racing.modules import Agent, DreamerPolicy, Interface, ModelSize, get_size

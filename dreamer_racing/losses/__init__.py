@@ -10,6 +10,7 @@ from dreamer_racing.losses.config import (
     LossConfig,
     PPOUpdateConfig,
 )
+from dreamer_racing.losses.imagination import Imagination, Starts, choose_starts, imagine
 from dreamer_racing.losses.policy import (
     OBJECTIVES,
     Objective,
@@ -24,11 +25,7 @@ from dreamer_racing.losses.policy import (
     through_dynamics,
 )
 from dreamer_racing.losses.returns import (
-    Imagination,
-    Starts,
-    choose_starts,
     critic_loss,
-    imagine,
     lambda_return,
     replay_critic_loss,
     replay_return,

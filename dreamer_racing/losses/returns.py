@@ -1,112 +1,15 @@
-"""Rollouts inside the world model, λ-returns of rollouts and of replayed windows, and what a critic learns of them.
+"""λ-returns of rollouts and of replayed windows, and what a critic learns of them.
 
-Shape legend: B batch, T time, N starts, H horizon or steps of a rollout, D belief, S state, F = D + S features, A
-action. Of imagined rollouts time comes first, so that a step is one block of memory.
+Shape legend: B batch, T time, N starts, H horizon or steps of a rollout, F features. Of rollouts time comes first.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dreamer_racing.modules.heads import Actor, Critic
-from dreamer_racing.modules.layers import autocast_type
-from dreamer_racing.modules.rssm import RSSM, join_features
-
-
-class Imagination(NamedTuple):
-    """An imagined rollout.
-
-    Attributes:
-        features: Belief and state before each action and after the last, ``(H + 1, N, F)``.
-        action: Unclipped samples of the policy, ``(H, N, A)``.
-    """
-
-    features: Tensor
-    action: Tensor
-
-
-class Starts(NamedTuple):
-    """Where imagination begins, without gradient.
-
-    Attributes:
-        belief: ``(N, D)``.
-        state: ``(N, S)``.
-        terminated: Whether the episode ended there, bool ``(N, 1)``.
-        previous_action: That led there, ``(N, A)``.
-    """
-
-    belief: Tensor
-    state: Tensor
-    terminated: Tensor
-    previous_action: Tensor
-
-
-def choose_starts(
-    belief: Tensor, state: Tensor, terminated: Tensor, previous_action: Tensor, number: int | None = None
-) -> Starts:
-    """Choose among the latents of a batch those that imagination begins from.
-
-    Args:
-        belief: Of its records, ``(B, T, D)``.
-        state: ``(B, T, S)``.
-        terminated: ``(B, T, 1)``.
-        previous_action: ``(B, T, A)``.
-        number: Of random ones; None for all, in order.
-    """
-    starts = Starts(*(value.detach().flatten(0, 1) for value in (belief, state, terminated, previous_action)))
-    if number is None:
-        return starts
-    # Not randperm, which a CUDA graph cannot capture.
-    order = torch.rand(len(starts.belief), device=belief.device).topk(min(number, len(starts.belief))).indices
-    return Starts(*(value[order] for value in starts))
-
-
-def imagine(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
-    """Let the policy act in the world model.
-
-    Call it under ``torch.no_grad()`` where nothing shall flow back through the rollout, as with REINFORCE.
-
-    Args:
-        rssm: Dynamics.
-        actor: Policy.
-        belief: Starts, ``(N, D)``.
-        state: Starts, ``(N, S)``.
-        horizon: H, number of actions.
-
-    Returns:
-        The rollout.
-    """
-    if rssm.few_kernels and not torch.is_grad_enabled():
-        return _imagine_low(rssm, actor, belief, state, horizon)
-    features, actions = [join_features(belief, state)], []
-    for _ in range(horizon):
-        action = actor(features[-1]).sample()
-        belief, state = rssm.imagine_step(belief, state, action)
-        actions.append(action)
-        features.append(join_features(belief, state))
-    return Imagination(torch.stack(features), torch.stack(actions))
-
-
-def _imagine_low(rssm: RSSM, actor: Actor, belief: Tensor, state: Tensor, horizon: int) -> Imagination:
-    """Let the policy act in the world model, with fewer kernels.
-
-    Noise is drawn ahead. Features are in the type in which autocast computes, to which every head casts them first.
-    """
-    shape = (horizon + 1, len(belief), belief.shape[-1] + state.shape[-1])
-    features = belief.new_zeros(shape, dtype=autocast_type(belief.device.type) or belief.dtype)
-    features[0].copy_(join_features(belief, state))
-    actions = []
-    noises = torch.randn(horizon, len(belief), actor.action_dim, device=belief.device)
-    draws = zip(noises, rssm.draw_noise(horizon, len(belief)), features[:-1], features[1:], strict=True)
-    for of_action, of_state, here, following in draws:
-        action = actor(here).sample(of_action)
-        belief = rssm.imagine_low(belief, here, action, of_state, following)
-        actions.append(action)
-    return Imagination(features, torch.stack(actions))
+from dreamer_racing.modules.heads import Critic
 
 
 def lambda_return(reward: Tensor, next_value: Tensor, discount: Tensor, lambda_: float | Tensor) -> Tensor:

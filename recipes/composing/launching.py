@@ -34,7 +34,7 @@ from dreamer_racing.experience.rollouts import WorkerError
 from dreamer_racing.export.agents import agent_path
 from dreamer_racing.export.shipped_agent import is_agent
 from dreamer_racing.figures.loggers import RunLogger, make_loggers
-from dreamer_racing.learners.optimizer import NonFiniteLossError
+from dreamer_racing.learners.gradient_step import NonFiniteLossError
 from dreamer_racing.machine import (
     git_commit,
     is_out_of_memory,

@@ -161,7 +161,7 @@ class ReplayRunConfig(RunConfig):
                 "first update: raise the one, or lower the other."
             )
         replay, steps = self.make_replay_ratio(), self.total_env_steps
-        if not replay.updates(self.total_env_steps):
+        if not replay.updates(steps):
             raise ValueError(
                 f"{self.ratio_group}.replay_ratio={replay.ratio} cannot be met: total_env_steps={steps:,} less "
                 f"prefill={self.prefill:,} asks for no whole update of {replay.records} records. "

@@ -34,8 +34,6 @@ from dreamer_racing.training.checkpoint import RunCheckpoints
 from tests.dreamers import learner_of
 from tests.export.recorded import answered
 
-ROOT = Path(__file__).parents[2]
-
 pytestmark = pytest.mark.xdist_group("shipped")  # one worker makes what these tests share
 
 WORLDS = {"track": "circle", "num_envs": 1, "camera": Camera(32, 32, tilt=30.0), "control_rate": 25.0, "num_threads": 1}
@@ -154,10 +152,9 @@ def test_only_what_flies_is_in_it(shipped: Path, env: DroneRacingEnv) -> None:
     assert held == json.loads((shipped / "contract.json").read_text())["model"]["parameters"]
 
 
-@pytest.mark.parametrize(
-    "folder", sorted(path.parent for path in (ROOT / "agents").glob("*/agent.json")), ids=lambda it: it.name
-)
-def test_three_agents_that_ship_are_less_than_ten_megabytes(folder: Path) -> None:
+@pytest.mark.slow
+def test_three_agents_are_less_than_ten_megabytes(env: DroneRacingEnv, tmp_path: Path) -> None:
+    folder = ship(make_agent("cpu_small", 64), env, tmp_path / "agent")
     assert sum(path.stat().st_size for path in folder.iterdir()) < 10e6 / 3
 
 

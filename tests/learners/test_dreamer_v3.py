@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
+from dreamer_racing.learners.gradient_step import NonFiniteLossError, gradient_norms
 from dreamer_racing.learners.learner import seeded
-from dreamer_racing.learners.optimizer import NonFiniteLossError, gradient_norms
 from dreamer_racing.losses import TARGETS, DreamerV3Losses, Target
 from dreamer_racing.losses.world_model import Image
 from dreamer_racing.modules import SIZES, Agent, Interface

@@ -13,9 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from dreamer_racing.learners import latent_ppo
+from dreamer_racing.learners.gradient_step import FiniteGuard, NonFiniteLossError
 from dreamer_racing.learners.latent_ppo import LatentPPO, PPOUpdate
 from dreamer_racing.learners.launches import launches
-from dreamer_racing.learners.optimizer import FiniteGuard, NonFiniteLossError
 from dreamer_racing.losses import PPOUpdateConfig, rollout_return
 from dreamer_racing.modules import Interface, join_features
 from dreamer_racing.modules.heads import ActionDistribution, symlog

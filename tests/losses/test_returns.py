@@ -11,7 +11,7 @@ from torchrl.objectives.dreamer_v3 import _replay_value_target
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from dreamer_racing.losses import critic_loss, imagine, lambda_return, replay_critic_loss, replay_return, rollout_return
-from dreamer_racing.losses.returns import choose_starts
+from dreamer_racing.losses.imagination import choose_starts
 from dreamer_racing.modules import SIZES, Critic
 from dreamer_racing.modules.agent import Agent
 from dreamer_racing.modules.interface import Interface

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from dreamer_racing.learners.dreamer_v3 import DreamerV3
 from dreamer_racing.learners.launches import launches
-from dreamer_racing.losses.returns import Imagination, imagine
+from dreamer_racing.losses.imagination import Imagination, imagine
 from dreamer_racing.modules import ModelSize, few_kernels, get_size
 from dreamer_racing.modules.few_kernels import cast_once
 from dreamer_racing.modules.layers import BlockLinear, LayerNorm, RMSNorm, autocast, linear, unrolled
