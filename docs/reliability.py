@@ -61,11 +61,9 @@ def read_results(folder: Path) -> dict[str, str]:
         survived = sum(record["survived"] for record in cases)
         there = max((int(calls[1]) for case in cases if (calls := CALLS.fullmatch(case.get("where", "")))), default=0)
         among = f", among {there}" if there > len(cases) else ""
-        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived{among} ({cases[0]['commit']})"
+        phrases[kind] = f"{kind}: {survived} of {len(cases)} survived{among}"
     for record in _read(folder / "fuzz.json"):
-        phrases[record["kind"]] = (
-            f"{record['kind']}: {record['failed']} of {record['cases']:,} failed ({record['commit']})"
-        )
+        phrases[record["kind"]] = f"{record['kind']}: {record['failed']} of {record['cases']:,} failed"
     return phrases
 
 

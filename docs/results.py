@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"
 PICTURES = (".png", ".gif", ".svg")
 WIDTH = 128
-BRIEF = "Index of further files (rarely needed)"
+BRIEF = "Further measurements"
 COLUMNS = ("value", "seeds", "minutes", "command")
 """Of the second table, behind the result."""
 BELOW = "command below"
