@@ -18,6 +18,8 @@ from multiprocessing import reduction
 from pathlib import Path
 from typing import Any
 
+import torch
+
 RECIPES = Path(__file__).resolve().parents[1] / "recipes"
 # Not dm_control, nor OpenGL: what they draw with they choose by the environment that they are imported in.
 SERVER = multiprocessing.get_context("forkserver")
@@ -90,6 +92,8 @@ def _begin(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(cwd)
+    # The server has counted threads already, by its own environment; by another number of them sums round differently
+    torch.set_num_threads(int(environment.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0)))))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have what they start in the background ignore it
     try:
         function(*arguments)
