@@ -49,7 +49,8 @@ draws the conclusions. To check a number, fly the included Kidney agent 2 × 100
 ./dev python recipes/evaluate.py checkpoint=kidney episodes=100 num_envs=100 start_noise=1 seed=7
 ```
 
-You should see two blocks with these lines; processors differ a little. Files go to `runs/agent_kidney/evaluation`.
+You should see two blocks with these lines; the numbers differ a little between processors. Files go to
+`runs/agent_kidney/evaluation`.
 Unless a table says otherwise, all runs were evaluated like this at their end (`checkpoint=runs/RUN`).
 
 ```text
@@ -65,16 +66,16 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 |---|---|
 | success | share of flights that finish three laps, each from another randomised start, by the deterministic policy |
 | sampled | success of the stochastic policy, whose actions are samples from its distribution |
-| minutes | of one core of an AMD EPYC or an Intel Xeon, for the whole training |
+| minutes | of one core, for the whole training; cores differ by a factor of two (behind *Commands, commits, machine*) |
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
 | images alone | without the true state, also in training |
 | stopped | ended by hand, before the planned number of env_steps |
-| `schedule.NAME` | moves setting NAME to `to` as the gate pass rate rises ([`by: known`](recipes.md#options)) |
+| `schedule.NAME` | changes the setting NAME during training: here as the gate pass rate rises ([`by: known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 
-The commands on this page use today's defaults. The numbers were made by those behind *Commands, commits, machine*.
-Before commit 2c16a57 `recipes/latent_ppo.py` was called `recipes/dreamer_v3.py`. `./dev python docs/results.py`
+The commands on this page use today's defaults; the original ones are behind *Commands, commits, machine*. There
+`recipes/latent_ppo.py` is still called `recipes/dreamer_v3.py` (before commit 2c16a57). `./dev python docs/results.py`
 writes this page from the `provenance.json` files in [results/](../results): change those."""
 
 
