@@ -35,6 +35,69 @@ ATTACKS = {
     "an untrusted checkpoint": ("checkpoints",),
 }  # fmt: skip
 """Kinds of attacks by the fault that a row is about."""
+TESTS = {
+    "the process is killed, at any time": (
+        "test_kill_during_a_save_leaves_a_loadable_checkpoint",
+        "test_kill_at_each_step_of_publishing",
+        "test_a_training_killed_at_any_file_of_a_save_goes_on_as_if_it_had_not_been",
+        "test_a_resumed_run_equals_an_uninterrupted_one",
+        "test_a_run_writes_the_same_rows_wherever_it_is_stopped",
+        "test_a_resumed_run_of_the_control_suite_is_evaluated_as_an_uninterrupted_one",
+    ),
+    "Ctrl-C, SIGTERM": (
+        "test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save",
+        "test_ctrl_c_before_anything_is_there_is_no_traceback",
+    ),
+    "power loss, or the machine is taken away": ("test_checkpoints_by_the_clock",),
+    "a file of a checkpoint is damaged or missing": (
+        "test_every_damaged_file_is_noticed_and_the_checkpoint_before_it_is_taken",
+        "test_every_missing_file_is_noticed_and_the_checkpoint_before_it_is_taken",
+        "test_json_of_another_kind_is_damage",
+    ),
+    "the disk fills up": (
+        "test_a_run_outlives_a_full_disk",
+        "test_a_run_outlives_a_disk_that_takes_nothing_at_all",
+        "test_a_run_that_cannot_be_saved_at_its_end_says_so",
+    ),
+    "too little disk space, before the run begins": ("test_a_disk_that_may_not_be_enough_is_said_before_the_run",),
+    "a kill or a full disk while `best/` is replaced": ("test_the_old_best_stays_until_the_new_one_is_there",),
+    "a second process in the same run folder": ("tests/training/test_directory.py",),
+    "a loss or gradient that is not finite": (
+        "test_a_loss_that_is_not_finite_ends_the_run",
+        "test_a_lagging_guard_names_the_batch_that_was_bad",
+    ),
+    "an action or a world that is not finite": ("tests/envs/race/test_race.py", "tests/envs/simulator",),
+    "the system clock changes": ("test_a_run_does_not_care_what_time_it_is",),
+    "a run is resumed with other settings": (
+        "test_a_resumed_run_says_what_is_other_than_it_was",
+        "test_a_resumed_run_cannot_change_its_track",
+    ),
+    "a wrong option": (
+        "tests/recipes/test_entry.py",
+        "tests/recipes/test_refusals.py",
+        "tests/recipes/test_usage.py",
+    ),
+    "an untrusted track file": ("tests/envs/tracks/test_loading.py",),
+    "an untrusted export": ("test_a_contract_of_another_file_is_refused",),
+    "a dependency of another version": ("tests/test_layout.py", ".ci/lowest", ".ci/run",),
+    "used without a clone": ("tests/test_main.py", "test_provenance", ".ci/wheel",),
+    "an untrusted checkpoint": ("test_a_malicious_state_is_refused_and_nothing_of_it_is_run",),
+    "a program ends without `close()`": ("test_twenty_processes_that_close_nothing_end_with_status_zero",),
+    "home directory missing or not writable": ("tests/test_machine.py",),
+    "`MUJOCO_GL`, `PYOPENGL_PLATFORM` or `MUJOCO_EGL_DEVICE_ID` name something that is not there": (
+        "tests/envs/test_worlds.py",
+    ),
+    "a terminal that is not UTF-8, or a closed pipe": ("tests/test_machine.py",),
+    "the terminal is closed (SIGHUP)": (
+        "tests/training/test_session.py",
+        "test_a_signal_saves_and_exits_cleanly_and_a_second_one_does_not_save",
+    ),
+    "a run is killed early": ("test_a_run_that_saves_on_the_way_does_so_within_two_minutes",),
+    "the wrong Python, without the project's packages": ("tests/recipes/test_entry.py",),
+    "an environment is copied, pickled or sent": ("tests/envs/test_copies.py",),
+    "a worker process is killed": ("test_a_worker_that_is_killed_is_replaced_and_no_frame_is_lost_or_counted_twice",),
+}  # fmt: skip
+"""Tests and folders of tests by the fault that a row is about."""
 CALLS = re.compile(r"(?:call|after opening) \d+ of (\d+)")
 """Where a case was killed that is one of so many."""
 

@@ -70,7 +70,7 @@ lap time           best 3.96 s, mean 4.06 s (297 laps)
 | state decoded | in training the world model learns the true state; in flight the agent sees only images |
 | images alone | without the true state, also in training |
 | stopped | ended by hand, before the planned number of env_steps |
-| `schedule.NAME` | changes the setting NAME during training: here as the gate pass rate rises ([`by: known`](recipes.md#options)) |
+| `schedule.NAME` | changes setting NAME in training, here as the gate pass rate rises ([`by: known`](recipes.md#options)) |
 """
 FOOT = """## Where the numbers come from
 

@@ -295,8 +295,11 @@ def test_examples_do_what_they_say(module: str, tmp_path: Path, monkeypatch: pyt
     assert not found.failed, f"{found.failed} of {found.attempted} lines, see above"
 
 
-def test_tests_that_promises_name_are_there() -> None:
+def test_every_guarantee_has_tests_that_are_there(reliability: ModuleType) -> None:
     page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    first_table = page.partition("| fault | guarantee |")[2].partition("\n\n")[0]
+    assert set(reliability.TESTS) == set(re.findall(r"^\| ([^|]+) \|", first_table, re.MULTILINE))
+    page += "".join(f"`{name}`" for names in reliability.TESTS.values() for name in names)
     tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     named = set(re.findall(r"`(test_\w+)`", page))
     assert named and {name for name in named if f"def {name}" not in tests} == set()
